@@ -1,0 +1,1 @@
+"""Jacobian estimators behind one contract."""

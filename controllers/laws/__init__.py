@@ -1,0 +1,1 @@
+"""Control laws behind one contract."""

@@ -1,0 +1,1 @@
+"""FMU models that servobench exports, a folder each, and the exporters."""

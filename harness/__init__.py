@@ -1,0 +1,1 @@
+"""Experiments: references, the loop, logs, metrics, comparisons and the command line."""

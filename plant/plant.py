@@ -1,0 +1,127 @@
+"""The contract of a plant: a spec, reset, step, close, and the truth for the log.
+
+A plant never sees a target. Adding one: a class below `Plant`, a frozen configuration dataclass beside it, and a
+`PlantEntry` that is named in `harness.registry` or published under the entry-point group `servobench.plants`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from plant.hand_eye import HandEyeModel
+from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault, Truth
+
+
+class PlantDiverged(RunFault):
+    """The plant's state left the finite numbers."""
+
+    status: ClassVar[str] = "plant_diverged"
+
+
+class FeatureLost(RunFault):
+    """The feature was not measured for too many periods in a row."""
+
+    status: ClassVar[str] = "feature_lost"
+
+
+class Plant(ABC):
+    """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
+
+    @property
+    @abstractmethod
+    def spec(self) -> PlantSpec:
+        """Sizes, names, limits and period."""
+
+    @abstractmethod
+    def reset(self, seed: int) -> Observation:
+        """Return to the start at time 0 and draw all randomness from `seed`.
+
+        Args:
+            seed: non-negative; the same seed gives the same run, bit for bit.
+
+        Returns:
+            The observation at time 0.
+
+        Raises:
+            FeatureLost: the feature cannot be seen from the start.
+        """
+
+    @abstractmethod
+    def step(self, command: Command) -> Observation:
+        """Apply `command` for one period.
+
+        Args:
+            command: joint velocities, shape (n,), rad/s; beyond the limit they are clipped.
+
+        Returns:
+            The observation at the end of the period.
+
+        Raises:
+            ValueError: a command of the wrong size.
+            PlantDiverged: the state is no longer finite.
+        """
+
+    @abstractmethod
+    def truth(self) -> Truth:
+        """Return the present true feature and Jacobian; for evaluation only."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free what the plant holds; calling it twice is allowed."""
+
+
+@dataclass(frozen=True)
+class PlantSetup:
+    """What the harness hands to a plant's builder.
+
+    Attributes:
+        model: the true arm and camera, mismatch included.
+        start: (n,), rad, reported joint positions at time 0.
+        period: control period, s.
+    """
+
+    model: HandEyeModel
+    start: FloatArray
+    period: float
+
+
+@dataclass(frozen=True)
+class PlantEntry:
+    """A plant as the registry knows it.
+
+    Attributes:
+        name: the word on the command line.
+        summary: one line for `servobench plants`.
+        config: frozen dataclass with a default for every field.
+        build: makes the plant from its configuration and the setup.
+    """
+
+    name: str
+    summary: str
+    config: type[Any]
+    build: Callable[[Any, PlantSetup], Plant]
+
+
+def whole_steps(period: float, own_step: float) -> int:
+    """Return how many own steps of a plant make a control period.
+
+    Args:
+        period: control period, s.
+        own_step: the plant's own step, s.
+
+    Returns:
+        The whole number of own steps, at least 1.
+
+    Raises:
+        ValueError: the own step does not divide the period.
+    """
+    count = round(period / own_step) if period > 0.0 else 0
+    if count < 1 or abs(count * own_step - period) > 1e-9:
+        raise ValueError(
+            f"period must be a whole multiple of the plant's own step of {own_step:.9g} s, got {period:.9g} s; "
+            f"the nearest is {max(count, 1) * own_step:.9g} s"
+        )
+    return count

@@ -1,0 +1,57 @@
+"""What lies between a measured feature and the observation: latency, lost frames, and the feature that is held."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from plant.signals import FloatArray, check_number
+
+
+class FeatureChannel:
+    """Delays features by whole periods, loses frames at random and holds the last valid feature.
+
+    A frame that was lost, or in which the feature was not found, comes out as "not valid" after the same latency.
+    """
+
+    def __init__(self, latency_periods: int, drop_probability: float) -> None:
+        """Prepare a channel.
+
+        Args:
+            latency_periods: whole control periods between exposure and delivery.
+            drop_probability: chance that a frame is lost, each on its own.
+
+        Raises:
+            ValueError: a negative latency, or a probability outside [0, 1).
+        """
+        check_number("latency_periods", latency_periods, at_least=0)
+        check_number("drop_probability", drop_probability, at_least=0.0, below=1.0)
+        self._latency = latency_periods
+        self._drop_probability = drop_probability
+        self._pending: deque[FloatArray | None] = deque()
+        self._held = np.zeros(0)
+        self._generator = np.random.default_rng(0)
+
+    def reset(self, first: FloatArray, generator: np.random.Generator) -> None:
+        """Start with the feature `first` (m,) seen at rest; later losses are drawn from `generator`."""
+        self._generator = generator
+        self._held = first
+        self._pending = deque([first] * self._latency)
+
+    def deliver(self, measured: FloatArray | None) -> tuple[FloatArray, bool]:
+        """Pass the frame of this instant in and the newest delivered feature out.
+
+        Args:
+            measured: (m,), or None where the feature was not found.
+
+        Returns:
+            The feature, (m,), and whether it is valid (else it is the last valid one).
+        """
+        lost = self._drop_probability > 0.0 and self._generator.random() < self._drop_probability
+        self._pending.append(None if lost else measured)
+        delivered = self._pending.popleft()
+        if delivered is None:
+            return self._held, False
+        self._held = delivered
+        return delivered, True

@@ -1,0 +1,179 @@
+"""The messages that pass between harness, controllers and plants, and what a plant says about itself.
+
+Arrays are float64, finite, shape-checked at the boundary and read-only. Row k of a log holds the observation and the
+command of instant t_k; the command acts on [t_k, t_{k+1}).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class RunFault(RuntimeError):
+    """A named reason why a run ended before its last period; `status` is what the table of runs shows."""
+
+    status: ClassVar[str] = "fault"
+
+
+def as_vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
+    """Return `value` as a read-only float64 vector.
+
+    Args:
+        name: name of the argument, for the error message.
+        value: anything array-like of shape (size,).
+        size: wanted number of entries.
+
+    Returns:
+        A read-only copy, shape (size,).
+
+    Raises:
+        ValueError: wrong shape, or an entry that is not finite.
+    """
+    vector = np.array(value, dtype=np.float64)
+    if vector.shape != (size,):
+        raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
+    if not np.isfinite(vector).all():
+        raise ValueError(f"{name} must be finite, got {vector.tolist()}")
+    vector.flags.writeable = False
+    return vector
+
+
+def check_number(
+    name: str,
+    value: float,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    below: float | None = None,
+) -> None:
+    """Check a configured number against its bounds.
+
+    Args:
+        name: name of the argument, for the error message.
+        value: the number that came.
+        above: it must be greater than this.
+        at_least: it must not be less than this.
+        at_most: it must not be greater than this.
+        below: it must be less than this.
+
+    Raises:
+        ValueError: not finite, or out of bounds; names the argument, what was wanted and what came.
+    """
+    wanted = []
+    good = bool(np.isfinite(value))
+    for word, bound, holds in (
+        ("above", above, above is None or value > above),
+        ("at least", at_least, at_least is None or value >= at_least),
+        ("at most", at_most, at_most is None or value <= at_most),
+        ("below", below, below is None or value < below),
+    ):
+        if bound is not None:
+            wanted.append(f"{word} {bound:g}")
+            good = good and holds
+    if not good:
+        raise ValueError(f"{name} must be {' and '.join(wanted) or 'finite'}, got {value}")
+
+
+@dataclass(frozen=True, slots=True)
+class PlantSpec:
+    """What a plant tells about its sizes, names, units, limits and period.
+
+    Attributes:
+        joint_names: n names, used in the columns of the log.
+        feature_names: m names, used in the columns of the log.
+        joint_velocity_limit: (n,), rad/s, positive.
+        joint_lower: (n,), rad.
+        joint_upper: (n,), rad.
+        period: control period, s.
+        feature_unit: unit of the feature.
+    """
+
+    joint_names: tuple[str, ...]
+    feature_names: tuple[str, ...]
+    joint_velocity_limit: FloatArray
+    joint_lower: FloatArray
+    joint_upper: FloatArray
+    period: float
+    feature_unit: str = "m"
+
+    def __post_init__(self) -> None:
+        """Check sizes and signs."""
+        for name in ("joint_velocity_limit", "joint_lower", "joint_upper"):
+            object.__setattr__(self, name, as_vector(name, getattr(self, name), self.n))
+        if not (self.joint_velocity_limit > 0.0).all():
+            raise ValueError(f"joint_velocity_limit must be positive, got {self.joint_velocity_limit.tolist()}")
+        if not (self.joint_lower < self.joint_upper).all():
+            raise ValueError("joint_lower must be below joint_upper for every joint")
+        if not self.period > 0.0:
+            raise ValueError(f"period must be positive, got {self.period} s")
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def m(self) -> int:
+        """Number of features."""
+        return len(self.feature_names)
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a controller sees at an instant.
+
+    Attributes:
+        time: s, k times the period.
+        joint_position: (n,), rad, as the encoders report it.
+        feature: (m,), in the unit of the plant's feature; the last valid one where `feature_valid` is false.
+        feature_valid: whether `feature` was measured for this instant.
+    """
+
+    time: float
+    joint_position: FloatArray
+    feature: FloatArray
+    feature_valid: bool = True
+
+    def __post_init__(self) -> None:
+        """Check that everything is finite and freeze the arrays."""
+        if not np.isfinite(self.time):
+            raise ValueError(f"time must be finite, got {self.time}")
+        for name in ("joint_position", "feature"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, as_vector(name, value, len(value)))
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What a controller asks for over the next period.
+
+    Attributes:
+        joint_velocity: (n,), rad/s.
+    """
+
+    joint_velocity: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check that everything is finite and freeze the array."""
+        value = self.joint_velocity
+        object.__setattr__(self, "joint_velocity", as_vector("joint_velocity", value, len(value)))
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What only the log may know.
+
+    Attributes:
+        feature: (m,), the feature without noise, latency or gaps.
+        jacobian: (m, n), ∂feature/∂joint_position, or None where the plant cannot tell.
+    """
+
+    feature: FloatArray
+    jacobian: FloatArray | None
