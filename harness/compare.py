@@ -109,5 +109,6 @@ def _carry_out(
     results.write_part(folder, index, result.row, result.steps)
     if result.picture is not None:
         (folder / PICTURES).mkdir(exist_ok=True)
-        cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), result.picture[..., ::-1])
+        large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), cv2.cvtColor(large, cv2.COLOR_RGB2BGR))
     return result.row

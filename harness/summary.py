@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pandas as pd
+from rich.box import SIMPLE
 from rich.table import Table
 
 from harness.experiment import COMPLETED
@@ -36,14 +37,19 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 def summary_table(runs: pd.DataFrame) -> Table:
     """Return the summary as a table for the terminal."""
-    table = Table(title="medians over runs; settled: came within 5 mm and stayed", title_justify="left")
+    table = Table(
+        title="medians over runs; settled: came within 5 mm and stayed",
+        title_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+    )
     table.add_column("", no_wrap=True)
     for heading in (
-        "completed",
+        "done",
         "settled",
-        "settling\n[s]",
-        "overshoot\n[%]",
-        "RMS end\n[mm]",
+        "after\n[s]",
+        "over-\nshoot\n[%]",
+        "RMS\nend\n[mm]",
         "path\nratio",
         "step\n[µs]",
     ):
@@ -56,7 +62,7 @@ def summary_table(runs: pd.DataFrame) -> Table:
             table.add_row(f"[bold]{block}[/bold]")
             previous = block
         table.add_row(
-            f"  {row['controller']}",
+            f" {row['controller']}",
             f"{row['completed']}/{row['runs']}",
             f"{row['settled']}/{row['runs']}",
             _number(row["settling_time_s"], 1.0, 2),
