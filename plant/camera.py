@@ -5,8 +5,8 @@ image of w × h pixels, the point (x, y, z) appears at (w/2 + f x/z, h/2 + f y/z
 PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), not at (u + ½, v + ½): missing that costs
 2.5 mm at 1.3 m.
 
-Noise models: stereo, RMS(z) = z² · subpixel / (f_native · baseline) (Intel, "Tuning D435 and D415 for best performance");
-structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012).
+Noise models: stereo, RMS(z) = z² · subpixel / (f_native · baseline) (Intel, "Tuning D435 and D415
+for best performance"); structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class PinholeCamera:
 
 
 def view_matrix(X_BC: FloatArray) -> FloatArray:
-    """Return the OpenGL view matrix, (4, 4), of a camera at X_BC (4, 4); OpenGL's camera has y up and looks along −z."""
+    """Return the OpenGL view matrix, (4, 4), of a camera at X_BC (4, 4); OpenGL has y up and looks along −z."""
     R, p = X_BC[:3, :3], X_BC[:3, 3]
     view = np.eye(4)
     view[:3, :3] = np.array([[1.0], [-1.0], [-1.0]]) * R.T

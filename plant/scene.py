@@ -1,7 +1,7 @@
 """The simulated bench: the one module that calls PyBullet.
 
-An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W is
-the arm's base frame B.
+An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W
+is the arm's base frame B.
 """
 
 from __future__ import annotations
