@@ -128,10 +128,16 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     fit = fit_sphere(rays, depth, start, radius)
     if fit is None or not fit.centre[2] > radius:
         return None
-    visible = len(depth) / float(np.pi * (camera.focal * radius / fit.centre[2]) ** 2)
+    visible = len(depth) / disc_area(fit.centre, camera, radius)
     plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
     complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
     return Detection(fit.centre, fit, visible) if plausible and complete else None
+
+
+def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
+    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    nearest2 = centre[2] ** 2 - radius**2
+    return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
 
 
 def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> SphereFit | None:
