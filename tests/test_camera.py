@@ -46,7 +46,7 @@ def test_structured_light_noise_follows_nguyen():
 
 @pytest.mark.parametrize("model", ["stereo", "structured_light"])
 def test_measured_depths_scatter_by_the_models_standard_deviation_about_the_truth(model):
-    noise = DepthNoise(model, quantisation=0.0)
+    noise = DepthNoise(model, depth_quantisation=0.0)
     measured = noise.apply(np.full(20000, 1.3), CAMERA, np.random.default_rng(0))
     sigma = float(noise.sigma(1.3, CAMERA))
     assert measured.std() == pytest.approx(sigma, rel=0.03)
@@ -54,14 +54,14 @@ def test_measured_depths_scatter_by_the_models_standard_deviation_about_the_trut
 
 
 def test_quantisation_rounds_to_the_sensors_unit():
-    measured = DepthNoise("none", quantisation=0.001).apply([1.23449, 1.2351], CAMERA, np.random.default_rng(0))
+    measured = DepthNoise("none", depth_quantisation=0.001).apply([1.23449, 1.2351], CAMERA, np.random.default_rng(0))
     np.testing.assert_allclose(measured, [1.234, 1.235], atol=1e-12)
 
 
 def test_without_noise_nothing_is_drawn_and_nothing_changes():
     generator, untouched = np.random.default_rng(3), np.random.default_rng(3)
     z = np.array([1.0, 1.1])
-    np.testing.assert_array_equal(DepthNoise("none", quantisation=0.0).apply(z, CAMERA, generator), z)
+    np.testing.assert_array_equal(DepthNoise("none", depth_quantisation=0.0).apply(z, CAMERA, generator), z)
     assert generator.random() == untouched.random()
 
 
@@ -84,11 +84,11 @@ def test_a_bad_camera_is_refused(change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"model": "kinect"}, "depth noise must be one of none, stereo, structured_light, got 'kinect'"),
-        ({"subpixel": -0.1}, "subpixel must be at least 0"),
-        ({"baseline": 0.0}, "baseline must be above 0"),
+        ({"depth_noise": "kinect"}, "depth_noise must be one of none, stereo, structured_light, got 'kinect'"),
+        ({"depth_subpixel": -0.1}, "depth_subpixel must be at least 0"),
+        ({"depth_baseline": 0.0}, "depth_baseline must be above 0"),
         ({"native_width": 0}, "native_width must be at least 1"),
-        ({"quantisation": -0.001}, "quantisation must be at least 0"),
+        ({"depth_quantisation": -0.001}, "depth_quantisation must be at least 0"),
     ],
 )
 def test_a_bad_noise_model_is_refused(change, message):
