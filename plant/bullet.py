@@ -172,7 +172,8 @@ class BulletPlant(Plant):
             raise FeatureLost(
                 f"the ball is not visible at the start {self._start.tolist()}: it is at {true.round(3).tolist()} m in "
                 f"the camera frame, column and row {self._camera.project(true).round(1).tolist()} of an image of "
-                f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight or cut by the border"
+                f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight, too small or cut "
+                "by the border"
             )
         self._channel.reset(first, named_generator(seed, "dropped_frames"))
         self._started = time.perf_counter()
