@@ -5,9 +5,9 @@ its ray r_i = (x/z, y/z, 1). A sphere of radius R about c meets that ray first a
 
     t_i(c) = (r_i·c − √D_i) / |r_i|²,          D_i = (r_i·c)² − |r_i|² (|c|² − R²)
 
-and c minimises Σ (z_i − t_i(c))² by Gauss-Newton with ∂t_i/∂c = −(t_i r_i − c)/√D_i. The noise lies along the ray, hence so
-do the residuals: a fit of distances to the centre would be biased by noise² / R. Pixels near the silhouette, where
-that slope grows without bound, and pixels whose residual stands far off the others' take no part.
+and c minimises Σ (z_i − t_i(c))² by Gauss-Newton with ∂t_i/∂c = −(t_i r_i − c)/√D_i. The noise lies along the ray,
+hence so do the residuals: a fit of distances to the centre would be biased by noise² / R. Pixels near the silhouette,
+where that slope grows without bound, and pixels whose residual stands far off the others' take no part.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ INNER_COSINE = 0.4  # of the angle between ray and surface normal, below which a
 OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
 OUTLIER_FLOOR = 0.002  # m, what is never an outlier
 MAX_RESIDUAL = 0.4  # of the radius, RMS beyond which the fit is implausible
+MAX_UNCERTAINTY = 0.1  # of the radius, standard error beyond which the fit says too little
 MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-6  # m
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
@@ -53,19 +54,34 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
-    """A ball that was found.
+class SphereFit:
+    """A sphere of known radius fitted to depths.
 
     Attributes:
         centre: (3,), m, camera frame.
-        residual: m, RMS of the depths that took part in the fit.
+        residual: m, RMS of the depths that took part.
         used: number of those depths.
-        visible: share of the ball's disc that is seen, about 1 where nothing hides it.
+        uncertainty: m, standard error of the centre by the residual, all axes together.
     """
 
     centre: FloatArray
     residual: float
     used: int
+    uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A ball that was found.
+
+    Attributes:
+        centre: (3,), m, camera frame.
+        fit: how well the sphere fits.
+        visible: share of the ball's disc that is seen, about 1 where nothing hides it.
+    """
+
+    centre: FloatArray
+    fit: SphereFit
     visible: float
 
 
@@ -110,19 +126,21 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     # The median depth over a sphere's disc is R/√2 nearer than its centre.
     start = middle * (float(np.median(depth)) + radius / np.sqrt(2.0))
     fit = fit_sphere(rays, depth, start, radius)
-    if fit is None:
+    if fit is None or not fit.centre[2] > radius:
         return None
-    centre, used, residual = fit
-    disc = np.pi * (camera.focal * radius / centre[2]) ** 2
-    visible = len(depth) / disc
-    if used < max(MIN_PIXELS, 0.5 * MIN_VISIBLE * disc) or not MIN_VISIBLE <= visible <= MAX_VISIBLE:
-        return None
-    return Detection(centre, residual, used, visible) if residual <= MAX_RESIDUAL * radius else None
+    visible = len(depth) / disc_area(fit.centre, camera, radius)
+    plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
+    complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
+    return Detection(fit.centre, fit, visible) if plausible and complete else None
 
 
-def fit_sphere(
-    rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float
-) -> tuple[FloatArray, int, float] | None:
+def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
+    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    nearest2 = centre[2] ** 2 - radius**2
+    return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
+
+
+def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> SphereFit | None:
     """Fit the centre of a sphere of known radius to depths along rays.
 
     Args:
@@ -132,34 +150,36 @@ def fit_sphere(
         radius: m.
 
     Returns:
-        The centre, (3,) m, how many depths took part, and the RMS of their residuals, m; None where the fit fails.
+        The fit, or None where too few depths agree with a sphere.
     """
     length2 = np.einsum("ij,ij->i", rays, rays)
+    rim = length2 * (INNER_COSINE * radius) ** 2
     centre = start
-    for _ in range(MAX_ITERATIONS):
+    for iteration in range(MAX_ITERATIONS + 1):
         along = rays @ centre
         D = along**2 - length2 * (centre @ centre - radius**2)
-        inner = np.flatnonzero(D >= length2 * (INNER_COSINE * radius) ** 2)
+        inner = np.flatnonzero(rim <= D)
         if len(inner) < MIN_PIXELS:
             return None
-        r, root = rays[inner], np.sqrt(D[inner])
+        root = np.sqrt(D[inner])
         t = (along[inner] - root) / length2[inner]
-        residual = depth[inner] - t
-        size = np.abs(residual)
+        slope = (centre - t[:, None] * rays[inner]) / root[:, None]
+        e = depth[inner] - t
+        size = np.abs(e)
         keep = size <= max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.median(size)))
-        used = int(np.count_nonzero(keep))
-        if used < MIN_PIXELS:
+        slope, e = slope[keep], e[keep]
+        if len(e) < MIN_PIXELS:
             return None
-        slope = ((centre - t[:, None] * r) / root[:, None])[keep]
-        kept = residual[keep]
-        normal = slope.T @ slope
-        step = np.linalg.solve(normal + 1e-9 * used * np.eye(3), slope.T @ kept)
-        # A step beyond the radius leaves the region in which the linearisation says anything.
-        step *= min(1.0, radius / max(float(np.linalg.norm(step)), 1e-12))
-        centre = centre + step
-        if float(np.abs(step).max()) < STEP_TOLERANCE:
-            return centre, used, float(np.sqrt(kept @ kept / used))
-    return centre, used, float(np.sqrt(kept @ kept / used))
+        # Gauss-Newton's normal matrix; the trace of its inverse is also the fit's variance for unit noise.
+        inverse = np.linalg.inv(slope.T @ slope + 1e-9 * len(e) * np.eye(3))
+        step = inverse @ (slope.T @ e)
+        length = float(np.linalg.norm(step))
+        if length < STEP_TOLERANCE or iteration == MAX_ITERATIONS:
+            break
+        # A step beyond the radius leaves the region in which the slope says anything.
+        centre = centre + step * min(1.0, radius / length)
+    residual = float(np.sqrt(e @ e / len(e)))
+    return SphereFit(centre, residual, len(e), residual * float(np.sqrt(np.trace(inverse))))
 
 
 def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeCamera, radius: float) -> ByteArray:

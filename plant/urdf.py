@@ -3,7 +3,8 @@
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
 
-No link has a collision shape: a mismatched arm's parts may overlap at rest, and the contact solver would throw it apart.
+No link has a collision shape: a mismatched arm's parts may overlap at rest, and the contact solver would throw it
+apart.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def arm_urdf(arm: SerialArm, body: ArmBody, ball_mesh: str) -> str:
         centre = rotation_from_rpy(arm.rpy[i + 1]) @ body.centre_of_mass[i] + step
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
-        link = add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre, along)
+        link = add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre=centre, along=along)
         _draw_link(link, step, body.tube_radius[i], body.side_step[i])
         add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
