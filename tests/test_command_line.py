@@ -71,7 +71,8 @@ def test_the_tables_have_the_promised_columns(monkeypatch, tmp_path):
     )  # fmt: skip
     runs = {
         "run_id", "plant", "controller", "task", "seed", "mismatch", "status", "settling_time_s",
-        "settling_time_5pct_s", "overshoot", "steady_state_error_m", "rms_error_m", "max_error_m", "path_length_ratio", "control_effort_rad",
+        "settling_time_5pct_s", "overshoot", "steady_state_error_m", "rms_error_m", "max_error_m",
+        "path_length_ratio", "control_effort_rad",
         "saturation_fraction", "jacobian_error_mean", "jacobian_condition_max", "controller_time_median_us",
         "controller_time_p99_us", "plant_time_median_us",
     }  # fmt: skip
