@@ -138,21 +138,18 @@ class QpProgram:
         """Forget the warm start; the solver is made anew because it may keep a working set of its own."""
         problem = {"x": self.x, "p": self.p, "f": self.objective, "g": self.rows}
         options = {"error_on_fail": False, "print_time": False, **_SOLVER_OPTIONS[self._solver]}
-        self._function = casadi.qpsol("mpc", self._solver, problem, options)
-        # qpOASES greets on its first solve, whatever its print level; that first solve is this empty one.
-        with contextlib.redirect_stdout(io.StringIO()):
-            self._function()
-        self._arrays = {name: np.zeros(self._function.numel_in(i)) for i, name in enumerate(self._function.name_in())}
-        self._results = {
-            name: np.zeros(self._function.numel_out(i)) for i, name in enumerate(self._function.name_out())
-        }
         buffer: Any
-        buffer, self._evaluate = self._function.buffer()  # views of the arrays: no conversion a call
+        with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made, whatever its print level
+            self._function = casadi.qpsol("mpc", self._solver, problem, options)
+            buffer, self._evaluate = self._function.buffer()  # views of the arrays: no conversion a call
         self._buffer = buffer
-        for i, array in enumerate(self._arrays.values()):
-            self._buffer.set_arg(i, array.data)
-        for i, array in enumerate(self._results.values()):
-            self._buffer.set_res(i, array.data)
+        inputs, outputs = self._function.name_in(), self._function.name_out()
+        self._arrays = {name: np.zeros(self._function.numel_in(i)) for i, name in enumerate(inputs)}
+        self._results = {name: np.zeros(self._function.numel_out(i)) for i, name in enumerate(outputs)}
+        for i, name in enumerate(inputs):
+            buffer.set_arg(i, self._arrays[name].data)
+        for i, name in enumerate(outputs):
+            buffer.set_res(i, self._results[name].data)
 
     def solve(self, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> QpSolution:
         """Solve for new parameters, starting from the last solution shifted by one move.
