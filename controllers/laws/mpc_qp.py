@@ -138,10 +138,15 @@ class QpProgram:
         """Forget the warm start; the solver is made anew because it may keep a working set of its own."""
         problem = {"x": self.x, "p": self.p, "f": self.objective, "g": self.rows}
         options = {"error_on_fail": False, "print_time": False, **_SOLVER_OPTIONS[self._solver]}
-        buffer: Any
-        with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made, whatever its print level
+        with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made and first used
             self._function = casadi.qpsol("mpc", self._solver, problem, options)
-            buffer, self._evaluate = self._function.buffer()  # views of the arrays: no conversion a call
+            self._connect()
+            self._evaluate()
+
+    def _connect(self) -> None:
+        """Give the solver views of our arrays, so that a solve converts nothing; all start at zero."""
+        buffer: Any
+        buffer, self._evaluate = self._function.buffer()
         self._buffer = buffer
         inputs, outputs = self._function.name_in(), self._function.name_out()
         self._arrays = {name: np.zeros(self._function.numel_in(i)) for i, name in enumerate(inputs)}
