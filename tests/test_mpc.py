@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controllers.controller import SolverFailed
+from controllers.controller import RobotKnowledge, SolverFailed
 from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.mpc_closed_form import constant_step, free_moves, horizon_integrals, move_weights
 from controllers.laws.mpc_qp import QpBounds, QpProgram, QpShape
@@ -34,7 +34,7 @@ def observe(spec, position=None, feature=None):
 
 
 def make_law(spec, preview=20, **settings):
-    return MpcLaw(MpcConfig(**settings), spec, preview)
+    return MpcLaw(MpcConfig(**settings), RobotKnowledge(spec, preview))
 
 
 def hold(target, preview=20):
@@ -356,12 +356,12 @@ def test_a_bad_setting_is_named(settings, message):
 def test_settings_that_do_not_fit_the_plant_are_named():
     config = MpcConfig()
     with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 10, got 9"):
-        MpcLaw(config, make_spec(), 9)
+        MpcLaw(config, RobotKnowledge(make_spec(), 9))
     with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 13, got 10"):
-        MpcLaw(replace(config, delay_periods=3), make_spec(), 10)
+        MpcLaw(replace(config, delay_periods=3), RobotKnowledge(make_spec(), 10))
     with pytest.raises(ValueError, match="view_tangent needs the 3 features x, y, z, got 2 features"):
-        MpcLaw(replace(config, view_tangent=(0.5, 0.5)), make_spec(m=2), 10)
+        MpcLaw(replace(config, view_tangent=(0.5, 0.5)), RobotKnowledge(make_spec(m=2), 10))
     with pytest.raises(ValueError, match=r"joint_weight must have shape \(6,\), got \(2,\)"):
-        MpcLaw(replace(config, joint_weight=(1.0, 2.0)), make_spec(), 10)
+        MpcLaw(replace(config, joint_weight=(1.0, 2.0)), RobotKnowledge(make_spec(), 10))
     with pytest.raises(ValueError, match="solver must be one of daqp, qpoases, got 'osqp'"):
         QpProgram(program()[1], "osqp")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, Literal, final, get_args
 
 import numpy as np
 
-from controllers.controller import Diagnostics, SolverFailed
+from controllers.controller import Diagnostics, RobotKnowledge, SolverFailed
 from controllers.laws.law import Law, scale_to_limit
 from controllers.laws.mpc_closed_form import (
     constant_step,
@@ -19,8 +19,9 @@ from controllers.laws.mpc_closed_form import (
     move_weights,
     preview_weights,
 )
+from controllers.laws.mpc_limits import joint_bounds
 from controllers.laws.mpc_qp import SOLVERS, QpBounds, QpProgram, QpShape, QpSolution
-from plant.signals import FloatArray, Observation, PlantSpec, as_vector, check_number
+from plant.signals import FloatArray, Observation, as_vector, check_number
 
 Mode = Literal["moves", "constant"]
 Solver = Literal["daqp", "qpoases"]
@@ -73,6 +74,7 @@ class MpcConfig:
             check_number("view_tangent", tangent, above=0.0)
 
 
+@final
 class MpcLaw(Law):
     """Receding-horizon law on the affine prediction y(k+τ) = ŷ + Ĵ Σ_{s≤τ} dq_s, after eq. 45.
 
@@ -101,17 +103,17 @@ class MpcLaw(Law):
     violated may not get worse, so that noise alone never makes the program infeasible.
     """
 
-    def __init__(self, config: MpcConfig, spec: PlantSpec, preview: int) -> None:
+    def __init__(self, config: MpcConfig, knowledge: RobotKnowledge) -> None:
         """Build the quadratic program.
 
         Args:
             config: settings.
-            spec: sizes, limits and period.
-            preview: future rows of the reference.
+            knowledge: sizes, limits, period and preview.
 
         Raises:
             ValueError: the preview does not reach the horizon, or a setting does not fit the sizes.
         """
+        spec, preview = knowledge.spec, knowledge.preview
         reach = config.horizon + config.delay_periods
         if config.use_preview and preview < reach:
             raise ValueError(f"preview must be at least horizon + delay_periods = {reach}, got {preview}")
@@ -191,21 +193,11 @@ class MpcLaw(Law):
         return np.asarray((integral + terminal)[None, :])
 
     def _bounds(self, joint_position: FloatArray, feature: FloatArray) -> QpBounds:
-        spec, config = self._spec, self._config
-        largest = spec.joint_velocity_limit * spec.period
-        change = np.full(spec.n, config.joint_acceleration_limit * spec.period**2)
-        count = config.horizon if config.mode == "moves" else 1
-        lower, upper = np.tile(-largest, (count, 1)), np.tile(largest, (count, 1))
-        lower[0] = np.maximum(lower[0], self._last - change)
-        upper[0] = np.minimum(upper[0], self._last + change)
-        return QpBounds(
-            move_lower=lower,
-            move_upper=upper,
-            change=change,
-            travel_lower=np.minimum(spec.joint_lower - joint_position, 0.0),
-            travel_upper=np.maximum(spec.joint_upper - joint_position, 0.0),
-            view_margin=np.minimum(-self._view @ feature, 0.0),
-        )
+        config = self._config
+        moves = config.horizon if config.mode == "moves" else 1
+        # A ball that is out of view already may not get further out.
+        margin = np.minimum(-self._view @ feature, 0.0)
+        return joint_bounds(self._spec, moves, self._last, config.joint_acceleration_limit, joint_position, margin)
 
     def _fall_back(self, jacobian: FloatArray, targets: FloatArray, status: str) -> FloatArray:
         """Return the step to send without a solution, (n,) rad."""

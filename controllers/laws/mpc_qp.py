@@ -8,7 +8,8 @@ Moves dq_1 … dq_H are condensed: the predicted displacement of the feature aft
          lower ≤ S_t ≤ upper                       joint positions
          V J S_t ≥ margin                          ball in view, rows V of `view_rows`
 
-The constant-move program has one move dq = dq_1 = … = dq_H and all position limits at S_H = H dq.
+Where the Jacobian varies along the horizon, as it does for a nonlinear model that is linearised along a trajectory, J is
+J_t. The constant-move program has one move dq = dq_1 = … = dq_H and all position limits at S_H = H dq.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ class QpShape:
         limit_acceleration: whether rows for the acceleration are wanted.
         limit_position: whether rows for the joint positions are wanted.
         view_rows: V, (v, m); no rows = no limit on the view.
+        varying_jacobian: whether every period has a Jacobian of its own; for free moves only.
     """
 
     n: int
@@ -54,6 +56,7 @@ class QpShape:
     limit_acceleration: bool
     limit_position: bool
     view_rows: FloatArray
+    varying_jacobian: bool = False
 
     @property
     def horizon(self) -> int:
@@ -160,12 +163,12 @@ class QpProgram:
         """Solve for new parameters, starting from the last solution shifted by one move.
 
         Args:
-            J: (m, n), m/rad.
+            J: (m, n), or (H, m, n) where it varies, m/rad.
             targets: (moves, m).
             bounds: finite or infinite, lower ≤ upper.
         """
         arrays, results = self._arrays, self._results
-        arrays["p"][:] = np.concatenate([J.ravel(order="F"), targets.ravel()])
+        arrays["p"][:] = np.concatenate([np.swapaxes(J, -1, -2).ravel(), targets.ravel()])
         arrays["lbx"][:], arrays["ubx"][:] = bounds.move_lower.ravel(), bounds.move_upper.ravel()
         arrays["lbg"][:], arrays["ubg"][:] = self._row_bounds(bounds)
         self._evaluate()
@@ -206,17 +209,18 @@ class QpProgram:
 
 def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
     """Return variables, parameters, criterion and rows as SX expressions."""
-    J = casadi.SX.sym("J", shape.m, shape.n)
+    blocks = shape.horizon if shape.varying_jacobian else 1
+    J = [casadi.SX.sym(f"J{t}", shape.m, shape.n) for t in range(blocks)]
     dq = casadi.SX.sym("dq", shape.n, shape.moves)
     targets = casadi.SX.sym("targets", shape.m, shape.moves)
+    travel = casadi.cumsum(dq, 1) if shape.constant_gain is None else shape.horizon * dq
+    shift = casadi.horzcat(*(J[t % blocks] @ travel[:, t] for t in range(shape.moves)))
     if shape.constant_gain is None:
-        travel = casadi.cumsum(dq, 1)
-        misses = targets - J @ travel
-        cost = 0.5 * casadi.dot(casadi.repmat(casadi.DM(shape.weights).T, shape.m, 1), misses**2)
+        weights = casadi.repmat(casadi.DM(shape.weights).T, shape.m, 1)
+        cost = 0.5 * casadi.dot(weights, (targets - shift) ** 2)
     else:
-        travel = shape.horizon * dq
-        shift = J @ dq
-        cost = 0.5 * shape.constant_gain * casadi.dot(shift, shift) - casadi.dot(targets, shift)
+        step = J[0] @ dq
+        cost = 0.5 * shape.constant_gain * casadi.dot(step, step) - casadi.dot(targets, step)
     cost += 0.5 * casadi.dot(casadi.repmat(casadi.DM(shape.move_weight), 1, shape.moves), dq**2)
     rows = []
     if shape.limit_acceleration:
@@ -224,5 +228,6 @@ def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
     if shape.limit_position:
         rows.append(casadi.vec(travel))
     if len(shape.view_rows):
-        rows.append(casadi.vec(casadi.DM(shape.view_rows) @ J @ travel))
-    return casadi.vec(dq), casadi.vertcat(casadi.vec(J), casadi.vec(targets)), cost, casadi.vertcat(*rows)
+        rows.append(casadi.vec(casadi.DM(shape.view_rows) @ shift))
+    parameters = casadi.vertcat(*(casadi.vec(block) for block in (*J, targets)))
+    return casadi.vec(dq), parameters, cost, casadi.vertcat(*rows)
