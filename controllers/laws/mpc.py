@@ -143,7 +143,7 @@ class MpcLaw(Law):
             SolverFailed: no solution, and the fallback is "raise".
         """
         config, delay = self._config, self._config.delay_periods
-        feature = observation.feature + jacobian @ np.sum(self._sent, axis=0)
+        feature = observation.feature + jacobian @ sum(self._sent, np.zeros(self._spec.n))
         rows = reference[delay : delay + config.horizon + 1] if config.use_preview else reference[:1]
         error = rows[0] - feature
         travel = rows[1:] - rows[0] if config.use_preview else np.zeros((config.horizon, self._spec.m))
@@ -165,7 +165,7 @@ class MpcLaw(Law):
     def _forget(self) -> None:
         delay, n = self._config.delay_periods, self._spec.n
         self._last = np.zeros(n)
-        self._sent: deque[FloatArray] = deque([np.zeros(n)] * max(delay, 1), maxlen=max(delay, 1))
+        self._sent: deque[FloatArray] = deque([np.zeros(n)] * delay, maxlen=delay)
         self._fallbacks = 0
         self._diagnostics: dict[str, float] = {}
 
@@ -197,7 +197,14 @@ class MpcLaw(Law):
         moves = config.horizon if config.mode == "moves" else 1
         # A ball that is out of view already may not get further out.
         margin = np.minimum(-self._view @ feature, 0.0)
-        return joint_bounds(self._spec, moves, self._last, config.joint_acceleration_limit, joint_position, margin)
+        return joint_bounds(
+            self._spec,
+            moves,
+            self._last,
+            acceleration_limit=config.joint_acceleration_limit,
+            joint_position=joint_position,
+            view_margin=margin,
+        )
 
     def _fall_back(self, jacobian: FloatArray, targets: FloatArray, status: str) -> FloatArray:
         """Return the step to send without a solution, (n,) rad."""

@@ -12,6 +12,7 @@ def joint_bounds(
     spec: PlantSpec,
     moves: int,
     last_step: FloatArray,
+    *,
     acceleration_limit: float,
     joint_position: FloatArray,
     view_margin: FloatArray,

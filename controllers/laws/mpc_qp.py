@@ -8,8 +8,8 @@ Moves dq_1 … dq_H are condensed: the predicted displacement of the feature aft
          lower ≤ S_t ≤ upper                       joint positions
          V J S_t ≥ margin                          ball in view, rows V of `view_rows`
 
-Where the Jacobian varies along the horizon, as it does for a nonlinear model that is linearised along a trajectory, J is
-J_t. The constant-move program has one move dq = dq_1 = … = dq_H and all position limits at S_H = H dq.
+Where the Jacobian varies along the horizon, as for a nonlinear model linearised along a trajectory, J is J_t.
+The constant-move program has one move dq = dq_1 = … = dq_H and all position limits at S_H = H dq.
 """
 
 from __future__ import annotations
