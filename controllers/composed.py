@@ -23,6 +23,7 @@ from controllers.estimators.ukf import UkfConfig, UkfEstimator
 from controllers.initial import InitialConfig, initial_jacobian
 from controllers.laws.law import Law
 from controllers.laws.mfac import MfacConfig, MfacLaw
+from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.pid import PidConfig, PidLaw
 from controllers.servo import ServoController
 
@@ -68,6 +69,7 @@ ESTIMATORS: dict[str, EstimatorEntry] = {
 LAWS: dict[str, LawEntry] = {
     "pid": LawEntry(PidConfig, PidLaw),
     "mfac": LawEntry(MfacConfig, MfacLaw),
+    "mpc": LawEntry(MpcConfig, MpcLaw),
 }
 
 

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, TypeAlias
 from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
+SymbolicFeature: TypeAlias = Callable[[Any], Any]
 Diagnostics: TypeAlias = Mapping[str, float]
 
 
@@ -47,12 +48,15 @@ class RobotKnowledge:
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
         true_jacobian: the same of the true robot; only handed to a controller whose entry asks for the truth.
+        true_symbolic: a CasADi expression q, (n, 1) rad -> the expression of the true robot's feature, (m, 1); under
+            the same condition. None where the plant has no closed form.
     """
 
     spec: PlantSpec
     preview: int
     nominal_jacobian: JacobianFunction | None = None
     true_jacobian: JacobianFunction | None = None
+    true_symbolic: SymbolicFeature | None = None
 
 
 class Controller(ABC):
@@ -97,7 +101,7 @@ class ControllerEntry:
         summary: one line for `servobench controllers`.
         config: frozen dataclass with a default for every field.
         build: makes the controller from its configuration and what it may know.
-        needs_truth: it is told the true Jacobian: a bound, not a competitor.
+        needs_truth: it is told the true Jacobian and kinematics: a bound, not a competitor.
     """
 
     name: str
