@@ -15,13 +15,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from controllers.composed import ESTIMATORS, LAWS
 from harness import results
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
 from harness.figures import draw_figures
 from harness.manifest import describe_batch
 from harness.registry import controller_names, find_controller, find_plant, plant_names
-from harness.summary import summary_table
+from harness.summary import summary_tables
 from harness.tasks import TASKS, find_task, task_names
 
 INTERRUPTED = 130
@@ -64,7 +65,8 @@ def tasks(name: NameArgument = None) -> None:
 @app.command()
 def run(
     plant: Annotated[str, typer.Option(help="Name of the plant.")] = "bullet",
-    controller: Annotated[str, typer.Option(help="Name of the controller.")] = "ukf_mfac",
+    controller: Annotated[str, typer.Option(help="Name of the controller, or of a law with --estimator.")] = "ukf_mfac",
+    estimator: Annotated[str | None, typer.Option(help="Compose the law --controller with this estimator.")] = None,
     task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",
     mismatch: Annotated[str, typer.Option(help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.")] = (
         "moderate"
@@ -81,7 +83,8 @@ def run(
         if plant != "bullet":
             raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
         assignments.append("bullet.view=true")
-    batch = Batch((plant,), (controller,), (task,), (mismatch,), parse_seeds(f"{seed},"))
+    name = f"{controller}+{estimator}" if estimator else controller
+    batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
     _carry_out(batch, read_settings(config, assignments), 1, out)
 
 
@@ -145,7 +148,7 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None)
             interrupted = True
     results.collect(folder)
     runs = results.load_runs(folder)
-    console.print(summary_table(runs))
+    console.print(summary_tables(runs))
     _print_faults(runs)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
@@ -181,7 +184,7 @@ def _names(kind: str, text: str, known: list[str]) -> tuple[str, ...]:
     if not names:
         raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:
-        if name not in known:
+        if name not in known and "+" not in name:
             raise ConfigurationError(f"unknown name {name!r} in --{kind}: {suggest(name, known)}")
     return names
 
@@ -201,6 +204,9 @@ def _list_or_show(
         for known in names:
             table.add_row(known, find(known).summary)
     console.print(table)
+    if kind == "controllers" and not name:
+        console.print(f"or any law with any estimator, such as mfac+rls: laws {', '.join(LAWS)};", soft_wrap=True)
+        console.print(f"estimators {', '.join(ESTIMATORS)}", soft_wrap=True)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def check_batch(batch: Batch, settings: Settings) -> None:
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used.
     """
-    settings.check_sections(known_sections())
+    settings.check_sections([*known_sections(), *batch.controllers])
     first = batch.seeds[0]
     for plant, mismatch in product(batch.plants, batch.mismatches):
         build_experiment(

@@ -24,6 +24,7 @@ from plant.mismatch import MismatchSample, parse_mismatch, sample_mismatch
 from plant.plant import ImageArray, Plant, PlantSetup
 from plant.seeds import named_seed
 from plant.signals import RunFault, check_number
+from plant.symbolic import symbolic_feature
 from plant.ur5 import nominal_ur5
 
 COMPLETED = "completed"
@@ -190,6 +191,7 @@ def _build_controller(
         preview=run.preview,
         nominal_jacobian=nominal.jacobian,
         true_jacobian=true.jacobian if entry.needs_truth else None,
+        true_symbolic=symbolic_feature(true) if entry.needs_truth else None,
     )
     try:
         return entry.build(config, knowledge)
