@@ -83,8 +83,8 @@ class Scene:
 
     def _load(self, arm: SerialArm, body: ArmBody, physics_step: float, *, scenery: bool) -> None:
         client = self._client
-        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps every
-        # mesh it ever loaded by file name, so memory would grow from plant to plant.
+        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps
+        # every mesh it ever loaded by file name, so memory would grow from plant to plant.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
         )
