@@ -67,10 +67,13 @@ class Scene:
 
         Raises:
             ValueError: a window is wanted where there is no display.
+            ConnectionError: PyBullet opens no world, as too many are open.
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
         self._client: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
+        if self._client < 0:
+            raise ConnectionError("PyBullet could not open a physics world")
         try:
             self._load(arm, body, physics_step, scenery=scenery)
         except BaseException:
