@@ -12,6 +12,7 @@ where that slope grows without bound, and pixels whose residual stands far off t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -27,6 +28,7 @@ IntArray = npt.NDArray[np.intp]
 # OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
 # both ends 0 and 180, and one range covers purplish and orange reds.
 RED_LOWER, RED_UPPER = (111, 120, 40), (129, 255, 255)
+FULL_BOX = 0.6  # share of red pixels; a disc fills π/4 of its box
 MIN_PIXELS = 16  # fewer do not fix three coordinates under noise
 MIN_VISIBLE = 0.4  # share of the ball's disc that must be seen
 MAX_VISIBLE = 1.4  # a larger red patch is not the ball
@@ -35,8 +37,10 @@ OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an out
 OUTLIER_FLOOR = 0.002  # m, what is never an outlier
 MAX_RESIDUAL = 0.4  # of the radius, RMS beyond which the fit is implausible
 MAX_UNCERTAINTY = 0.1  # of the radius, standard error beyond which the fit says too little
+SELECTIONS = 3  # iterations that choose their depths anew
 MAX_ITERATIONS = 10
-STEP_TOLERANCE = 1e-6  # m
+STEP_TOLERANCE = 1e-5  # m; what is left after such a step is far smaller
+RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
 
 
@@ -98,11 +102,12 @@ def find_patch(rgb: ByteArray) -> Patch | None:
     x, y, width, height = cv2.boundingRect(mask)
     if width * height < MIN_PIXELS:
         return None
-    # Only the box around all red is looked at, as the search for connected parts would be slow on the whole image.
-    box = np.ascontiguousarray(mask[y : y + height, x : x + width])
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(box, connectivity=8)
-    largest = 1 + int(np.argmax(statistics[1:count, cv2.CC_STAT_AREA]))
-    rows, columns = np.nonzero(labels == largest)
+    # Only the box around all red is looked at. A full one holds one patch; the search for connected parts is slow.
+    red = mask[y : y + height, x : x + width] > 0
+    if np.count_nonzero(red) < FULL_BOX * width * height:
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(red.astype(np.uint8), connectivity=8)
+        red = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+    rows, columns = np.nonzero(red)
     rows, columns = rows + y, columns + x
     image_height, image_width = mask.shape
     cut = rows[0] == 0 or rows[-1] == image_height - 1 or columns.min() == 0 or columns.max() == image_width - 1
@@ -152,34 +157,48 @@ def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: f
     Returns:
         The fit, or None where too few depths agree with a sphere.
     """
-    length2 = np.einsum("ij,ij->i", rays, rays)
-    rim = length2 * (INNER_COSINE * radius) ** 2
     centre = start
-    for iteration in range(MAX_ITERATIONS + 1):
-        along = rays @ centre
-        D = along**2 - length2 * (centre @ centre - radius**2)
-        inner = np.flatnonzero(rim <= D)
-        if len(inner) < MIN_PIXELS:
-            return None
-        root = np.sqrt(D[inner])
-        t = (along[inner] - root) / length2[inner]
-        slope = (centre - t[:, None] * rays[inner]) / root[:, None]
-        e = depth[inner] - t
-        size = np.abs(e)
-        keep = size <= max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.median(size)))
-        slope, e = slope[keep], e[keep]
-        if len(e) < MIN_PIXELS:
-            return None
-        # Gauss-Newton's normal matrix; the trace of its inverse is also the fit's variance for unit noise.
-        inverse = np.linalg.inv(slope.T @ slope + 1e-9 * len(e) * np.eye(3))
-        step = inverse @ (slope.T @ e)
-        length = float(np.linalg.norm(step))
-        if length < STEP_TOLERANCE or iteration == MAX_ITERATIONS:
-            break
+    for iteration in range(MAX_ITERATIONS):
+        # Choosing anew for ever would let a pixel at the gate swing in and out, and the centre with it.
+        if iteration < SELECTIONS:
+            chosen = choose_depths(rays, depth, centre, radius)
+            if len(chosen) < MIN_PIXELS:
+                return None
+            r, z = rays[chosen], depth[chosen]
+        t, root = first_hit(r, centre, radius)
+        e = z - t
+        slope = (centre - t[:, None] * r) / root[:, None]
+        normal = slope.T @ slope + RIDGE * len(e)
+        step = np.linalg.solve(normal, slope.T @ e)
+        length = math.sqrt(step @ step)
         # A step beyond the radius leaves the region in which the slope says anything.
-        centre = centre + step * min(1.0, radius / length)
-    residual = float(np.sqrt(e @ e / len(e)))
-    return SphereFit(centre, residual, len(e), residual * float(np.sqrt(np.trace(inverse))))
+        centre = centre + step * min(1.0, radius / max(length, radius))
+        if iteration >= SELECTIONS and length < STEP_TOLERANCE:
+            break
+    residual = math.sqrt(e @ e / len(e))
+    # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.
+    return SphereFit(centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal))))
+
+
+def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+    """Return where rays (k, 3) first meet a sphere: the depths t (k,) m and the roots √D (k,); D is kept positive."""
+    length2, along = np.einsum("ij,ij->i", rays, rays), rays @ centre
+    D = along * along - length2 * (centre @ centre - radius**2)
+    root = np.sqrt(np.maximum(D, (0.1 * INNER_COSINE * radius) ** 2))
+    return (along - root) / length2, root
+
+
+def choose_depths(rays: FloatArray, depth: FloatArray, centre: FloatArray, radius: float) -> IntArray:
+    """Return the indices of the rays that meet the sphere well inside its silhouette and whose depth is no outlier."""
+    t, root = first_hit(rays, centre, radius)
+    inner = np.flatnonzero(root >= INNER_COSINE * radius * np.sqrt(np.einsum("ij,ij->i", rays, rays)))
+    if len(inner) == 0:
+        return inner
+    size = np.abs(depth[inner] - t[inner])
+    middle = len(inner) // 2
+    # 1.4826 times the median size estimates the standard deviation, whatever the outliers.
+    gate = max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.partition(size, middle)[middle]))
+    return inner[size <= gate]
 
 
 def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeCamera, radius: float) -> ByteArray:

@@ -67,10 +67,13 @@ class Scene:
 
         Raises:
             ValueError: a window is wanted where there is no display.
+            ConnectionError: PyBullet opens no world, as too many are open.
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
         self._client: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
+        if self._client < 0:
+            raise ConnectionError("PyBullet could not open a physics world")
         try:
             self._load(arm, body, physics_step, scenery=scenery)
         except BaseException:
@@ -83,8 +86,8 @@ class Scene:
 
     def _load(self, arm: SerialArm, body: ArmBody, physics_step: float, *, scenery: bool) -> None:
         client = self._client
-        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps every
-        # mesh it ever loaded by file name, so memory would grow from plant to plant.
+        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps
+        # every mesh it ever loaded by file name, so memory would grow from plant to plant.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
         )

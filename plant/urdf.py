@@ -148,15 +148,20 @@ def _draw_base(link: ET.Element, step: FloatArray, radius: float) -> None:
 
 
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
-    """Draw a link: a housing about its joint's axis, a tube beside the axis, and the way over to the next joint."""
-    corner, end = np.array([step[0], step[1], side]), step
-    beyond = np.array([0.0, 0.0, np.copysign(1.12 * radius, side or -1.0)])
-    top = np.array([0.0, 0.0, side])
-    draw_cylinder(link, ALUMINIUM, -beyond if side == 0.0 else np.zeros(3), top + beyond, 1.06 * radius)
-    draw_cylinder(link, LIGHT_BLUE, top + beyond, top + 1.25 * beyond, 1.0 * radius)
+    """Draw a link: a capped housing about its joint, a tube beside it, and the way over to the next joint."""
+    top, corner, end = np.array([0.0, 0.0, side]), np.array([step[0], step[1], side]), step
+    far_aside = abs(side) > radius
+    # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
+    outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
+    draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
+    draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
     draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
-    draw_cylinder(link, DARK_GREY, corner, end, 0.85 * radius)
-    draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
+    draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
+    if far_aside:
+        draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
+        draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
+    else:
+        draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
 
 
 def _draw_tool(link: ET.Element, tool: FloatArray, body: ArmBody) -> None:
