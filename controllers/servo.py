@@ -23,8 +23,10 @@ class ServoController(Controller):
     """Estimates the Jacobian from what moved and commands by what it estimates.
 
     Each step learns from the motion between the last valid feature and the present one, so that Δy and Δq span the same
-    gap when frames are lost; a step without a valid feature learns nothing. While the initial Jacobian is being probed,
-    the probing moves are the command and neither estimator nor law is asked.
+    gap when frames are lost; a step without a valid feature learns nothing. Joint positions are read without delay, so
+    under camera latency Δy is that of a motion a little earlier: while the arm speeds up or slows down, an estimator is
+    misled. While the initial Jacobian is being probed, the probing moves are the command and neither estimator nor law is
+    asked.
 
     Attributes:
         estimator: the Jacobian estimator, for a look at its state.
