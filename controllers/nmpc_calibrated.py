@@ -12,8 +12,8 @@ import numpy as np
 
 from controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge, SolverFailed
 from controllers.laws.mpc_closed_form import decay_targets, move_weights
-from controllers.laws.mpc_limits import joint_bounds
-from controllers.laws.mpc_qp import SOLVERS, QpProgram, QpShape, QpSolution
+from controllers.laws.mpc_limits import LimitedProgram, joint_bounds
+from controllers.laws.mpc_qp import SOLVERS, QpShape, QpSolution
 from plant.signals import Command, FloatArray, Observation, check_number
 
 Fallback = Literal["hold", "raise"]
@@ -102,7 +102,7 @@ class NmpcCalibrated(Controller):
             view_rows=np.zeros((0, m)),
             varying_jacobian=True,
         )
-        self._program = QpProgram(shape, config.solver)
+        self._program = LimitedProgram(shape, config.solver)
         self._b: FloatArray = np.zeros(m)
         self._jacobian: FloatArray | None = None
         self._forget()

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from controllers.controller import RobotKnowledge, SolverFailed
 from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.mpc_closed_form import constant_step, free_moves, horizon_integrals, move_weights
+from controllers.laws.mpc_limits import LimitedProgram
 from controllers.laws.mpc_qp import QpBounds, QpProgram, QpShape
 from plant.signals import Observation, PlantSpec
 
@@ -159,6 +160,20 @@ def test_daqp_equals_qpoases(seed):
     assert solutions[0].objective == pytest.approx(solutions[1].objective, abs=1e-8)
     assert math.isnan(solutions[0].iterations)
     assert solutions[1].iterations > 0
+
+
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("travel", [0.4, 1.4, 1.6])
+def test_position_rows_out_of_reach_change_nothing(constant, travel):
+    # Five moves of at most 0.3 rad reach 1.5 rad: a limit at 1.6 rad is left out, nearer ones are not.
+    qp, shape = program(constant=constant)
+    limited = LimitedProgram(shape, "daqp")
+    bounds = make_bounds(shape, move=0.3, travel=travel)
+    J, targets = random_jacobian(1, 2, 4), np.full((shape.moves, 2), 3.0 * (40.0 if constant else 1.0))
+    found = limited.solve(J, targets, bounds)
+    np.testing.assert_allclose(found.moves, qp.solve(J, targets, bounds).moves, atol=1e-9)
+    dropped = found.row_multiplier.size < qp.solve(J, targets, bounds).row_multiplier.size
+    assert dropped == (travel > 1.5)
 
 
 def test_solvers_print_nothing(capfd):

@@ -19,8 +19,8 @@ from controllers.laws.mpc_closed_form import (
     move_weights,
     preview_weights,
 )
-from controllers.laws.mpc_limits import joint_bounds
-from controllers.laws.mpc_qp import SOLVERS, QpBounds, QpProgram, QpShape, QpSolution
+from controllers.laws.mpc_limits import LimitedProgram, joint_bounds
+from controllers.laws.mpc_qp import SOLVERS, QpBounds, QpShape, QpSolution
 from plant.signals import FloatArray, Observation, as_vector, check_number
 
 Mode = Literal["moves", "constant"]
@@ -127,7 +127,7 @@ class MpcLaw(Law):
         self._preview_weights = preview_weights(config.horizon, config.alpha)
         self._gain = self._integrals.a + config.terminal_weight * config.horizon**2
         self._view = _view_rows(config.view_tangent, spec.m)
-        self._program = QpProgram(self._shape(), config.solver)
+        self._program = LimitedProgram(self._shape(), config.solver)
         self._forget()
 
     def reset(self, observation: Observation) -> None:

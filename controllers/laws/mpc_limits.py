@@ -1,10 +1,13 @@
-"""The limits of a robot's joints as bounds of a predictive program."""
+"""The limits of a robot's joints as bounds of a predictive program, and the program that drops those out of reach."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import final
+
 import numpy as np
 
-from controllers.laws.mpc_qp import QpBounds
+from controllers.laws.mpc_qp import QpBounds, QpProgram, QpShape, QpSolution
 from plant.signals import FloatArray, PlantSpec
 
 
@@ -32,7 +35,9 @@ def joint_bounds(
     """
     largest = spec.joint_velocity_limit * spec.period
     change = np.full(spec.n, acceleration_limit * spec.period**2)
-    lower, upper = np.tile(-largest, (moves, 1)), np.tile(largest, (moves, 1))
+    upper = np.empty((moves, spec.n))
+    upper[:] = largest
+    lower = -upper
     lower[0] = np.maximum(lower[0], last_step - change)
     upper[0] = np.minimum(upper[0], last_step + change)
     return QpBounds(
@@ -43,3 +48,34 @@ def joint_bounds(
         travel_upper=np.maximum(spec.joint_upper - joint_position, 0.0),
         view_margin=view_margin,
     )
+
+
+@final
+class LimitedProgram:
+    """A `QpProgram` that leaves the position rows out while no joint can reach a limit within the horizon.
+
+    Rows that no feasible plan touches change nothing but the time: they are a third of it for six joints and ten moves.
+    """
+
+    def __init__(self, shape: QpShape, solver: str) -> None:
+        """Build the program, twice where the shape limits positions.
+
+        Raises:
+            ValueError: an unknown solver.
+        """
+        self._horizon = shape.horizon
+        self._without = QpProgram(replace(shape, limit_position=False), solver)
+        self._with = QpProgram(shape, solver) if shape.limit_position else self._without
+
+    def reset(self) -> None:
+        """Forget the warm starts."""
+        self._without.reset()
+        if self._with is not self._without:
+            self._with.reset()
+
+    def solve(self, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> QpSolution:
+        """Solve for new parameters; see `QpProgram.solve`."""
+        reach = self._horizon * np.maximum(bounds.move_upper[-1], -bounds.move_lower[-1])
+        free = (bounds.travel_upper > reach).all() and (bounds.travel_lower < -reach).all()
+        program = self._without if free else self._with
+        return program.solve(J, targets, bounds)

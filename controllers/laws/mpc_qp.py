@@ -195,16 +195,21 @@ class QpProgram:
     def _row_bounds(self, bounds: QpBounds) -> tuple[FloatArray, FloatArray]:
         """The bounds of the rows, in the order in which `_expressions` stacks them."""
         shape = self._shape
-        lower, upper = [np.zeros(0)], [np.zeros(0)]
+        lower, upper = [], []
         if shape.limit_acceleration:
-            lower.append(np.tile(-bounds.change, shape.moves - 1))
-            upper.append(np.tile(bounds.change, shape.moves - 1))
+            lower.append(_repeat(-bounds.change, shape.moves - 1))
+            upper.append(_repeat(bounds.change, shape.moves - 1))
         if shape.limit_position:
-            lower.append(np.tile(bounds.travel_lower, shape.moves))
-            upper.append(np.tile(bounds.travel_upper, shape.moves))
-        lower.append(np.tile(bounds.view_margin, shape.moves))
-        upper.append(np.full(len(shape.view_rows) * shape.moves, np.inf))
+            lower.append(_repeat(bounds.travel_lower, shape.moves))
+            upper.append(_repeat(bounds.travel_upper, shape.moves))
+        lower.append(_repeat(bounds.view_margin, shape.moves))
+        upper.append(np.full(lower[-1].size, np.inf))
         return np.concatenate(lower), np.concatenate(upper)
+
+
+def _repeat(row: FloatArray, count: int) -> FloatArray:
+    """Return `row` `count` times in a row; numpy's own `tile` costs as much as a small solve."""
+    return np.broadcast_to(row, (count, row.size)).ravel()
 
 
 def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
