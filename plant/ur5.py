@@ -50,6 +50,13 @@ TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
 BALL_RADIUS = 0.035  # m
 
 # The camera hangs above the workspace and looks straight down; image up is +x of the base.
+# The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
+HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
+
+# The box of joint positions in which networks are trained on the nominal model, rad.
+TRAINING_LOWER = (-0.25, -2.29, -3.04, 0.39, 0.92, -0.3)
+TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
+
 WORKSPACE_CENTRE = (0.5, 0.0, 0.25)  # m, base frame
 CAMERA_DISTANCE = 1.3  # m, from the camera to the workspace's centre
 R_BC_DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
