@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
@@ -61,6 +62,7 @@ def window_step(theta: FloatArray, joint_steps: FloatArray, k2: float, epsilon: 
     return k2 / total if total > 0.0 else 0.0
 
 
+@final
 class RbfEstimator(Estimator):
     """Jacobian network with the paper's windowed gradient update.
 
@@ -109,7 +111,7 @@ class RbfEstimator(Estimator):
         gradient, error = window_gradient(self._weights, thetas, joint_steps, feature_steps)
         self._step = window_step(thetas, joint_steps, self._config.k2, self._config.epsilon)
         self._weights = self._weights + self._step * gradient
-        self._prediction_error = float(np.linalg.norm(error[-1]))
+        self._window_error = float(np.linalg.norm(error))
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad."""
@@ -117,10 +119,10 @@ class RbfEstimator(Estimator):
         return jacobian_output(self._weights, theta)
 
     def diagnostics(self) -> Diagnostics:
-        """Return the step size α₂, the prediction error ‖Δy − ĴΔq‖ (m) and the norm of all weights."""
+        """Return the step size α₂, the root of Q, the window's prediction error (m), and the norm of all weights."""
         return {
             "estimator_step_size": self._step,
-            "prediction_error": self._prediction_error,
+            "window_error": self._window_error,
             "estimator_weight_norm": float(np.linalg.norm(self._weights)),
         }
 
@@ -128,4 +130,4 @@ class RbfEstimator(Estimator):
         self._weights = self._network.weights.copy()
         self._window: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque(maxlen=self._config.window)
         self._step = 0.0
-        self._prediction_error = 0.0
+        self._window_error = 0.0
