@@ -12,9 +12,12 @@ from functools import cache
 from typing import Any
 
 from controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from controllers.estimators.broyden import BroydenConfig, BroydenEstimator
+from controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
 from controllers.estimators.constant import ConstantConfig, ConstantEstimator
 from controllers.estimators.estimator import Estimator
 from controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from controllers.estimators.rls import RlsConfig, RlsEstimator
 from controllers.estimators.true import TrueConfig, TrueEstimator
 from controllers.estimators.ukf import UkfConfig, UkfEstimator
 from controllers.initial import InitialConfig, initial_jacobian
@@ -57,6 +60,9 @@ ESTIMATORS: dict[str, EstimatorEntry] = {
     "true": EstimatorEntry(TrueConfig, lambda _config, knowledge: TrueEstimator(knowledge), needs_truth=True),
     "ukf": EstimatorEntry(UkfConfig, lambda config, _knowledge: UkfEstimator(config)),
     "kalman": EstimatorEntry(KalmanConfig, lambda config, _knowledge: KalmanEstimator(config)),
+    "broyden": EstimatorEntry(BroydenConfig, lambda config, _knowledge: BroydenEstimator(config)),
+    "rls": EstimatorEntry(RlsConfig, lambda config, _knowledge: RlsEstimator(config)),
+    "cfdl": EstimatorEntry(CfdlConfig, lambda config, _knowledge: CfdlEstimator(config)),
 }
 
 LAWS: dict[str, LawEntry] = {

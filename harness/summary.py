@@ -36,31 +36,27 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 
 def summary_table(runs: pd.DataFrame) -> Table:
     """Return the summary as a table for the terminal."""
-    table = Table(title="medians over runs; settled = within 5 mm and stays", title_justify="left")
-    for heading, justify in (
-        ("plant", "left"),
-        ("mismatch", "left"),
-        ("task", "left"),
-        ("controller", "left"),
-        ("completed", "right"),
-        ("settled", "right"),
-        ("settling [s]", "right"),
-        ("overshoot [%]", "right"),
-        ("RMS end [mm]", "right"),
-        ("path ratio", "right"),
-        ("step [µs]", "right"),
+    table = Table(title="medians over runs; settled: came within 5 mm and stayed", title_justify="left")
+    table.add_column("", no_wrap=True)
+    for heading in (
+        "completed",
+        "settled",
+        "settling\n[s]",
+        "overshoot\n[%]",
+        "RMS end\n[mm]",
+        "path\nratio",
+        "step\n[µs]",
     ):
-        table.add_column(heading, justify="left" if justify == "left" else "right", no_wrap=True)
-    previous: tuple[str, ...] | None = None
+        table.add_column(heading, justify="right", no_wrap=True)
+    previous = None
     for row in summarise(runs).to_dict("records"):
-        block = (row["plant"], row["mismatch"], row["task"])
-        if previous is not None and block != previous:
+        block = f"{row['task']} on {row['plant']}, {row['mismatch']}"
+        if block != previous:
             table.add_section()
-        shown = block if block != previous else ("", "", "")
-        previous = block
+            table.add_row(f"[bold]{block}[/bold]")
+            previous = block
         table.add_row(
-            *shown,
-            row["controller"],
+            f"  {row['controller']}",
             f"{row['completed']}/{row['runs']}",
             f"{row['settled']}/{row['runs']}",
             _number(row["settling_time_s"], 1.0, 2),

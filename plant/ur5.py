@@ -45,6 +45,10 @@ MAX_TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # Nm
 MAX_JOINT_SPEED = np.pi  # rad/s, the vendor's limit
 JOINT_RANGE = 2 * np.pi  # rad, each way
 
+# For the looks only: tube radii, and how far a link's tube runs beside its joints, along the joint's axis.
+TUBE_RADIUS = (0.062, 0.056, 0.047, 0.04, 0.04, 0.038)  # m
+SIDE_STEP = (0.0, 0.136, 0.0165, 0.0, 0.0, 0.0)  # m
+
 # The ball stands off the flange so that the wrist does not hide it from above.
 TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
 BALL_RADIUS = 0.035  # m
