@@ -25,12 +25,16 @@ class ServoController(Controller):
     Each step learns from the motion between the last valid feature and the present one, so that Δy and Δq span the same
     gap when frames are lost; a step without a valid feature learns nothing. While the initial Jacobian is being probed,
     the probing moves are the command and neither estimator nor law is asked.
+
+    Attributes:
+        estimator: the Jacobian estimator, for a look at its state.
+        law: the control law, likewise.
     """
 
     def __init__(self, estimator: Estimator, law: Law, initial: InitialJacobian, knowledge: RobotKnowledge) -> None:
         """Compose a controller; `reset` must be called before the first `step`."""
-        self._estimator = estimator
-        self._law = law
+        self.estimator = estimator
+        self.law = law
         self._initial = initial
         self._spec = knowledge.spec
         self._preview = knowledge.preview
@@ -52,7 +56,7 @@ class ServoController(Controller):
         del seed
         self._check_observation(observation)
         self._initial.reset(observation)
-        self._law.reset(observation)
+        self.law.reset(observation)
         self._forget()
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
@@ -69,11 +73,11 @@ class ServoController(Controller):
             self._probing = True
             return Command(probing)
         if not self._ready:
-            self._estimator.reset(self._initial.jacobian())
+            self.estimator.reset(self._initial.jacobian())
             self._ready, self._probing = True, False
         self._learn(observation, reference)
-        self._jacobian = self._estimator.jacobian(observation.joint_position)
-        u = self._law.command(self._jacobian, observation, reference)
+        self._jacobian = self.estimator.jacobian(observation.joint_position)
+        u = self.law.command(self._jacobian, observation, reference)
         if not np.isfinite(u).all():
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.6g} s: {u.tolist()}, "
@@ -90,7 +94,7 @@ class ServoController(Controller):
         own = {"probing": float(self._probing), "jacobian_prediction_error": self._prediction_error}
         if not self._ready:
             return own
-        return {**own, **self._estimator.diagnostics(), **self._law.diagnostics()}
+        return {**own, **self.estimator.diagnostics(), **self.law.diagnostics()}
 
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the Jacobian (m, n) that the last step used, or None before there is one."""
@@ -109,9 +113,9 @@ class ServoController(Controller):
             error=reference[0] - observation.feature,
             duration=observation.time - last.time,
         )
-        J = self._estimator.jacobian(motion.joint_position)
+        J = self.estimator.jacobian(motion.joint_position)
         self._prediction_error = float(np.linalg.norm(motion.feature_step - J @ motion.joint_step))
-        self._estimator.update(motion)
+        self.estimator.update(motion)
 
     def _check_observation(self, observation: Observation) -> None:
         sizes = (

@@ -41,9 +41,9 @@ class CfdlConfig:
 class CfdlEstimator(Estimator):
     """Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²), back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
 
-    Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly changes
-    the sign of single entries, so the sign of the whole is taken: ⟨Φ, Φ₀⟩ = trace(ΦᵀΦ₀) ≤ 0 counts as changed. The book's
-    reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, and what was learnt stays.
+    Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly
+    changes the sign of single entries, so the sign of the whole is taken: ⟨Φ, Φ₀⟩ = trace(ΦᵀΦ₀) ≤ 0 counts as changed.
+    The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, what was learnt stays.
     """
 
     def __init__(self, config: CfdlConfig) -> None:
