@@ -11,9 +11,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault
+
+if TYPE_CHECKING:
+    from controllers.network_file import TrainedNetworks
+    from controllers.training_config import TrainingConfig
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 Diagnostics: TypeAlias = Mapping[str, float]
@@ -47,12 +51,17 @@ class RobotKnowledge:
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
         true_jacobian: the same of the true robot; only handed to a controller whose entry asks for the truth.
+        region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
+            trained there.
+        train: returns trained networks, from a cache where it has them; None: networks are trained on the spot.
     """
 
     spec: PlantSpec
     preview: int
     nominal_jacobian: JacobianFunction | None = None
     true_jacobian: JacobianFunction | None = None
+    region: tuple[FloatArray, FloatArray] | None = None
+    train: Callable[[TrainingConfig], TrainedNetworks] | None = None
 
 
 class Controller(ABC):

@@ -87,7 +87,9 @@ def load_networks(
         ("training digest", digest, networks.digest),
     ):
         if wanted is not None and wanted != came:
-            raise ValueError(f"network file {path} is of another robot or configuration: {name} {came}, wanted {wanted}")
+            raise ValueError(
+                f"network file {path} is of another robot or configuration: {name} {came}, wanted {wanted}"
+            )
     return networks
 
 

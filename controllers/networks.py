@@ -127,12 +127,12 @@ class JacobianNetwork:
     @property
     def n(self) -> int:
         """Number of joints."""
-        return self.weights.shape[0]
+        return int(self.weights.shape[0])
 
     @property
     def m(self) -> int:
         """Number of features."""
-        return self.weights.shape[1]
+        return int(self.weights.shape[1])
 
     def jacobian(self, q: FloatArray) -> FloatArray:
         """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad."""
@@ -180,12 +180,12 @@ class ControllerNetwork:
     @property
     def n(self) -> int:
         """Number of joints."""
-        return self.weights.shape[0]
+        return int(self.weights.shape[0])
 
     @property
     def m(self) -> int:
         """Number of features."""
-        return (self.weights.shape[1] - self.n * self.position_history) // self.error_history
+        return int(self.weights.shape[1] - self.n * self.position_history) // self.error_history
 
     def features(self, xi: FloatArray) -> FloatArray:
         """Return h, (..., N_h), at ξ (..., p)."""

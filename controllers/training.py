@@ -4,9 +4,13 @@ Jacobian network: ridge least squares of W_i on J_i(q) = W_i θ_i(q), one fit fo
 
 Controller network, one of two fits by ridge least squares on samples of ξ:
 
-- "output" (default): ψ ξ ≈ q(k−1) + K_p dt J⁺ e(k), linear in W with the features ξ ⊗ h(ξ);
-- "entries" (the paper's reading): ψ ≈ [K_p dt J⁺, 0, I, 0], linear in W with the features h(ξ). Its error in the identity
-  block, times joint positions of some radians, is a standing error of several degrees.
+- "output" (default): ψ ξ ≈ q_cmd, linear in W with the features ξ ⊗ h(ξ);
+- "entries" (the paper's reading): ψ ≈ [K_p dt J⁺, 0, I, 0], linear in W with the features h(ξ). Its error in the
+  identity block is multiplied by joint positions of some radians.
+
+The paper's ideal law leaves the null space of J alone, so an arm with n > m wanders out of the region on which it was
+trained. The output fit therefore imitates ψ ξ ≈ q + K_p dt J⁺ e + K_n dt (I − J⁺J)(q_c − q), which draws the posture
+towards the region's middle q_c without moving the feature; K_n = 0 is the paper's law.
 
 Widths and regularisation are the best of a small grid on held-out samples. Nothing here is random beyond the
 configuration's own seed, and only `train_cached` touches files.
@@ -22,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controllers.controller import JacobianFunction
+from controllers.controller import JacobianFunction, RobotKnowledge
 from controllers.network_file import TrainedNetworks, load_networks, save_networks
 from controllers.networks import ControllerNetwork, JacobianNetwork, hidden_features, jacobian_features
 from controllers.training_config import ControllerTraining, JacobianTraining, TrainingConfig
@@ -89,6 +93,28 @@ def train_cached(
     return networks
 
 
+def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> TrainedNetworks:
+    """Return networks for a robot, from `knowledge.train` where there is such a source, else trained on the spot.
+
+    Args:
+        config: a region that is left empty is the robot's working region.
+        knowledge: of the robot.
+
+    Raises:
+        ValueError: no region is known, no nominal model exists, or as `train`.
+    """
+    if not config.lower:
+        if knowledge.region is None:
+            raise ValueError("training needs a region: give lower and upper, one number a joint, rad")
+        lower, upper = knowledge.region
+        config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
+    if knowledge.train is not None:
+        return knowledge.train(config)
+    if knowledge.nominal_jacobian is None:
+        raise ValueError("training needs a nominal model, and this plant has none")
+    return train(config, knowledge.nominal_jacobian, knowledge.spec)
+
+
 def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> str:
     """Return a hash of all that the networks depend on: configuration, sizes, period, speed limit and model.
 
@@ -117,11 +143,8 @@ def _train_jacobian(
     rng = np.random.default_rng([config.seed, 1])
     placement = plan.placement
     unit = unit_points(plan.samples, spec.n, rng, placement)
-    centres = joint_samples(
-        choose_centres(unit_points(pool_size(plan.centres, placement), spec.n, rng, placement), plan.centres, rng, placement),
-        lower,
-        upper,
-    )
+    pool = unit_points(pool_size(plan.centres, placement), spec.n, rng, placement)
+    centres = joint_samples(choose_centres(pool, plan.centres, rng, placement), lower, upper)
     q = joint_samples(unit, lower, upper)
     J = _checked(nominal_jacobian, q, spec)
     held = held_out_count(plan.samples, config.held_out)
@@ -148,7 +171,8 @@ def _train_controller(
     plan: ControllerTraining = config.controller
     region = controller_region(config, spec)
     rng = np.random.default_rng([config.seed, 2])
-    gains = (plan.gain * spec.period, plan.posture_gain * spec.period)
+    posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
+    gains = (plan.gain * spec.period, posture_gain * spec.period)
     unit = unit_points(plan.samples, region.dimension, rng, plan.placement)
     samples = controller_samples(unit, region, nominal_jacobian, *gains)
     pool = unit_points(pool_size(plan.hidden, plan.placement), region.dimension, rng, plan.placement)
@@ -226,20 +250,6 @@ def ridge_path(features: FloatArray, targets: FloatArray, regularisations: tuple
 def held_out_count(samples: int, share: float) -> int:
     """Return how many of the samples are held out, at least one."""
     return max(1, round(samples * share))
-
-
-def with_region(config: TrainingConfig, region: tuple[FloatArray, FloatArray] | None) -> TrainingConfig:
-    """Return `config` with the robot's working region where it names none itself.
-
-    Raises:
-        ValueError: neither names a region.
-    """
-    if config.lower:
-        return config
-    if region is None:
-        raise ValueError("training needs a region: give training.lower and training.upper, one number for each joint, rad")
-    lower, upper = region
-    return replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
 
 
 def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec) -> FloatArray:

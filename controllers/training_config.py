@@ -37,13 +37,13 @@ class ControllerTraining:
     hidden: int = 60  # N_h, units
     kernel: Kernel = "exponential"  # of eq. 16; "gaussian" squares the norm
     gain: float = 3.0  # K_p of the law that is imitated, 1/s
-    posture_gain: float = 0.5  # K_n, 1/s, towards the region's middle in the null space of J; 0 as in the paper
+    posture_gain: float = 0.5  # K_n, 1/s, towards the region's middle in the null space; 0 as in the paper
     fit: Fit = "output"  # of the product ψ ξ, or "entries" of ψ as the paper reads
     error_range: float = 0.5  # m, largest error an axis
     samples: int = 6000  # held-out ones included
     placement: Placement = "halton"  # of the centres: halton, sobol or kmeans
-    width_scales: tuple[float, ...] = (1.0, 2.0, 4.0)  # reach of a unit over the spread of ξ
-    regularisations: tuple[float, ...] = (1e-10, 1e-8, 1e-6)  # ridge, over the largest eigenvalue
+    width_scales: tuple[float, ...] = (2.0, 4.0, 8.0)  # reach of a unit over the spread of ξ
+    regularisations: tuple[float, ...] = (1e-12, 1e-10, 1e-8)  # ridge, over the largest eigenvalue
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -60,7 +60,7 @@ class ControllerTraining:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of both fits; the region is a box of joint positions, empty where the robot's working region is meant."""
+    """Settings of both fits; an empty region means the one in which the robot will work."""
 
     lower: tuple[float, ...] = ()  # rad, one a joint
     upper: tuple[float, ...] = ()  # rad, one a joint

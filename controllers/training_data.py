@@ -1,4 +1,4 @@
-"""Samples on which the networks are trained: joint positions and errors drawn from a region by low-discrepancy points."""
+"""Samples on which the networks are trained: low-discrepancy points of joint positions and errors in a region."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class ControllerSamples:
         error: e(k), (S, m), m.
         position: q(k−1), (S, n), rad.
         gain: K_p dt J⁺ at q(k−1), (S, n, m), rad/m.
-        posture_step: K_n dt (I − J⁺J)(q_c − q), (S, n), rad, the motion towards the region's middle that does not move y.
+        posture_step: K_n dt (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
     """
 
     xi: FloatArray
@@ -112,8 +112,8 @@ def controller_samples(
 ) -> ControllerSamples:
     """Return samples of ξ that a servo with its target at rest could see, and the ideal controller's parts at them.
 
-    The joint position is uniform in the box. The error has a uniform magnitude, so that small errors, where the arm comes
-    to rest, are as well covered as large ones. Older entries of the histories follow from random joint steps Δq:
+    The joint position is uniform in the box. The error has a uniform magnitude, so that small errors, where the arm
+    comes to rest, are as well covered as large ones. Older entries of the histories follow from random joint steps Δq:
     q(k−2) = q(k−1) − Δq, e(k−1) = e(k) + J Δq.
 
     Args:
@@ -132,7 +132,7 @@ def controller_samples(
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : region.error_history] @ np.swapaxes(J, -1, -2)
     positions = q[:, None, :] - back[:, : region.position_history]
-    pinv = np.linalg.pinv(J)
+    pinv = np.asarray(np.linalg.pinv(J), dtype=np.float64)
     away = (region.lower + region.upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     return ControllerSamples(information_vector(errors, positions), error, q, proportional * pinv, posture * free)

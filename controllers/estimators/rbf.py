@@ -73,21 +73,22 @@ class RbfEstimator(Estimator):
     over the last T motions, all with the present weights. Symbols: q joint position (n,) rad; Δq, Δy steps of joints
     (n,) rad and feature (m,) m; W_i weights (m, L) m/rad; θ_i features (L,); T window; k₂, α₂ step sizes; ε rad².
 
-    Departures from the paper: α₂ > 0 (the paper's is negative and enters with a minus sign); ε, in joint motion per unit
-    of ‖θ‖², without which the step grows without bound as the arm comes to rest and noise rewrites the network there; the
-    sum in α₂ runs over the same window as the gradient (the paper's has one term more).
+    Departures from the paper: α₂ > 0 (the paper's is negative and enters with a minus sign); ε, in joint motion per
+    unit of ‖θ‖², without which the step grows without bound as the arm comes to rest and noise rewrites the network
+    there; the sum in α₂ runs over the same window as the gradient (the paper's has one term more).
     """
 
     def __init__(self, config: RbfConfig, network: JacobianNetwork) -> None:
         """Start from the offline `network`."""
         self._config = config
         self._network = network
+        self._weights = network.weights
         self._restore()
 
     @property
     def weights(self) -> FloatArray:
         """W as it is now, (n, m, L), m/rad; a copy."""
-        return self._weights.copy()
+        return np.array(self._weights)
 
     def reset(self, jacobian: FloatArray) -> None:
         """Forget everything and restore the offline network.

@@ -60,20 +60,21 @@ class RbfLyapunovEstimator(Estimator):
 
     Departures from the paper: n₂ enters with a minus, since e = y_ref − y here and y − y_ref there. V̇ ≤ 0 holds for a
     target at rest; a moving one adds n₂ eᵀẏ_ref to V̇, which no choice of Ẇ cancels: the update stays as it is (s does
-    not see the target), and the law may cancel the term by feeding ẏ_ref forward. In discrete time the gains must be small:
-    n₃ Σ Δq_i² ‖θ_i‖² / duration < 2 for the s-part alone.
+    not see the target), and the law may cancel the term by feeding ẏ_ref forward. In discrete time the gains must be
+    small: n₃ Σ Δq_i² ‖θ_i‖² / duration < 2 for the s-part alone.
     """
 
     def __init__(self, config: RbfLyapunovConfig, network: JacobianNetwork) -> None:
         """Start from the offline `network`."""
         self._config = config
         self._network = network
+        self._weights = network.weights
         self._restore()
 
     @property
     def weights(self) -> FloatArray:
         """W as it is now, (n, m, L), m/rad; a copy."""
-        return self._weights.copy()
+        return np.array(self._weights)
 
     def reset(self, jacobian: FloatArray) -> None:
         """Forget everything and restore the offline network.

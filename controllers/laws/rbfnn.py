@@ -52,12 +52,11 @@ class RbfnnLaw(Law):
 
     Departures from the paper:
     - ε, and the joint-speed limit in prediction and command.
-    - "q(k−1)" is by default the measured position at instant k, from which the next step starts: the sum of all commands
-      drifts away from the arm where a joint lags, saturates or has another gear ratio. Both read the same in the joint's
-      zero, so an offset does no harm.
-    - The weights integrate Ĵᵀe. As the arm moves, Ĵ turns, and with n > m a part of what was learned comes to lie in the
-      null space of Ĵ, where no error can ever unlearn it: it drives the arm into ever new postures. With
-      `row_space_only` the learned part W − W(0) is projected on the row space of Ĵ, which leaves J Δq as it was.
+    - "q(k−1)" is by default the measured position at instant k, from which the next step starts: the sum of all
+      commands drifts away from the arm where a joint saturates or does not reach its commanded speed.
+    - The weights integrate Ĵᵀe. As the arm moves, Ĵ turns, and with n > m a part of what was learned comes to lie in
+      the null space of Ĵ, where no error can ever unlearn it: it drives the arm into ever new postures. With
+      `row_space_only` the learned part W − W(0) is projected on the row space of Ĵ, which leaves Ĵ Δq as it was.
     - Without anti-windup the weights grow as long as a limited command cannot follow.
     - Without a valid feature nothing is learned; the last error is held.
     """

@@ -5,9 +5,9 @@ With Ĵ and the weights frozen, for t = 1 … T:
     q(k+t−1) = limit(ψ(ξ) ξ),   e(k+t) = y_ref(k+t) − y_ref(k+t−1) + e(k+t−1) − Ĵ Δq(k+t−1)
     G_j = Σ_t [Ĵᵀ e(k+t)] ξ_j(k+t−1) h(k+t−1)ᵀ,   α = k Σ_t ‖e(k+t)‖² / (ε + ‖G‖²_F),   W_j ← W_j + α G_j
 
-−G is the gradient of I_c = ½ Σ ‖e(k+t)‖² with the paper's truncation (eq. 18): each term is differentiated through its own
-step only. Departures from the paper: ε, the joint-speed limit inside the prediction, and α > 0 where the paper writes a
-negative α into an update with the opposite sign.
+−G is the gradient of I_c = ½ Σ ‖e(k+t)‖² with the paper's truncation (eq. 18): each term is differentiated through its
+own step only. Departures from the paper: ε, the joint-speed limit inside the prediction, and α > 0 where the
+paper writes a negative α into an update with the opposite sign.
 """
 
 from __future__ import annotations
