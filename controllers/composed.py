@@ -17,6 +17,8 @@ from controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
 from controllers.estimators.constant import ConstantConfig, ConstantEstimator
 from controllers.estimators.estimator import Estimator
 from controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from controllers.estimators.rbf import RbfConfig, RbfEstimator
+from controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
 from controllers.estimators.rls import RlsConfig, RlsEstimator
 from controllers.estimators.true import TrueConfig, TrueEstimator
 from controllers.estimators.ukf import UkfConfig, UkfEstimator
@@ -25,7 +27,11 @@ from controllers.laws.law import Law
 from controllers.laws.mfac import MfacConfig, MfacLaw
 from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.pid import PidConfig, PidLaw
+from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from controllers.network_file import TrainedNetworks
 from controllers.servo import ServoController
+from controllers.training import obtain_networks
+from controllers.training_config import TrainingConfig
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,11 @@ class LawEntry:
     build: Callable[[Any, RobotKnowledge], Law]
 
 
+def _default_networks(knowledge: RobotKnowledge) -> TrainedNetworks:
+    """Return the networks of the default training; with a cache behind `knowledge.train` both parts share one."""
+    return obtain_networks(TrainingConfig(), knowledge)
+
+
 ESTIMATORS: dict[str, EstimatorEntry] = {
     "constant": EstimatorEntry(ConstantConfig, lambda _config, _knowledge: ConstantEstimator()),
     "true": EstimatorEntry(TrueConfig, lambda _config, knowledge: TrueEstimator(knowledge), needs_truth=True),
@@ -63,6 +74,13 @@ ESTIMATORS: dict[str, EstimatorEntry] = {
     "kalman": EstimatorEntry(KalmanConfig, lambda config, _knowledge: KalmanEstimator(config)),
     "broyden": EstimatorEntry(BroydenConfig, lambda config, _knowledge: BroydenEstimator(config)),
     "rls": EstimatorEntry(RlsConfig, lambda config, _knowledge: RlsEstimator(config)),
+    "rbf": EstimatorEntry(
+        RbfConfig, lambda config, knowledge: RbfEstimator(config, _default_networks(knowledge).jacobian)
+    ),
+    "rbf_lyapunov": EstimatorEntry(
+        RbfLyapunovConfig,
+        lambda config, knowledge: RbfLyapunovEstimator(config, _default_networks(knowledge).jacobian),
+    ),
     "cfdl": EstimatorEntry(CfdlConfig, lambda config, _knowledge: CfdlEstimator(config)),
 }
 
@@ -70,6 +88,9 @@ LAWS: dict[str, LawEntry] = {
     "pid": LawEntry(PidConfig, PidLaw),
     "mfac": LawEntry(MfacConfig, MfacLaw),
     "mpc": LawEntry(MpcConfig, MpcLaw),
+    "rbfnn": LawEntry(
+        RbfnnConfig, lambda config, knowledge: RbfnnLaw(config, _default_networks(knowledge).controller, knowledge)
+    ),
 }
 
 

@@ -19,11 +19,13 @@ from controllers.composed import ESTIMATORS, LAWS
 from harness import results
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
+from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
 from harness.manifest import describe_batch
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.summary import summary_tables
 from harness.tasks import TASKS, find_task, task_names
+from harness.training import cache_folder
 
 INTERRUPTED = 130
 MAX_DEFAULT_WORKERS = 8
@@ -113,6 +115,28 @@ def compare(
 
 
 @app.command()
+def train(
+    controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
+    set_: SetOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Train the networks of a controller on the nominal model, or find them trained, and tell their held-out error."""
+    settings = read_settings(config, set_ or [])
+    settings.check_sections([*known_sections(), controller])
+    with _progress() as progress:
+        bar = progress.add_task("training", total=1.0)
+        trained = train_networks(
+            controller, settings, lambda share, what: progress.update(bar, completed=share, description=what)
+        )
+        progress.update(bar, completed=1.0, description="done")
+    table = Table("network", "held-out error")
+    table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
+    table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
+    console.print(table)
+    console.print(f"kept in {cache_folder()}", soft_wrap=True)
+
+
+@app.command()
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
     """Put the finished runs of a killed batch together into its tables."""
     results.check_folder(folder)
@@ -133,8 +157,10 @@ def main() -> None:
 
 def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None) -> None:
     """Check everything, run everything, and leave tables and figures behind."""
-    with console.status("checking the configuration"):
-        check_batch(batch, settings)
+    with console.status("checking the configuration") as status:
+        check_batch(
+            batch, settings, lambda share, what: status.update(f"training networks once: {100 * share:3.0f} %, {what}")
+        )
     requests = batch.requests()
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     results.create_folder(folder, describe_batch(requests, settings))

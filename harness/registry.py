@@ -22,8 +22,10 @@ PLANTS = {
     "bullet": "plant.bullet:ENTRY",
 }
 CONTROLLERS = {
+    "rbfnn_mfac": "controllers.rbfnn_mfac:ENTRY",
     "ukf_mfac": "controllers.ukf_mfac:ENTRY",
     "ukf_mpc": "controllers.ukf_mpc:ENTRY",
+    "rbf_pid": "controllers.rbf_pid:ENTRY",
     "constant": "controllers.constant:ENTRY",
     "calibrated": "controllers.calibrated:ENTRY",
     "nmpc_calibrated": "controllers.nmpc_calibrated:ENTRY",

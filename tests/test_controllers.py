@@ -7,17 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controllers import broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rls, ukf_mfac
+from controllers import broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rbf_pid, rbfnn_mfac, rls, ukf_mfac
 from controllers.composed import ESTIMATORS, LAWS, compose, servo_entry
 from controllers.controller import RobotKnowledge
 from controllers.initial import InitialConfig
 from controllers.servo import ServoController
+from controllers.training import train
+from controllers.training_config import ControllerTraining, JacobianTraining
 from plant.signals import Observation, PlantSpec
 
-PRESETS = [module.ENTRY for module in (broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rls, ukf_mfac)]
+MODULES = (broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rbf_pid, rbfnn_mfac, rls, ukf_mfac)
+PRESETS = [module.ENTRY for module in MODULES]
 PAIRS = [compose(law, estimator) for law in sorted(LAWS) for estimator in sorted(ESTIMATORS)]
 ENTRIES = [pytest.param(entry, id=entry.name) for entry in PRESETS + PAIRS]
 PREVIEW = 20
+SMALL = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 
 
 def robot(n, m, seed):
@@ -26,10 +30,20 @@ def robot(n, m, seed):
     names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
     spec = PlantSpec(*names, rng.uniform(0.1, 3.0, n), np.full(n, -6.0), np.full(n, 6.0), 0.05)
     A, B = rng.normal(size=(m, n)), rng.normal(size=n)
+
+    def nominal_jacobian(q):
+        return A * (B * np.cos(B * q))[..., None, :]
+
+    def train_small(config):
+        jacobian, controller = JacobianTraining(centres=6, **SMALL), ControllerTraining(hidden=6, **SMALL)
+        return train(dataclasses.replace(config, jacobian=jacobian, controller=controller), nominal_jacobian, spec)
+
     return RobotKnowledge(
         spec,
         PREVIEW,
-        nominal_jacobian=lambda q: A * (B * np.cos(B * q))[..., None, :],
+        nominal_jacobian,
+        region=(np.full(n, -1.0), np.full(n, 1.0)),
+        train=train_small,
         true_jacobian=lambda q: 1.1 * A * (B * np.cos(B * q))[..., None, :],
     )
 
