@@ -11,6 +11,7 @@ camera's latency; it is missing where the ball is hidden, out of sight or cut by
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -119,8 +120,9 @@ def velocity_targets(
     Returns:
         (steps, n), rad/s; a joint that would leave its range stops at the limit.
     """
-    left = decay ** np.arange(1, steps + 1)[:, None]
-    targets = u + left * (v - u)
+    with np.errstate(under="ignore"):  # under a short lag nothing is left
+        left = decay ** np.arange(1, steps + 1)[:, None]
+        targets = u + left * (v - u)
     moved = PHYSICS_STEP * np.cumsum(targets, axis=0)
     if (moved < room[0]).any() or (moved > room[1]).any():
         moved = np.clip(moved, *room)
@@ -146,7 +148,7 @@ class BulletPlant(Plant):
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
         if not setup.model.arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {setup.model.arm.gear_ratio.tolist()}")
-        self._decay = float(np.exp(-PHYSICS_STEP / config.lag)) if config.lag > 0.0 else 0.0
+        self._decay = math.exp(-PHYSICS_STEP / config.lag) if config.lag > 0.0 else 0.0
         self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self._camera, self._depth_noise = config.camera(), config.noise()
         self._view = view_of(self._camera, setup.model.X_BC)

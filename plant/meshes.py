@@ -6,6 +6,8 @@ where one is seen.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -39,6 +41,7 @@ def sphere_mesh(subdivisions: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     return vertices, triangles
 
 
+@lru_cache(maxsize=4)
 def sphere_obj(subdivisions: int) -> str:
     """Return `sphere_mesh` as a Wavefront OBJ file with normals, so that it is shaded smoothly."""
     vertices, triangles = sphere_mesh(subdivisions)

@@ -76,6 +76,8 @@ class Scene:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
             self._load(arm, body, physics_step, scenery=scenery)
+            if window:
+                self._aim_window()
         except BaseException:
             self.close()
             raise
@@ -109,6 +111,12 @@ class Scene:
                 if name.endswith(".urdf")
             ]
         self._arm = bodies[0]
+
+    def _aim_window(self) -> None:
+        """Show the arm from the front right, without PyBullet's side panels."""
+        client = self._client
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+        pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
 
     def place(self, theta: FloatArray) -> None:
         """Put the arm at rest at joint angles `theta` (n,) rad."""

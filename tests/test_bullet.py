@@ -13,7 +13,7 @@ from plant.bullet import ENTRY, PHYSICS_STEP, BulletConfig, BulletPlant, ur5_bod
 from plant.camera import DepthNoise, PinholeCamera
 from plant.hand_eye import HandEyeModel
 from plant.kinematics import SerialArm
-from plant.plant import FeatureLost, PlantSetup
+from plant.plant import FeatureLost, PlantDiverged, PlantSetup
 from plant.scene import Scene, view_of
 from plant.signals import Command
 
@@ -53,11 +53,11 @@ def geared_ur5() -> HandEyeModel:
     return HandEyeModel(SerialArm(arm.joint_names, arm.translation, arm.rpy, offset, gear, arm.tool), MODEL.X_BC)
 
 
-def errors_over_poses(scenery, noise, count) -> tuple[np.ndarray, int]:
+def errors_over_poses(noise, count) -> tuple[np.ndarray, int]:
     """Detected less simulated ball centres over random visible poses, and how many poses were tried."""
     camera, rng = PinholeCamera(), np.random.default_rng(11)
     view = view_of(camera, MODEL.X_BC)
-    scene = Scene(MODEL.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=scenery, window=False)
+    scene = Scene(MODEL.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=False, window=False)
     errors, tried = [], 0
     while len(errors) < count:
         scene.place(HOME + rng.uniform(-0.6, 0.6, 6))
@@ -73,7 +73,8 @@ def errors_over_poses(scenery, noise, count) -> tuple[np.ndarray, int]:
 
 
 def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre():
-    errors, tried = errors_over_poses(True, DepthNoise("none", depth_quantisation=0.0), 200)
+    # Table and floor change no bit of what is found, as a test below shows, and cost most of the time.
+    errors, tried = errors_over_poses(DepthNoise("none", depth_quantisation=0.0), 200)
     distance = np.linalg.norm(errors, axis=1)
     assert np.median(distance) <= 0.0002
     assert distance.max() <= 0.001
@@ -82,7 +83,7 @@ def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre():
 
 @pytest.mark.parametrize("model", ["stereo", "structured_light"])
 def test_with_noise_the_centre_has_no_bias_of_note(model):
-    errors, _ = errors_over_poses(False, DepthNoise(model), 100)
+    errors, _ = errors_over_poses(DepthNoise(model), 100)
     assert np.abs(errors.mean(axis=0)).max() < 0.0003
     assert np.linalg.norm(errors, axis=1).max() < 0.01
 
@@ -193,6 +194,20 @@ def test_joints_stop_at_their_range(open_plant):
     assert observation.joint_position[0] == pytest.approx(3.0, abs=1e-8)
     back = plant.step(Command(-np.eye(6)[0])).joint_position[0]
     assert back < 2.99
+
+
+def test_a_lag_far_shorter_than_a_physics_step_is_like_none(open_plant):
+    plant = open_plant(BulletConfig(scenery=False, lag=1e-6))
+    plant.reset(0)
+    np.testing.assert_allclose(plant.step(Command(np.full(6, 0.2))).joint_position, HOME + 0.01, atol=1e-8)
+
+
+def test_joint_angles_that_are_not_finite_end_the_run(open_plant, monkeypatch):
+    plant = open_plant()
+    plant.reset(0)
+    monkeypatch.setattr(pybullet, "getJointStates", lambda *_, **__: [(np.nan,)] * 6)
+    with pytest.raises(PlantDiverged, match="joint positions are not finite"):
+        plant.step(Command(np.zeros(6)))
 
 
 def test_velocity_targets_without_lag_are_the_command():
