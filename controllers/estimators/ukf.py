@@ -108,15 +108,15 @@ def unscented_update(
     offsets = np.zeros((2 * size + 1, size))
     offsets[1 : size + 1] = weights.reach * cholesky_of(P).T
     offsets[size + 1 :] = -offsets[1 : size + 1]
-    points = (J.ravel() + offsets).reshape(-1, *J.shape)
-    Z = points @ joint_step
+    points = J.ravel() + offsets
+    Z = (points.reshape(-1, joint_step.size) @ joint_step).reshape(points.shape[0], -1)  # every point is m rows of J
     z = weights.mean @ Z
     deviations = Z - z
     weighted = weights.covariance[:, None] * deviations
     S = deviations.T @ weighted + R
     C = offsets.T @ weighted
     K = np.linalg.solve(S, C.T).T
-    P = P - K @ S @ K.T
+    P = P - K @ C.T  # K S = C
     return J + (K @ (feature_step - z)).reshape(J.shape), (P + P.T) / 2
 
 
