@@ -14,7 +14,7 @@ from controllers.controller import Controller, ControllerEntry, Diagnostics, Rob
 from controllers.laws.mpc_closed_form import decay_targets, move_weights
 from controllers.laws.mpc_limits import LimitedProgram, joint_bounds
 from controllers.laws.mpc_qp import SOLVERS, QpShape, QpSolution
-from plant.signals import Command, FloatArray, Observation, check_number
+from plant.signals import Command, FloatArray, Observation, as_vector, check_number
 
 Fallback = Literal["hold", "raise"]
 Solver = Literal["daqp", "qpoases"]
@@ -86,7 +86,7 @@ class NmpcCalibrated(Controller):
             raise ValueError(f"preview must be at least horizon + delay_periods = {reach}, got {knowledge.preview}")
         if knowledge.true_symbolic is None:
             raise ValueError("true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics")
-        self._config, self._spec = config, knowledge.spec
+        self._config, self._spec, self._preview = config, knowledge.spec, knowledge.preview
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
         self._along_plan = self._model.map(config.horizon)
@@ -117,9 +117,11 @@ class NmpcCalibrated(Controller):
         """Return the first step of the best plan as a joint velocity; see `Controller.step`.
 
         Raises:
+            ValueError: an observation or a reference of the wrong size.
             SolverFailed: no solution, and the fallback is "raise".
         """
         config, delay = self._config, self._config.delay_periods
+        self._check(observation, reference)
         present = observation.joint_position
         feature, self._jacobian = self._evaluate(present)
         if observation.feature_valid:
@@ -153,6 +155,15 @@ class NmpcCalibrated(Controller):
         self._jacobian = None
         self._fallbacks = 0
         self._diagnostics: dict[str, float] = {}
+
+    def _check(self, observation: Observation, reference: FloatArray) -> None:
+        as_vector("observation.joint_position", observation.joint_position, self._spec.n)
+        as_vector("observation.feature", observation.feature, self._spec.m)
+        wanted = (1 + self._preview, self._spec.m)
+        if np.shape(reference) != wanted:
+            raise ValueError(f"reference must have shape {wanted}, got {np.shape(reference)}")
+        if not np.isfinite(reference).all():
+            raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")
 
     def _evaluate(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
         feature, jacobian = self._model(joint_position)

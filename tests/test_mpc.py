@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controllers import ukf_mpc
 from controllers.controller import RobotKnowledge, SolverFailed
 from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.mpc_closed_form import constant_step, free_moves, horizon_integrals, move_weights
@@ -174,6 +175,17 @@ def test_position_rows_out_of_reach_change_nothing(constant, travel):
     np.testing.assert_allclose(found.moves, qp.solve(J, targets, bounds).moves, atol=1e-9)
     dropped = found.row_multiplier.size < qp.solve(J, targets, bounds).row_multiplier.size
     assert dropped == (travel > 1.5)
+
+
+def test_the_preset_starts_as_the_law_on_the_nominal_jacobian():
+    J, spec = random_jacobian(5), make_spec()
+    knowledge = RobotKnowledge(spec, 20, nominal_jacobian=lambda q: J)
+    controller = ukf_mpc.ENTRY.build(ukf_mpc.UkfMpcConfig(), knowledge)
+    controller.reset(observe(spec), 0)
+    command = controller.step(observe(spec), hold([0.2, 0.1, -0.1]))
+    expected = make_law(spec).command(J, observe(spec), hold([0.2, 0.1, -0.1]))
+    np.testing.assert_array_equal(command.joint_velocity, expected)
+    assert controller.diagnostics()["solver_success"] == 1.0
 
 
 def test_solvers_print_nothing(capfd):

@@ -88,12 +88,12 @@ def test_the_plan_minimises_the_nonlinear_criterion():
 def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
     plant = KinematicPlant(KinematicConfig(), PlantSetup(MODEL, START, 0.05))
     controller = NmpcCalibrated(NmpcCalibratedConfig(), knowledge())
-    angle = 2 * np.pi * np.arange(140) / 200
+    angle = 2 * np.pi * np.arange(110) / 200
     path = MODEL.feature(START) + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros_like(angle)], axis=-1)
     observation = plant.reset(0)
     controller.reset(observation, 0)
     errors = []
-    for k in range(120):
+    for k in range(90):
         errors.append(np.linalg.norm(path[k] - plant.truth().feature))
         observation = plant.step(controller.step(observation, path[k : k + 13]))
     assert errors[0] > 0.1
@@ -199,3 +199,21 @@ def test_knowledge_that_does_not_suffice_is_named():
         NmpcCalibrated(config, knowledge(symbolic=None))
     with pytest.raises(ValueError, match=r"true_symbolic must give an expression of shape \(3, 1\), got \(6, 1\)"):
         NmpcCalibrated(config, knowledge(symbolic=lambda q: q))
+
+
+@pytest.mark.parametrize(
+    ("observation", "reference", "message"),
+    [
+        (Observation(0.0, np.zeros(5), np.zeros(3)), hold(np.zeros(3)), "observation.joint_position must have shape"),
+        (Observation(0.0, START, np.zeros(2)), hold(np.zeros(3)), "observation.feature must have shape"),
+        (
+            Observation(0.0, START, np.zeros(3)),
+            hold(np.zeros(3), 3),
+            r"reference must have shape \(13, 3\), got \(4, 3\)",
+        ),
+        (Observation(0.0, START, np.zeros(3)), hold([0.0, np.nan, 0.0]), "reference must be finite"),
+    ],
+)
+def test_a_step_with_the_wrong_size_is_refused(observation, reference, message):
+    with pytest.raises(ValueError, match=message):
+        make().step(observation, reference)

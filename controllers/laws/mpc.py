@@ -37,8 +37,8 @@ class MpcConfig:
     horizon: int = 10  # H, periods; tuned
     mode: Mode = "moves"  # "moves": H free moves; "constant": one constant step, the paper's
     alpha: float = 1.0  # α in (0, 1], weight of an error against the one a period earlier; the plain mean
-    rho: float = 0.2  # ρ, 1/period: the error should decay as exp(−ρ τ); tuned
-    move_weight: float = 0.05  # q of Q = q I, m²/rad²; tuned
+    rho: float = 0.25  # ρ, 1/period: the error should decay as exp(−ρ τ); tuned
+    move_weight: float = 0.15  # q of Q = q I, m²/rad²; tuned
     joint_weight: tuple[float, ...] = ()  # relative weight of each joint, Q = q diag(…); empty = all 1
     terminal_weight: float = 0.0  # extra weight of the error after H periods; 0 is the paper's criterion
     use_preview: bool = True  # follow the previewed reference; false holds the present one, as the paper does
