@@ -25,6 +25,7 @@ from controllers.estimators.ukf import UkfConfig, UkfEstimator
 from controllers.initial import InitialConfig, initial_jacobian
 from controllers.laws.law import Law
 from controllers.laws.mfac import MfacConfig, MfacLaw
+from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.pid import PidConfig, PidLaw
 from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from controllers.network_file import TrainedNetworks
@@ -86,6 +87,7 @@ ESTIMATORS: dict[str, EstimatorEntry] = {
 LAWS: dict[str, LawEntry] = {
     "pid": LawEntry(PidConfig, PidLaw),
     "mfac": LawEntry(MfacConfig, MfacLaw),
+    "mpc": LawEntry(MpcConfig, MpcLaw),
     "rbfnn": LawEntry(
         RbfnnConfig, lambda config, knowledge: RbfnnLaw(config, _default_networks(knowledge).controller, knowledge)
     ),

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from controllers.training_config import TrainingConfig
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
+SymbolicFeature: TypeAlias = Callable[[Any], Any]
 Diagnostics: TypeAlias = Mapping[str, float]
 
 
@@ -51,6 +52,8 @@ class RobotKnowledge:
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
         true_jacobian: the same of the true robot; only handed to a controller whose entry asks for the truth.
+        true_symbolic: a CasADi expression q, (n, 1) rad -> the expression of the true robot's feature, (m, 1); under
+            the same condition. None where the plant has no closed form.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: returns trained networks, from a cache where it has them; None: networks are trained on the spot.
@@ -60,6 +63,7 @@ class RobotKnowledge:
     preview: int
     nominal_jacobian: JacobianFunction | None = None
     true_jacobian: JacobianFunction | None = None
+    true_symbolic: SymbolicFeature | None = None
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[TrainingConfig], TrainedNetworks] | None = None
 
@@ -106,7 +110,7 @@ class ControllerEntry:
         summary: one line for `servobench controllers`.
         config: frozen dataclass with a default for every field.
         build: makes the controller from its configuration and what it may know.
-        needs_truth: it is told the true Jacobian: a bound, not a competitor.
+        needs_truth: it is told the true Jacobian and kinematics: a bound, not a competitor.
     """
 
     name: str

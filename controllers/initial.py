@@ -62,13 +62,20 @@ class InitialJacobian(ABC):
 class NominalJacobian(InitialJacobian):
     """Ĵ₀ = J_nominal(q(0))."""
 
-    def __init__(self, nominal_jacobian: JacobianFunction) -> None:
-        """Take the nominal model, (n,) rad -> (m, n) m/rad."""
+    def __init__(self, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> None:
+        """Take the nominal model, (n,) rad -> (m, n) m/rad, and the sizes that it must have."""
         self._nominal_jacobian = nominal_jacobian
+        self._shape = (spec.m, spec.n)
 
     def reset(self, observation: Observation) -> None:
-        """Evaluate the model at the start."""
+        """Evaluate the model at the start.
+
+        Raises:
+            ValueError: the model is that of another robot.
+        """
         self._jacobian = np.array(self._nominal_jacobian(observation.joint_position), dtype=np.float64)
+        if self._jacobian.shape != self._shape:
+            raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {self._jacobian.shape}")
 
     def step(self, observation: Observation) -> None:
         """Return None: nothing has to move."""
@@ -193,4 +200,4 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
         raise ValueError(
             "source 'nominal' needs a nominal model, and this plant has none; take 'probe' or 'given' instead"
         )
-    return NominalJacobian(knowledge.nominal_jacobian)
+    return NominalJacobian(knowledge.nominal_jacobian, knowledge.spec)

@@ -23,8 +23,9 @@ class ServoController(Controller):
     """Estimates the Jacobian from what moved and commands by what it estimates.
 
     Each step learns from the motion between the last valid feature and the present one, so that Δy and Δq span the same
-    gap when frames are lost; a step without a valid feature learns nothing. While the initial Jacobian is being probed,
-    the probing moves are the command and neither estimator nor law is asked.
+    gap when frames are lost; a step without a valid feature learns nothing. Joint positions are read without delay, so
+    under camera latency Δy is that of a motion a little earlier: while the arm speeds up or slows down, an estimator is
+    misled. While the initial Jacobian is probed, the probing moves are the command; estimator and law are not asked.
 
     Attributes:
         estimator: the Jacobian estimator, for a look at its state.
@@ -56,7 +57,6 @@ class ServoController(Controller):
         del seed
         self._check_observation(observation)
         self._initial.reset(observation)
-        self.law.reset(observation)
         self._forget()
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
@@ -64,7 +64,7 @@ class ServoController(Controller):
 
         Raises:
             ValueError: an observation or a reference of the wrong size.
-            ControllerDiverged: the law asked for something that is not finite.
+            ControllerDiverged: the estimate, or what the law asked for, is not finite.
         """
         self._check_observation(observation)
         self._check_reference(reference)
@@ -74,14 +74,16 @@ class ServoController(Controller):
             return Command(probing)
         if not self._ready:
             self.estimator.reset(self._initial.jacobian())
+            self.law.reset(observation)
             self._ready, self._probing = True, False
         self._learn(observation, reference)
-        self._jacobian = self.estimator.jacobian(observation.joint_position)
-        u = self.law.command(self._jacobian, observation, reference)
+        J = self._jacobian = self.estimator.jacobian(observation.joint_position)
+        if not np.isfinite(J).all():
+            raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
+        u = self.law.command(J, observation, reference)
         if not np.isfinite(u).all():
             raise ControllerDiverged(
-                f"joint_velocity is not finite at {observation.time:.6g} s: {u.tolist()}, "
-                f"with the Jacobian {self._jacobian.tolist()}"
+                f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
             )
         return Command(u)
 

@@ -5,13 +5,14 @@ its ray r_i = (x/z, y/z, 1). A sphere of radius R about c meets that ray first a
 
     t_i(c) = (r_i·c − √D_i) / |r_i|²,          D_i = (r_i·c)² − |r_i|² (|c|² − R²)
 
-and c minimises Σ (z_i − t_i(c))² by Gauss-Newton with ∂t_i/∂c = −(t_i r_i − c)/√D_i. The noise lies along the ray, hence so
-do the residuals: a fit of distances to the centre would be biased by noise² / R. Pixels near the silhouette, where
-that slope grows without bound, and pixels whose residual stands far off the others' take no part.
+and c minimises Σ (z_i − t_i(c))² by Gauss-Newton with ∂t_i/∂c = −(t_i r_i − c)/√D_i. The noise lies along the ray,
+hence so do the residuals: a fit of distances to the centre would be biased by noise² / R. Pixels near the silhouette,
+where that slope grows without bound, and pixels whose residual stands far off the others' take no part.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -27,6 +28,7 @@ IntArray = npt.NDArray[np.intp]
 # OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
 # both ends 0 and 180, and one range covers purplish and orange reds.
 RED_LOWER, RED_UPPER = (111, 120, 40), (129, 255, 255)
+FULL_BOX = 0.6  # share of red pixels; a disc fills π/4 of its box
 MIN_PIXELS = 16  # fewer do not fix three coordinates under noise
 MIN_VISIBLE = 0.4  # share of the ball's disc that must be seen
 MAX_VISIBLE = 1.4  # a larger red patch is not the ball
@@ -34,8 +36,11 @@ INNER_COSINE = 0.4  # of the angle between ray and surface normal, below which a
 OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
 OUTLIER_FLOOR = 0.002  # m, what is never an outlier
 MAX_RESIDUAL = 0.4  # of the radius, RMS beyond which the fit is implausible
+MAX_UNCERTAINTY = 0.1  # of the radius, standard error beyond which the fit says too little
+SELECTIONS = 3  # iterations that choose their depths anew
 MAX_ITERATIONS = 10
-STEP_TOLERANCE = 1e-6  # m
+STEP_TOLERANCE = 1e-5  # m; what is left after such a step is far smaller
+RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
 
 
@@ -53,19 +58,34 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
-    """A ball that was found.
+class SphereFit:
+    """A sphere of known radius fitted to depths.
 
     Attributes:
         centre: (3,), m, camera frame.
-        residual: m, RMS of the depths that took part in the fit.
+        residual: m, RMS of the depths that took part.
         used: number of those depths.
-        visible: share of the ball's disc that is seen, about 1 where nothing hides it.
+        uncertainty: m, standard error of the centre by the residual, all axes together.
     """
 
     centre: FloatArray
     residual: float
     used: int
+    uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A ball that was found.
+
+    Attributes:
+        centre: (3,), m, camera frame.
+        fit: how well the sphere fits.
+        visible: share of the ball's disc that is seen, about 1 where nothing hides it.
+    """
+
+    centre: FloatArray
+    fit: SphereFit
     visible: float
 
 
@@ -82,11 +102,12 @@ def find_patch(rgb: ByteArray) -> Patch | None:
     x, y, width, height = cv2.boundingRect(mask)
     if width * height < MIN_PIXELS:
         return None
-    # Only the box around all red is looked at, as the search for connected parts would be slow on the whole image.
-    box = np.ascontiguousarray(mask[y : y + height, x : x + width])
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(box, connectivity=8)
-    largest = 1 + int(np.argmax(statistics[1:count, cv2.CC_STAT_AREA]))
-    rows, columns = np.nonzero(labels == largest)
+    # Only the box around all red is looked at. A full one holds one patch; the search for connected parts is slow.
+    red = mask[y : y + height, x : x + width] > 0
+    if np.count_nonzero(red) < FULL_BOX * width * height:
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(red.astype(np.uint8), connectivity=8)
+        red = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+    rows, columns = np.nonzero(red)
     rows, columns = rows + y, columns + x
     image_height, image_width = mask.shape
     cut = rows[0] == 0 or rows[-1] == image_height - 1 or columns.min() == 0 or columns.max() == image_width - 1
@@ -110,19 +131,21 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     # The median depth over a sphere's disc is R/√2 nearer than its centre.
     start = middle * (float(np.median(depth)) + radius / np.sqrt(2.0))
     fit = fit_sphere(rays, depth, start, radius)
-    if fit is None:
+    if fit is None or not fit.centre[2] > radius:
         return None
-    centre, used, residual = fit
-    disc = np.pi * (camera.focal * radius / centre[2]) ** 2
-    visible = len(depth) / disc
-    if used < max(MIN_PIXELS, 0.5 * MIN_VISIBLE * disc) or not MIN_VISIBLE <= visible <= MAX_VISIBLE:
-        return None
-    return Detection(centre, residual, used, visible) if residual <= MAX_RESIDUAL * radius else None
+    visible = len(depth) / disc_area(fit.centre, camera, radius)
+    plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
+    complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
+    return Detection(fit.centre, fit, visible) if plausible and complete else None
 
 
-def fit_sphere(
-    rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float
-) -> tuple[FloatArray, int, float] | None:
+def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
+    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    nearest2 = centre[2] ** 2 - radius**2
+    return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
+
+
+def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> SphereFit | None:
     """Fit the centre of a sphere of known radius to depths along rays.
 
     Args:
@@ -132,34 +155,50 @@ def fit_sphere(
         radius: m.
 
     Returns:
-        The centre, (3,) m, how many depths took part, and the RMS of their residuals, m; None where the fit fails.
+        The fit, or None where too few depths agree with a sphere.
     """
-    length2 = np.einsum("ij,ij->i", rays, rays)
     centre = start
-    for _ in range(MAX_ITERATIONS):
-        along = rays @ centre
-        D = along**2 - length2 * (centre @ centre - radius**2)
-        inner = np.flatnonzero(D >= length2 * (INNER_COSINE * radius) ** 2)
-        if len(inner) < MIN_PIXELS:
-            return None
-        r, root = rays[inner], np.sqrt(D[inner])
-        t = (along[inner] - root) / length2[inner]
-        residual = depth[inner] - t
-        size = np.abs(residual)
-        keep = size <= max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.median(size)))
-        used = int(np.count_nonzero(keep))
-        if used < MIN_PIXELS:
-            return None
-        slope = ((centre - t[:, None] * r) / root[:, None])[keep]
-        kept = residual[keep]
-        normal = slope.T @ slope
-        step = np.linalg.solve(normal + 1e-9 * used * np.eye(3), slope.T @ kept)
-        # A step beyond the radius leaves the region in which the linearisation says anything.
-        step *= min(1.0, radius / max(float(np.linalg.norm(step)), 1e-12))
-        centre = centre + step
-        if float(np.abs(step).max()) < STEP_TOLERANCE:
-            return centre, used, float(np.sqrt(kept @ kept / used))
-    return centre, used, float(np.sqrt(kept @ kept / used))
+    for iteration in range(MAX_ITERATIONS):
+        # Choosing anew for ever would let a pixel at the gate swing in and out, and the centre with it.
+        if iteration < SELECTIONS:
+            chosen = choose_depths(rays, depth, centre, radius)
+            if len(chosen) < MIN_PIXELS:
+                return None
+            r, z = rays[chosen], depth[chosen]
+        t, root = first_hit(r, centre, radius)
+        e = z - t
+        slope = (centre - t[:, None] * r) / root[:, None]
+        normal = slope.T @ slope + RIDGE * len(e)
+        step = np.linalg.solve(normal, slope.T @ e)
+        length = math.sqrt(step @ step)
+        # A step beyond the radius leaves the region in which the slope says anything.
+        centre = centre + step * min(1.0, radius / max(length, radius))
+        if iteration >= SELECTIONS and length < STEP_TOLERANCE:
+            break
+    residual = math.sqrt(e @ e / len(e))
+    # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.
+    return SphereFit(centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal))))
+
+
+def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+    """Return where rays (k, 3) first meet a sphere: the depths t (k,) m and the roots √D (k,); D is kept positive."""
+    length2, along = np.einsum("ij,ij->i", rays, rays), rays @ centre
+    D = along * along - length2 * (centre @ centre - radius**2)
+    root = np.sqrt(np.maximum(D, (0.1 * INNER_COSINE * radius) ** 2))
+    return (along - root) / length2, root
+
+
+def choose_depths(rays: FloatArray, depth: FloatArray, centre: FloatArray, radius: float) -> IntArray:
+    """Return the indices of the rays that meet the sphere well inside its silhouette and whose depth is no outlier."""
+    t, root = first_hit(rays, centre, radius)
+    inner = np.flatnonzero(root >= INNER_COSINE * radius * np.sqrt(np.einsum("ij,ij->i", rays, rays)))
+    if len(inner) == 0:
+        return inner
+    size = np.abs(depth[inner] - t[inner])
+    middle = len(inner) // 2
+    # 1.4826 times the median size estimates the standard deviation, whatever the outliers.
+    gate = max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.partition(size, middle)[middle]))
+    return inner[size <= gate]
 
 
 def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeCamera, radius: float) -> ByteArray:

@@ -129,7 +129,7 @@ def velocity_targets(
 
 
 class BulletPlant(Plant):
-    """A UR5 in PyBullet under a fixed RGB-D camera: y = ball centre fitted to the image, v₊ = v + (1 − e^(−h/τ))(u − v)."""
+    """A UR5 in PyBullet under a fixed RGB-D camera: v₊ = v + (1 − e^(−h/τ))(u − v), y = centre of the ball it sees."""
 
     def __init__(self, config: BulletConfig, setup: PlantSetup) -> None:
         """Open a world of its own and load the arm.
@@ -170,9 +170,10 @@ class BulletPlant(Plant):
         if first is None:
             true = self._model.to_camera(self._scene.ball_position())
             raise FeatureLost(
-                f"the ball is not visible at the start {self._start.tolist()}: it is at {true.round(3).tolist()} m in the "
-                f"camera frame, column and row {self._camera.project(true).round(1).tolist()} of an image of "
-                f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight or cut by the border"
+                f"the ball is not visible at the start {self._start.tolist()}: it is at {true.round(3).tolist()} m in "
+                f"the camera frame, column and row {self._camera.project(true).round(1).tolist()} of an image of "
+                f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight, too small or cut "
+                "by the border"
             )
         self._channel.reset(first, named_generator(seed, "dropped_frames"))
         self._started = time.perf_counter()

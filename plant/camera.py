@@ -5,8 +5,8 @@ image of w × h pixels, the point (x, y, z) appears at (w/2 + f x/z, h/2 + f y/z
 PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), not at (u + ½, v + ½): missing that costs
 2.5 mm at 1.3 m.
 
-Noise models: stereo, RMS(z) = z² · subpixel / (f_native · baseline) (Intel, "Tuning D435 and D415 for best performance");
-structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012).
+Noise models: stereo, RMS(z) = z² · subpixel / (f_native · baseline) (Intel, "Tuning D435 and D415
+for best performance"); structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class PinholeCamera:
 
 
 def view_matrix(X_BC: FloatArray) -> FloatArray:
-    """Return the OpenGL view matrix, (4, 4), of a camera at X_BC (4, 4); OpenGL's camera has y up and looks along −z."""
+    """Return the OpenGL view matrix, (4, 4), of a camera at X_BC (4, 4); OpenGL has y up and looks along −z."""
     R, p = X_BC[:3, :3], X_BC[:3, 3]
     view = np.eye(4)
     view[:3, :3] = np.array([[1.0], [-1.0], [-1.0]]) * R.T
@@ -99,36 +99,36 @@ def view_matrix(X_BC: FloatArray) -> FloatArray:
 class DepthNoise:
     """What a depth sensor adds to the true depth: z_measured = quantise(z + σ(z) N(0, 1))."""
 
-    model: str = "stereo"  # one of NOISE_MODELS
-    subpixel: float = 0.08  # px, RMS disparity error of a stereo match, vendor's white paper
-    baseline: float = 0.05  # m, between the two imagers, RealSense D435
+    depth_noise: str = "stereo"  # one of NOISE_MODELS
+    depth_subpixel: float = 0.08  # px, RMS disparity error of a stereo match, vendor's white paper
+    depth_baseline: float = 0.05  # m, between the two imagers, RealSense D435
     native_width: int = 848  # px, width at which the sensor matches, RealSense D435's optimum
-    quantisation: float = 0.001  # m, depth unit of the sensor; 0 = none
+    depth_quantisation: float = 0.001  # m, depth unit of the sensor; 0 = none
 
     def __post_init__(self) -> None:
         """Check the name and the numbers."""
-        if self.model not in NOISE_MODELS:
-            raise ValueError(f"depth noise must be one of {', '.join(NOISE_MODELS)}, got {self.model!r}")
-        check_number("subpixel", self.subpixel, at_least=0.0)
-        check_number("baseline", self.baseline, above=0.0)
+        if self.depth_noise not in NOISE_MODELS:
+            raise ValueError(f"depth_noise must be one of {', '.join(NOISE_MODELS)}, got {self.depth_noise!r}")
+        check_number("depth_subpixel", self.depth_subpixel, at_least=0.0)
+        check_number("depth_baseline", self.depth_baseline, above=0.0)
         check_number("native_width", self.native_width, at_least=1)
-        check_number("quantisation", self.quantisation, at_least=0.0)
+        check_number("depth_quantisation", self.depth_quantisation, at_least=0.0)
 
     def sigma(self, depth: npt.ArrayLike, camera: PinholeCamera) -> FloatArray:
         """Return the standard deviation, m, at true depths of any shape, m."""
         z = np.asarray(depth, dtype=np.float64)
-        if self.model == "stereo":
+        if self.depth_noise == "stereo":
             native_focal = camera.focal * self.native_width / camera.width
-            return np.asarray(z**2 * (self.subpixel / (native_focal * self.baseline)))
-        if self.model == "structured_light":
+            return np.asarray(z**2 * (self.depth_subpixel / (native_focal * self.depth_baseline)))
+        if self.depth_noise == "structured_light":
             return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2)
         return np.zeros_like(z)
 
     def apply(self, depth: npt.ArrayLike, camera: PinholeCamera, generator: np.random.Generator) -> FloatArray:
         """Return measured depths, m, for true depths of any shape, m; without noise nothing is drawn."""
         z = np.asarray(depth, dtype=np.float64)
-        if self.model != "none":
+        if self.depth_noise != "none":
             z = z + self.sigma(z, camera) * generator.standard_normal(z.shape)
-        if self.quantisation > 0.0:
-            z = np.round(z / self.quantisation) * self.quantisation
+        if self.depth_quantisation > 0.0:
+            z = np.round(z / self.depth_quantisation) * self.depth_quantisation
         return z

@@ -1,7 +1,7 @@
-"""Meshes as Wavefront OBJ text: a finely meshed unit sphere and upright-facing rectangles.
+"""Meshes as Wavefront OBJ text: a finely meshed unit sphere and level rectangles.
 
-The simulator's own sphere is so coarse that its front lies 6 % of the radius too deep; and its boxes draw six faces where
-one is seen, which costs most of the time of a frame.
+The simulator's own sphere is so coarse that its front lies 6 % of the radius too deep, and its boxes draw six faces
+where one is seen.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The simulated bench: the one module that calls PyBullet.
 
-An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W is
-the arm's base frame B.
+An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W
+is the arm's base frame B.
 """
 
 from __future__ import annotations
@@ -67,10 +67,13 @@ class Scene:
 
         Raises:
             ValueError: a window is wanted where there is no display.
+            ConnectionError: PyBullet opens no world, as too many are open.
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
         self._client: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
+        if self._client < 0:
+            raise ConnectionError("PyBullet could not open a physics world")
         try:
             self._load(arm, body, physics_step, scenery=scenery)
         except BaseException:
@@ -83,9 +86,10 @@ class Scene:
 
     def _load(self, arm: SerialArm, body: ArmBody, physics_step: float, *, scenery: bool) -> None:
         client = self._client
-        # Without this PyBullet keeps every mesh ever loaded by file name, and memory grows from plant to plant.
+        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps
+        # every mesh it ever loaded by file name, so memory would grow from plant to plant.
         pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=physics_step, enableFileCaching=0, deterministicOverlappingPairs=1, physicsClientId=client
+            fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
         )
         pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
         files = {"arm.urdf": arm_urdf(arm, body, BALL_MESH), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}

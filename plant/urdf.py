@@ -3,7 +3,8 @@
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
 
-No link has a collision shape: a mismatched arm's parts may overlap at rest, and the contact solver would throw it apart.
+No link has a collision shape: a mismatched arm's parts may overlap at rest, and the contact solver would throw it
+apart.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ def arm_urdf(arm: SerialArm, body: ArmBody, ball_mesh: str) -> str:
         centre = rotation_from_rpy(arm.rpy[i + 1]) @ body.centre_of_mass[i] + step
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
-        link = add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre, along)
+        link = add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre=centre, along=along)
         _draw_link(link, step, body.tube_radius[i], body.side_step[i])
         add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
@@ -147,15 +148,20 @@ def _draw_base(link: ET.Element, step: FloatArray, radius: float) -> None:
 
 
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
-    """Draw a link: a housing about its joint's axis, a tube beside the axis, and the way over to the next joint."""
-    corner, end = np.array([step[0], step[1], side]), step
-    beyond = np.array([0.0, 0.0, np.copysign(1.12 * radius, side or -1.0)])
-    top = np.array([0.0, 0.0, side])
-    draw_cylinder(link, ALUMINIUM, -beyond if side == 0.0 else np.zeros(3), top + beyond, 1.06 * radius)
-    draw_cylinder(link, LIGHT_BLUE, top + beyond, top + 1.25 * beyond, 1.0 * radius)
+    """Draw a link: a capped housing about its joint, a tube beside it, and the way over to the next joint."""
+    top, corner, end = np.array([0.0, 0.0, side]), np.array([step[0], step[1], side]), step
+    far_aside = abs(side) > radius
+    # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
+    outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
+    draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
+    draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
     draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
-    draw_cylinder(link, DARK_GREY, corner, end, 0.85 * radius)
-    draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
+    draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
+    if far_aside:
+        draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
+        draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
+    else:
+        draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
 
 
 def _draw_tool(link: ET.Element, tool: FloatArray, body: ArmBody) -> None:

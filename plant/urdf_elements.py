@@ -28,6 +28,7 @@ def add_link(
     name: str,
     mass: float,
     inertia: npt.ArrayLike,
+    *,
     centre: npt.ArrayLike = (0.0, 0.0, 0.0),
     along: npt.ArrayLike = (0.0, 0.0, 1.0),
 ) -> ET.Element:

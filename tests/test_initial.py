@@ -99,6 +99,12 @@ def test_the_nominal_model_is_evaluated_at_the_start():
     np.testing.assert_array_equal(provider.jacobian(), [[0.2, 0.6]])
 
 
+def test_a_nominal_model_of_another_robot_is_refused():
+    provider = initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: np.zeros((3, 6))))
+    with pytest.raises(ValueError, match=r"nominal_jacobian must return shape \(1, 2\), got \(3, 6\)"):
+        provider.reset(Observation(0.0, np.zeros(2), np.zeros(1)))
+
+
 def test_a_given_jacobian_is_taken_as_it_is():
     provider = initial_jacobian(InitialConfig("given", given=((1.0, 2.0),)), RobotKnowledge(spec(), 0))
     provider.reset(at := Observation(0.0, np.zeros(2), np.zeros(1)))

@@ -102,6 +102,16 @@ def test_a_command_that_is_not_finite_is_a_named_fault():
         controller.step(first, np.zeros((2, 2)))
 
 
+def test_an_estimate_that_is_not_finite_is_a_named_fault():
+    estimator, first = Recorder(), seen(0, np.zeros(3), np.zeros(2))
+    controller = servo(estimator)
+    controller.reset(first, 0)
+    controller.step(first, np.zeros((2, 2)))
+    estimator.J = np.full((2, 3), np.nan)
+    with pytest.raises(ControllerDiverged, match="jacobian is not finite at 0 s"):
+        controller.step(first, np.zeros((2, 2)))
+
+
 def test_observations_and_references_of_the_wrong_size_are_refused():
     controller, first = servo(ConstantEstimator()), seen(0, np.zeros(3), np.zeros(2))
     controller.reset(first, 0)

@@ -27,10 +27,10 @@ FORMS = ("split", "full")
 class KalmanConfig:
     """Settings of the Kalman filter."""
 
-    initial_deviation: float = 0.1  # m/rad, standard deviation of an entry of Ĵ₀: a tenth of a UR5's reach
-    process_deviation: float = 0.02  # m/rad, standard deviation of an entry's walk over one motion
+    initial_deviation: float = 0.05  # m/rad, of an entry of Ĵ₀; tuned: softer lets latency spoil the first motions
+    process_deviation: float = 0.02  # m/rad, of an entry's walk over one motion; tuned on mismatched kinematic plants
     feature_noise: float = 0.001  # m, standard deviation of the feature an axis; R = 2σ² I
-    min_joint_step: float = 0.005  # rad, motions below tell less than they cost: 1 mm of noise hides them
+    min_joint_step: float = 0.002  # rad, motions below, in which 1 mm of noise is all there is, are left out
     form: Literal["split", "full"] = "split"  # the same numbers; "full" is the readable reference
 
     def __post_init__(self) -> None:

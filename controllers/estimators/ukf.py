@@ -32,10 +32,10 @@ FORMS = ("sigma_points", "split")
 class UkfConfig:
     """Settings of the unscented Kalman filter."""
 
-    initial_deviation: float = 0.1  # m/rad, standard deviation of an entry of Ĵ₀: a tenth of a UR5's reach
-    process_deviation: float = 0.02  # m/rad, standard deviation of an entry's walk over one motion
+    initial_deviation: float = 0.05  # m/rad, of an entry of Ĵ₀; tuned: softer lets latency spoil the first motions
+    process_deviation: float = 0.02  # m/rad, of an entry's walk over one motion; tuned on mismatched kinematic plants
     feature_noise: float = 0.001  # m, standard deviation of the feature an axis; R = 2σ² I
-    min_joint_step: float = 0.005  # rad, motions below tell less than they cost: 1 mm of noise hides them
+    min_joint_step: float = 0.002  # rad, motions below, in which 1 mm of noise is all there is, are left out
     alpha: float = 1.0  # spread of the sigma points; 1 keeps all weights from being negative
     beta: float = 2.0  # prior knowledge of the distribution; 2 suits a Gaussian
     kappa: float = 0.0  # secondary spread
@@ -156,9 +156,10 @@ class UkfEstimator(Estimator):
             return
         if self._config.form == "split":
             self._J, self._P = split_update(self._J, self._P, dq, dy, q=self._q, r=self._r)
+            cholesky_of(self._P)
         else:
-            self._J, self._P = unscented_update(self._J, self._P, dq, dy, Q=self._Q, R=self._R, weights=self._weights)
-        cholesky_of(self._P)
+            weights = self._weights
+            self._J, self._P = unscented_update(self._J, self._P, dq, dy, Q=self._Q, R=self._R, weights=weights)
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return the present estimate, (m, n), m/rad."""

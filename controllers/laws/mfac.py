@@ -22,8 +22,8 @@ from plant.signals import FloatArray, Observation, check_number
 class MfacConfig:
     """Settings of the MFAC law."""
 
-    step_factor: float = 0.2  # ρ; with three periods of delay a loop gain above 0.44 a period is unstable
-    step_weight: float = 0.05  # λ, m²/rad², the unit of ‖J‖²: halves the gain where σ = 0.22 m/rad
+    step_factor: float = 0.15  # ρ, not the paper's 1: with three periods of delay a gain of 0.44 a period is unstable
+    step_weight: float = 0.02  # λ, m²/rad², the unit of ‖J‖²: halves the gain where σ = 0.14 m/rad
     feedforward: bool = False  # aim the reference's next step as well; needs a preview of at least 1, not in the paper
 
     def __post_init__(self) -> None:

@@ -117,11 +117,13 @@ def _draw_trajectory(tracks: dict[str, pd.DataFrame], styles: dict[str, MethodSt
     longest = max(tracks.values(), key=len)
     reference = longest[[kind.replace("true_feature", "reference") for kind in kinds]].to_numpy()
     start = longest[kinds].to_numpy()[0]
+    axes.scatter(*start, color="black", marker="s", s=35, label="start", zorder=10)
     if np.ptp(reference, axis=0).max() > 0.0:
         axes.plot(*reference.T, color="black", linewidth=2.5, alpha=0.3, label="reference")
-    axes.scatter(*start, color="black", marker="s", s=35, label="start", zorder=10)
-    axes.scatter(*reference[-1], color="black", marker="*", s=90, label="target", zorder=10)
+    else:
+        axes.scatter(*reference[0], color="black", marker="*", s=90, label="target", zorder=10)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z (depth) [m]")
+    axes.zaxis.labelpad = 12.0
     axes.set_title(" ")  # keeps the figure's title off the axis label
     axes.set_aspect("equal", adjustable="datalim")
     axes.view_init(elev=-62.0, azim=-90.0, roll=0.0)
