@@ -96,7 +96,7 @@ def load_networks(
 def _read_arrays(path: Path) -> dict[str, Any]:
     """Return all arrays of the file after its format and version have been checked."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise ValueError(f"network file {path} does not exist") from error
