@@ -13,13 +13,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from plant import ur5
 from plant.bullet import PHYSICS_STEP, BulletConfig, BulletPlant, ur5_body
 from plant.plant import PlantSetup, whole_steps
 from plant.scene import Scene, view_of
 from plant.signals import Command
 from plant.ur5 import nominal_ur5
 
-HOME = np.array([2.97, -1.72, 2.05, -0.40, 1.70, 0.0])
+HOME = np.array(ur5.HOME)
 
 
 def milliseconds(call: Callable[[], object]) -> float:

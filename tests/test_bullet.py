@@ -17,7 +17,7 @@ from plant.plant import FeatureLost, PlantDiverged, PlantSetup
 from plant.scene import Scene, view_of
 from plant.signals import Command
 
-HOME = np.array([2.97, -1.72, 2.05, -0.40, 1.70, 0.0])
+HOME = np.array(ur5.HOME)
 FLANGE_DOWN = np.array([np.pi, -1.6, 1.9, -1.87, -np.pi / 2, 0.0])
 BARE = BulletConfig(scenery=False)
 IDEAL = BulletConfig(
