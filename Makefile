@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 .PHONY: run test lint format benchmark lock clean
 
 run: $(VENV)/ready
-	$(BIN)/servobench compare --plants bullet --controllers all --tasks exp1,exp2,exp3,exp4,circle --mismatch moderate
+	$(BIN)/servobench compare --plants bullet --mismatch moderate \
+	  --controllers rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
 test: lint
 	$(BIN)/python -m pytest -n auto

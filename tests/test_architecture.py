@@ -16,7 +16,7 @@ MAY_IMPORT = {
     "harness": PACKAGES,
 }
 OWNERS = {
-    "pybullet": ("plant/bullet",),
+    "pybullet": ("plant/scene",),
     "casadi": ("plant/symbolic", "controllers/laws/mpc", "controllers/nmpc", "fmus/"),
     "fmpy": ("plant/fmu", "fmus/"),
     "dask": ("harness/cluster",),
