@@ -26,7 +26,7 @@ def test_the_first_update_equals_the_one_computed_by_hand():
     assert estimator.diagnostics()["rate_error"] == pytest.approx(6.0)
 
 
-def lyapunov_run(true, estimator, config, gain=2.0, dt=1e-3, steps=3000, sign=1.0):
+def lyapunov_run(true, estimator, config, gain=4.0, dt=1e-3, steps=1500, sign=1.0):
     """Return V and its predicted rate along u = K_p Ĵ⁺ e on the plant ẏ = J(q) q̇ whose J the network can represent."""
     q, e, V, rate = np.array([0.2, -0.1, 0.3]), np.array([0.3, -0.2]), [], []
     for _ in range(steps):

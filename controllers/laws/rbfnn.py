@@ -108,9 +108,10 @@ class RbfnnLaw(Law):
             self._positions = _pushed(self._positions, observation.joint_position, network.position_history)
         if config.row_space_only:
             self._learned = project_to_row_space(self._learned, jacobian)
-        ahead = self._predict(jacobian, reference)
+        weights = self.weights
+        ahead = self._predict(weights, jacobian, reference)
         xi, h, q = ahead.xi[0], ahead.h[0], self._positions[0]
-        wanted = controller_output(self.weights, xi, h) - q
+        wanted = controller_output(weights, xi, h) - q
         if observation.feature_valid:
             wanted = self._learn(jacobian, ahead, wanted)
         step = scale_to_limit(wanted, self._step_limit)
@@ -130,14 +131,14 @@ class RbfnnLaw(Law):
             "saturated": float(self._saturated),
         }
 
-    def _predict(self, jacobian: FloatArray, reference: FloatArray) -> RollOut:
-        """Roll the loop ahead with the present weights."""
+    def _predict(self, weights: FloatArray, jacobian: FloatArray, reference: FloatArray) -> RollOut:
+        """Roll the loop ahead."""
         assumed = reference[: self._config.horizon + 1]
         if not self._config.preview:
             assumed = np.repeat(reference[:1], self._config.horizon + 1, axis=0)
         history = _known(self._errors), _known(self._positions)
         steps = np.diff(assumed, axis=0)
-        ahead = roll_out(self._network, self.weights, jacobian, history, steps, self._step_limit)
+        ahead = roll_out(self._network, weights, jacobian, history, steps, self._step_limit)
         self._criterion = ahead.criterion
         self._predicted_error = float(np.linalg.norm(ahead.errors[-1]))
         return ahead
