@@ -101,18 +101,26 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
         knowledge: of the robot.
 
     Raises:
-        ValueError: no region is known, no nominal model exists, or as `train`.
+        ValueError: no region is known, no nominal model exists, networks of another robot came, or as `train`.
     """
     if not config.lower:
         if knowledge.region is None:
             raise ValueError("training needs a region: give lower and upper, one number a joint, rad")
         lower, upper = knowledge.region
         config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
+    spec = knowledge.spec
     if knowledge.train is not None:
-        return knowledge.train(config)
-    if knowledge.nominal_jacobian is None:
+        networks = knowledge.train(config)
+    elif knowledge.nominal_jacobian is not None:
+        networks = train(config, knowledge.nominal_jacobian, spec)
+    else:
         raise ValueError("training needs a nominal model, and this plant has none")
-    return train(config, knowledge.nominal_jacobian, knowledge.spec)
+    if (networks.jacobian.n, networks.jacobian.m) != (spec.n, spec.m):
+        raise ValueError(
+            f"network must be of {spec.n} joints and {spec.m} features, "
+            f"got {networks.jacobian.n} and {networks.jacobian.m}"
+        )
+    return networks
 
 
 def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> str:

@@ -138,7 +138,7 @@ def test_reset_restores_the_offline_network_whatever_the_initial_jacobian():
     assert estimator.diagnostics()["estimator_step_size"] == 0.0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-6, 3))
 def test_the_jacobian_stays_finite_for_any_sizes_and_motions(n, m, seed, exponent):
     estimator, rng = RbfEstimator(RbfConfig(), network(n, m, seed=seed)), np.random.default_rng(seed)

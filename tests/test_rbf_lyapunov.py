@@ -26,7 +26,7 @@ def test_the_first_update_equals_the_one_computed_by_hand():
     assert estimator.diagnostics()["rate_error"] == pytest.approx(6.0)
 
 
-def lyapunov_run(true, estimator, config, gain=2.0, dt=1e-3, steps=3000, sign=1.0):
+def lyapunov_run(true, estimator, config, gain=4.0, dt=1e-3, steps=1500, sign=1.0):
     """Return V and its predicted rate along u = K_p Ĵ⁺ e on the plant ẏ = J(q) q̇ whose J the network can represent."""
     q, e, V, rate = np.array([0.2, -0.1, 0.3]), np.array([0.3, -0.2]), [], []
     for _ in range(steps):
@@ -78,7 +78,7 @@ def test_reset_restores_the_offline_network():
     assert estimator.diagnostics()["rate_error"] == 0.0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_the_jacobian_is_finite_for_any_sizes(n, m, seed):
     rng, estimator = np.random.default_rng(seed), RbfLyapunovEstimator(RbfLyapunovConfig(), network(n, m, seed=seed))

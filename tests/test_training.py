@@ -269,6 +269,15 @@ def test_both_presets_take_their_networks_from_the_harness(networks):
     assert asked[0].lower == (0.5,) * N
 
 
+def test_networks_of_another_robot_are_refused_at_construction(networks):
+    names = tuple("abcdef"), tuple("xyz")
+    other = PlantSpec(*names, np.ones(6), np.full(6, -6.0), np.full(6, 6.0), PERIOD)
+    told = knowledge(spec=other, train=lambda config: networks)
+    for preset in (rbfnn_mfac, rbf_pid):
+        with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
+            preset.ENTRY.build(preset.ENTRY.config(), told)
+
+
 def test_networks_of_two_robots_do_not_go_together(networks):
     rng = np.random.default_rng(0)
     other = ControllerNetwork(rng.normal(size=(4, 5)), np.ones(4), rng.normal(size=(4, 5, 4)), 1, 1)

@@ -43,9 +43,9 @@ def window_gradient(
     Returns:
         G_i = Σ_t (Δy_t − Ĵ_t Δq_t) Δq_{i,t} θ_i(q_t)ᵀ, (n, m, L), and Δy_t − Ĵ_t Δq_t, (T, m).
     """
-    moved = joint_steps[:, :, None] * theta
-    error = feature_steps - np.einsum("iml,til->tm", weights, moved, optimize=True)
-    return np.einsum("tm,til->iml", error, moved, optimize=True), error
+    moved = np.swapaxes(joint_steps[:, :, None] * theta, 0, 1)
+    error = feature_steps - np.matmul(moved, np.swapaxes(weights, 1, 2)).sum(axis=0)
+    return np.matmul(error.T, moved), error
 
 
 def window_step(theta: FloatArray, joint_steps: FloatArray, k2: float, epsilon: float) -> float:

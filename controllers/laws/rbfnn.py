@@ -108,9 +108,12 @@ class RbfnnLaw(Law):
             self._positions = _pushed(self._positions, observation.joint_position, network.position_history)
         if config.row_space_only:
             self._learned = project_to_row_space(self._learned, jacobian)
-        ahead = self._predict(jacobian, reference)
+        weights = self.weights
+        history = self._errors, self._positions
+        ahead = roll_out(network, weights, jacobian, history, self._reference_steps(reference), self._step_limit)
+        self._criterion, self._predicted_error = ahead.criterion, float(np.linalg.norm(ahead.errors[-1]))
         xi, h, q = ahead.xi[0], ahead.h[0], self._positions[0]
-        wanted = controller_output(self.weights, xi, h) - q
+        wanted = controller_output(weights, xi, h) - q
         if observation.feature_valid:
             wanted = self._learn(jacobian, ahead, wanted)
         step = scale_to_limit(wanted, self._step_limit)
@@ -130,17 +133,11 @@ class RbfnnLaw(Law):
             "saturated": float(self._saturated),
         }
 
-    def _predict(self, jacobian: FloatArray, reference: FloatArray) -> RollOut:
-        """Roll the loop ahead with the present weights."""
-        assumed = reference[: self._config.horizon + 1]
+    def _reference_steps(self, reference: FloatArray) -> FloatArray:
+        """Return how the reference is assumed to move in each of the T steps, (T, m), m."""
         if not self._config.preview:
-            assumed = np.repeat(reference[:1], self._config.horizon + 1, axis=0)
-        history = _known(self._errors), _known(self._positions)
-        steps = np.diff(assumed, axis=0)
-        ahead = roll_out(self._network, self.weights, jacobian, history, steps, self._step_limit)
-        self._criterion = ahead.criterion
-        self._predicted_error = float(np.linalg.norm(ahead.errors[-1]))
-        return ahead
+            return np.zeros((self._config.horizon, self._network.m))
+        return np.diff(reference[: self._config.horizon + 1], axis=0)
 
     def _learn(self, jacobian: FloatArray, ahead: RollOut, wanted: FloatArray) -> FloatArray:
         """Update the weights and return the joint step that the new ones want, (n,), rad.
@@ -173,9 +170,3 @@ def _pushed(history: FloatArray | None, newest: FloatArray, length: int) -> Floa
     if history is None:
         return np.repeat(newest[None], length, axis=0)
     return np.concatenate([newest[None], history[:-1]])
-
-
-def _known(history: FloatArray | None) -> FloatArray:
-    if history is None:
-        raise ValueError("command must have been called before anything can be predicted")
-    return history
