@@ -9,10 +9,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 from plant.hand_eye import HandEyeModel
 from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault, Truth
+
+ImageArray: TypeAlias = npt.NDArray[np.uint8]
 
 
 class PlantDiverged(RunFault):
@@ -67,6 +72,13 @@ class Plant(ABC):
     @abstractmethod
     def truth(self) -> Truth:
         """Return the present true feature and Jacobian; for evaluation only."""
+
+    def picture(self) -> ImageArray | None:
+        """Return what the camera sees now, (h, w, 3) RGB with the detection drawn in; None without a camera.
+
+        Taking it disturbs neither the run nor its random streams.
+        """
+        return None
 
     @abstractmethod
     def close(self) -> None:

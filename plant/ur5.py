@@ -50,6 +50,11 @@ TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
 BALL_RADIUS = 0.035  # m
 
 # The camera hangs above the workspace and looks straight down; image up is +x of the base.
+# The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
+HOME = (2.79, -1.45, 2.34, 2.25, -1.22, -0.19)  # rad
+TRAINING_LOWER = tuple(q - 0.6 for q in HOME)
+TRAINING_UPPER = tuple(q + 0.6 for q in HOME)
+
 WORKSPACE_CENTRE = (0.5, 0.0, 0.25)  # m, base frame
 CAMERA_DISTANCE = 1.3  # m, from the camera to the workspace's centre
 R_BC_DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))

@@ -1,0 +1,207 @@
+"""The command `servobench`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import pandas as pd
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from harness import results
+from harness.compare import Batch, check_batch, parse_seeds, run_batch
+from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
+from harness.figures import draw_figures
+from harness.manifest import describe_batch
+from harness.registry import controller_names, find_controller, find_plant, plant_names
+from harness.summary import summary_table
+from harness.tasks import TASKS, find_task, task_names
+
+INTERRUPTED = 130
+MAX_DEFAULT_WORKERS = 8
+
+app = typer.Typer(
+    help="The bench on which uncalibrated visual-servoing controllers are compared.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting, such as kinematic.lag=0.1.")
+]
+OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
+NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
+
+
+@app.command()
+def plants(name: NameArgument = None) -> None:
+    """List the plants, or show the settings of one."""
+    _list_or_show("plants", name, plant_names(), find_plant, lambda entry: entry.config())
+
+
+@app.command()
+def controllers(name: NameArgument = None) -> None:
+    """List the controllers, or show the settings of one."""
+    _list_or_show("controllers", name, controller_names(), find_controller, lambda entry: entry.config())
+
+
+@app.command()
+def tasks(name: NameArgument = None) -> None:
+    """List the tasks, or show the settings of one."""
+    _list_or_show("tasks", name, task_names(), find_task, lambda entry: entry.default)
+
+
+@app.command()
+def run(
+    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "bullet",
+    controller: Annotated[str, typer.Option(help="Name of the controller.")] = "ukf_mfac",
+    task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",
+    mismatch: Annotated[str, typer.Option(help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.")] = (
+        "moderate"
+    ),
+    seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
+    set_: SetOption = None,
+    config: ConfigOption = None,
+    view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
+    out: OutOption = None,
+) -> None:
+    """Carry out one run."""
+    assignments = list(set_ or [])
+    if view:
+        if plant != "bullet":
+            raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
+        assignments.append("bullet.view=true")
+    batch = Batch((plant,), (controller,), (task,), (mismatch,), parse_seeds(f"{seed},"))
+    _carry_out(batch, read_settings(config, assignments), 1, out)
+
+
+@app.command()
+def compare(
+    plants: Annotated[str, typer.Option(help="Names by comma, or all.")] = "kinematic",
+    controllers: Annotated[str, typer.Option(help="Names by comma, or all.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Names by comma.")] = "exp1,exp2,exp3,exp4,circle",
+    mismatch: Annotated[str, typer.Option(help="Mismatches by comma.")] = "moderate",
+    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "1",
+    workers: Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")] = None,
+    set_: SetOption = None,
+    config: ConfigOption = None,
+    out: OutOption = None,
+) -> None:
+    """Run every combination and compare the controllers."""
+    batch = Batch(
+        _names("plants", plants, plant_names()),
+        _names("controllers", controllers, controller_names()),
+        _names("tasks", tasks, list(TASKS)),
+        tuple(part.strip() for part in mismatch.split(",")),
+        parse_seeds(seeds),
+    )
+    count = workers or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
+    _carry_out(batch, read_settings(config, set_ or []), count, out)
+
+
+@app.command()
+def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
+    """Put the finished runs of a killed batch together into its tables."""
+    results.check_folder(folder)
+    console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
+
+
+def main() -> None:
+    """Run the command line; a bad input is one line on standard error and exit code 2."""
+    try:
+        app()
+    except ConfigurationError as error:
+        sys.stderr.write(f"servobench: {error}\n")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.stderr.write("servobench: interrupted\n")
+        sys.exit(INTERRUPTED)
+
+
+def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None) -> None:
+    """Check everything, run everything, and leave tables and figures behind."""
+    with console.status("checking the configuration"):
+        check_batch(batch, settings)
+    requests = batch.requests()
+    folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    results.create_folder(folder, describe_batch(requests, settings))
+    interrupted = False
+    with _progress() as progress:
+        bar = progress.add_task("running", total=len(requests))
+        try:
+            for row in run_batch(requests, settings, folder, min(workers, len(requests))):
+                progress.update(bar, advance=1, description=row["run_id"])
+        except KeyboardInterrupt:
+            interrupted = True
+    results.collect(folder)
+    runs = results.load_runs(folder)
+    console.print(summary_table(runs))
+    _print_faults(runs)
+    with console.status("drawing the figures"):
+        figures = draw_figures(folder)
+    if out is None:
+        results.point_latest(folder)
+    console.print(f"tables and {len(figures)} figures in {folder}", soft_wrap=True)
+    if interrupted:
+        console.print(f"interrupted: {len(runs)} of {len(requests)} runs were finished and kept")
+        sys.exit(INTERRUPTED)
+
+
+def _print_faults(runs: pd.DataFrame) -> None:
+    for row in runs[runs["reason"] != ""].to_dict("records"):
+        console.print(f"{row['run_id']}: {row['status']}: {row['reason']}", soft_wrap=True, markup=False)
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _names(kind: str, text: str, known: list[str]) -> tuple[str, ...]:
+    if text.strip() == "all":
+        return tuple(known)
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    if not names:
+        raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            raise ConfigurationError(f"unknown name {name!r} in --{kind}: {suggest(name, known)}")
+    return names
+
+
+def _list_or_show(
+    kind: str,
+    name: str | None,
+    names: Sequence[str],
+    find: Callable[[str], Any],
+    default: Callable[[Any], Any],
+) -> None:
+    table = Table("setting", "default") if name else Table(kind, "")
+    if name:
+        for key, value in flatten(default(find(name))).items():
+            table.add_row(f"{name}.{key}", str(value))
+    else:
+        for known in names:
+            table.add_row(known, find(known).summary)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()

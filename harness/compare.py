@@ -1,0 +1,113 @@
+"""Many runs: every plant with every controller, task, mismatch and seed, side by side on worker processes."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import cv2
+import joblib
+
+from harness import results
+from harness.configuration import ConfigurationError, Settings
+from harness.experiment import RunRequest, build_experiment, known_sections, run_experiment
+
+PICTURES = "pictures"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The runs of a comparison: all combinations of these, in this order."""
+
+    plants: tuple[str, ...]
+    controllers: tuple[str, ...]
+    tasks: tuple[str, ...]
+    mismatches: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+    def requests(self) -> list[RunRequest]:
+        """Return the runs, seeds varying fastest."""
+        order = product(self.plants, self.tasks, self.mismatches, self.controllers, self.seeds)
+        return [
+            RunRequest(plant, controller, task, mismatch, seed) for plant, task, mismatch, controller, seed in order
+        ]
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds that `text` names: a count `5`, a list `3,1,4`, or a range `100:120` (end not included).
+
+    Raises:
+        ConfigurationError: none of these, or empty.
+    """
+    try:
+        if ":" in text:
+            begin, end = (int(part) for part in text.split(":"))
+            seeds = tuple(range(begin, end))
+        elif "," in text:
+            seeds = tuple(int(part) for part in text.split(",") if part.strip())
+        else:
+            seeds = tuple(range(int(text)))
+    except ValueError as error:
+        raise ConfigurationError(
+            f"seeds must be a count (5), a list (3,1,4) or a range (100:120), got {text!r}"
+        ) from error
+    if not seeds or min(seeds) < 0:
+        raise ConfigurationError(f"seeds must name at least one seed, none of them negative; got {text!r}")
+    return tuple(dict.fromkeys(seeds))
+
+
+def check_batch(batch: Batch, settings: Settings) -> None:
+    """Build every combination of plant, controller, task and mismatch once, so that a bad one is refused at once.
+
+    Raises:
+        ConfigurationError: a name, setting or mismatch that cannot be used.
+    """
+    settings.check_sections(known_sections())
+    first = batch.seeds[0]
+    for plant, mismatch in product(batch.plants, batch.mismatches):
+        build_experiment(
+            RunRequest(plant, batch.controllers[0], batch.tasks[0], mismatch, first), settings
+        ).plant.close()
+    for plant, controller in product(batch.plants, batch.controllers[1:]):
+        request = RunRequest(plant, controller, batch.tasks[0], batch.mismatches[0], first)
+        build_experiment(request, settings).plant.close()
+    for task in batch.tasks[1:]:
+        request = RunRequest(batch.plants[0], batch.controllers[0], task, batch.mismatches[0], first)
+        build_experiment(request, settings).plant.close()
+
+
+def run_batch(
+    requests: Sequence[RunRequest], settings: Settings, folder: Path, workers: int
+) -> Iterator[dict[str, Any]]:
+    """Carry out `requests` and yield each run's row as it finishes; every finished run is on disk by then.
+
+    Args:
+        requests: the runs.
+        settings: overrides of the defaults.
+        folder: a results folder made by `results.create_folder`.
+        workers: number of processes; with 1 the runs happen in this one.
+    """
+    pictured = min(request.seed for request in requests)
+    parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)
+    jobs = (
+        joblib.delayed(_carry_out)(index, request, settings, folder, request.seed == pictured, workers > 1)
+        for index, request in enumerate(requests)
+    )
+    yield from parallel(jobs)
+
+
+def _carry_out(
+    index: int, request: RunRequest, settings: Settings, folder: Path, picture: bool, in_worker: bool
+) -> dict[str, Any]:
+    if in_worker:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    result = run_experiment(request, settings, picture=picture)
+    results.write_part(folder, index, result.row, result.steps)
+    if result.picture is not None:
+        (folder / PICTURES).mkdir(exist_ok=True)
+        cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), result.picture[..., ::-1])
+    return result.row

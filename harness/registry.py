@@ -1,0 +1,86 @@
+"""Plants, controllers and tasks by name: those of this package and those that other distributions publish.
+
+A third party publishes a `PlantEntry` or `ControllerEntry` under the entry-point group `servobench.plants` or
+`servobench.controllers`; a name of this package cannot be taken over.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+
+from controllers.controller import ControllerEntry
+from harness.configuration import ConfigurationError, suggest
+from plant.plant import PlantEntry
+
+PLANT_GROUP = "servobench.plants"
+CONTROLLER_GROUP = "servobench.controllers"
+
+PLANTS = {
+    "kinematic": "plant.kinematic:ENTRY",
+    "bullet": "plant.bullet:ENTRY",
+}
+CONTROLLERS = {
+    "constant": "controllers.constant:ENTRY",
+    "calibrated": "controllers.calibrated:ENTRY",
+    "ukf_mfac": "controllers.ukf_mfac:ENTRY",
+}
+
+
+def plant_names() -> list[str]:
+    """Return the names of all plants, those of this package first."""
+    return list(_points(PLANT_GROUP))
+
+
+def controller_names() -> list[str]:
+    """Return the names of all controllers, those of this package first."""
+    return list(_points(CONTROLLER_GROUP))
+
+
+def find_plant(name: str) -> PlantEntry:
+    """Return the plant called `name`.
+
+    Raises:
+        ConfigurationError: no such plant, or a third party's that cannot be loaded.
+    """
+    entry = _load(PLANT_GROUP, "plant", name)
+    if not isinstance(entry, PlantEntry):
+        raise ConfigurationError(
+            f"plant {name!r} is published as {type(entry).__name__}, wanted a plant.plant.PlantEntry"
+        )
+    return entry
+
+
+def find_controller(name: str) -> ControllerEntry:
+    """Return the controller called `name`.
+
+    Raises:
+        ConfigurationError: no such controller, or a third party's that cannot be loaded.
+    """
+    entry = _load(CONTROLLER_GROUP, "controller", name)
+    if not isinstance(entry, ControllerEntry):
+        raise ConfigurationError(
+            f"controller {name!r} is published as {type(entry).__name__}, "
+            "wanted a controllers.controller.ControllerEntry"
+        )
+    return entry
+
+
+@cache
+def _points(group: str) -> dict[str, EntryPoint]:
+    own = PLANTS if group == PLANT_GROUP else CONTROLLERS
+    points = {name: EntryPoint(name, value, group) for name, value in own.items()}
+    for point in entry_points(group=group):
+        points.setdefault(point.name, point)
+    return points
+
+
+@cache
+def _load(group: str, kind: str, name: str) -> object:
+    points = _points(group)
+    if name not in points:
+        raise ConfigurationError(f"unknown {kind} {name!r}: {suggest(name, points)}")
+    try:
+        return points[name].load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}") from error

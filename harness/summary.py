@@ -1,0 +1,80 @@
+"""The table that a comparison ends with: a row for each controller in each task."""
+
+from __future__ import annotations
+
+import pandas as pd
+from rich.table import Table
+
+from harness.experiment import COMPLETED
+
+KEYS = ["plant", "mismatch", "task", "controller"]
+
+
+def summarise(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each plant, mismatch, task and controller, in the order in which they first appear.
+
+    Columns: runs, completed, settled (within 5 mm), median settling time [s], median overshoot, median RMS error of the
+    evaluated part [m], median path length ratio, median controller time [µs].
+    """
+    rows = []
+    for key, group in runs.groupby(KEYS, sort=False):
+        row = dict(zip(KEYS, key, strict=True))
+        row["runs"] = len(group)
+        row["completed"] = int((group["status"] == COMPLETED).sum())
+        row["settled"] = int(_column(group, "settling_time_s").notna().sum())
+        for name in (
+            "settling_time_s",
+            "overshoot",
+            "rms_error_evaluated_m",
+            "path_length_ratio",
+            "controller_time_median_us",
+        ):
+            row[name] = _column(group, name).median()
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def summary_table(runs: pd.DataFrame) -> Table:
+    """Return the summary as a table for the terminal."""
+    table = Table(title="medians over runs; settled = within 5 mm and stays", title_justify="left")
+    for heading, justify in (
+        ("plant", "left"),
+        ("mismatch", "left"),
+        ("task", "left"),
+        ("controller", "left"),
+        ("completed", "right"),
+        ("settled", "right"),
+        ("settling [s]", "right"),
+        ("overshoot [%]", "right"),
+        ("RMS end [mm]", "right"),
+        ("path ratio", "right"),
+        ("step [µs]", "right"),
+    ):
+        table.add_column(heading, justify="left" if justify == "left" else "right", no_wrap=True)
+    previous: tuple[str, ...] | None = None
+    for row in summarise(runs).to_dict("records"):
+        block = (row["plant"], row["mismatch"], row["task"])
+        if previous is not None and block != previous:
+            table.add_section()
+        shown = block if block != previous else ("", "", "")
+        previous = block
+        table.add_row(
+            *shown,
+            row["controller"],
+            f"{row['completed']}/{row['runs']}",
+            f"{row['settled']}/{row['runs']}",
+            _number(row["settling_time_s"], 1.0, 2),
+            _number(row["overshoot"], 100.0, 0),
+            _number(row["rms_error_evaluated_m"], 1000.0, 1),
+            _number(row["path_length_ratio"], 1.0, 2),
+            _number(row["controller_time_median_us"], 1.0, 0),
+        )
+    return table
+
+
+def _column(group: pd.DataFrame, name: str) -> pd.Series[float]:
+    return group[name].astype(float) if name in group else pd.Series([float("nan")] * len(group))
+
+
+def _number(value: float, factor: float, digits: int) -> str:
+    return "–" if pd.isna(value) else f"{value * factor:.{digits}f}"

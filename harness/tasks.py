@@ -1,0 +1,215 @@
+"""The tasks: where a run starts, what the feature should do, and for how long.
+
+Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
+feature. A target given as joint positions is therefore seen through the true robot, and is always in reach. Curves are
+given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.configuration import ConfigurationError, suggest
+from harness.references import Circle, FixedPoint, Lemniscate, Reference, line, read_waypoints
+from plant.hand_eye import FEATURE_NAMES, HandEyeModel
+from plant.seeds import named_generator
+from plant.signals import FloatArray, as_vector, check_number
+from plant.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
+
+Vector = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A task made concrete for one true robot.
+
+    Attributes:
+        start: (n,), rad, joint positions at time 0.
+        reference: the desired feature over time.
+        duration: s.
+        evaluate_from: s, where the evaluated part begins.
+        point_to_point: the reference is a fixed target.
+    """
+
+    start: FloatArray
+    reference: Reference
+    duration: float
+    evaluate_from: float
+    point_to_point: bool = False
+
+
+@dataclass(frozen=True)
+class PointTask:
+    """A move from rest to a fixed target that was taught at given joint positions."""
+
+    start: Vector = HOME  # rad, joint positions at time 0
+    target: Vector = HOME  # rad, joint positions at which the target was taught
+    duration: float = 10.0  # s
+
+
+@dataclass(frozen=True)
+class RandomTask:
+    """A move whose start and target are drawn by the run's seed from a box of joint positions."""
+
+    lower: Vector = TRAINING_LOWER  # rad
+    upper: Vector = TRAINING_UPPER  # rad
+    shortest: float = 0.1  # m, least distance between start and target (on the nominal model)
+    lowest: float = 0.08  # m, least height of the ball above the table (on the nominal model)
+    duration: float = 10.0  # s
+
+
+@dataclass(frozen=True)
+class CircleTask:
+    """A horizontal circle in the camera frame, entered from its centre: a large initial error."""
+
+    start: Vector = HOME  # rad
+    centre: Vector = (0.0, 0.0, 1.25)  # m, camera frame: (0.5, 0, 0.3) m in the base frame of the nominal robot
+    radius: float = 0.3  # m
+    lap_time: float = 10.0  # s: 200 points a lap at the default period
+    laps: int = 2
+
+    def __post_init__(self) -> None:
+        """Check the numbers that the reference does not."""
+        check_number("laps", self.laps, at_least=1)
+
+
+@dataclass(frozen=True)
+class LemniscateTask(CircleTask):
+    """A figure of eight in the plane of the camera's image."""
+
+
+@dataclass(frozen=True)
+class LineTask:
+    """A straight line at constant speed, then rest at its end."""
+
+    start: Vector = HOME  # rad
+    begin: Vector = (-0.2, 0.0, 1.25)  # m, camera frame
+    end: Vector = (0.2, 0.1, 1.2)  # m, camera frame
+    moving: float = 8.0  # s
+    duration: float = 10.0  # s
+
+
+@dataclass(frozen=True)
+class WaypointTask:
+    """Waypoints from a CSV file with the columns time_s, x_m, y_m, z_m in the camera frame."""
+
+    start: Vector = HOME  # rad
+    file: str = ""  # path of the CSV file
+    settle: float = 2.0  # s after the last waypoint
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("settle", self.settle, at_least=0.0)
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task as the command line knows it.
+
+    Attributes:
+        name: the word on the command line.
+        summary: one line for `servobench tasks`.
+        default: its settings.
+        build: makes a scenario from settings, the true robot and a seed.
+    """
+
+    name: str
+    summary: str
+    default: Any
+    build: Callable[[Any, HandEyeModel, int], Scenario]
+
+
+def _build_point(config: PointTask, true: HandEyeModel, _: int) -> Scenario:
+    n = true.arm.n
+    target = as_vector("target", config.target, n)
+    check_number("duration", config.duration, above=0.0)
+    return Scenario(
+        start=as_vector("start", config.start, n),
+        reference=FixedPoint(true.feature(target)),
+        duration=config.duration,
+        evaluate_from=0.75 * config.duration,
+        point_to_point=True,
+    )
+
+
+def _build_random(config: RandomTask, true: HandEyeModel, seed: int) -> Scenario:
+    n = true.arm.n
+    lower, upper = as_vector("lower", config.lower, n), as_vector("upper", config.upper, n)
+    if not (lower < upper).all():
+        raise ConfigurationError("random: lower must be below upper for every joint")
+    generator, nominal = named_generator(seed, "start_and_target"), nominal_ur5()
+    for _ in range(1000):
+        pair = generator.uniform(lower, upper, (2, n))
+        balls = nominal.arm.ball_position(pair)
+        if np.linalg.norm(balls[1] - balls[0]) >= config.shortest and (balls[:, 2] >= config.lowest).all():
+            return _build_point(PointTask(tuple(pair[0]), tuple(pair[1]), config.duration), true, seed)
+    raise ConfigurationError("random: no start and target in the box are far enough apart and above the table")
+
+
+def _build_circle(config: CircleTask, true: HandEyeModel, _: int) -> Scenario:
+    reference = Circle(as_vector("centre", config.centre, 3), config.radius, config.lap_time)
+    return _lap_scenario(config, reference, true)
+
+
+def _build_lemniscate(config: LemniscateTask, true: HandEyeModel, _: int) -> Scenario:
+    reference = Lemniscate(as_vector("centre", config.centre, 3), config.radius, config.lap_time)
+    return _lap_scenario(config, reference, true)
+
+
+def _lap_scenario(config: CircleTask, reference: Reference, true: HandEyeModel) -> Scenario:
+    start = as_vector("start", config.start, true.arm.n)
+    return Scenario(start, reference, config.laps * config.lap_time, (config.laps - 1) * config.lap_time)
+
+
+def _build_line(config: LineTask, true: HandEyeModel, _: int) -> Scenario:
+    reference = line(as_vector("begin", config.begin, 3), as_vector("end", config.end, 3), config.moving)
+    start = as_vector("start", config.start, true.arm.n)
+    return Scenario(start, reference, config.duration, 0.5 * config.duration)
+
+
+def _build_waypoints(config: WaypointTask, true: HandEyeModel, _: int) -> Scenario:
+    if not config.file:
+        raise ConfigurationError("waypoints needs a CSV file: --set waypoints.file=PATH")
+    reference = read_waypoints(Path(config.file).expanduser(), FEATURE_NAMES)
+    duration = float(reference.times[-1]) + config.settle
+    check_number("last waypoint's time plus settle", duration, above=0.0)
+    return Scenario(as_vector("start", config.start, true.arm.n), reference, duration, 0.5 * duration)
+
+
+def _near_home(*change: float) -> Vector:
+    return tuple(float(q) for q in np.array(HOME) + np.array(change))
+
+
+_ENTRIES = (
+    TaskEntry("exp1", "a move whose target lies outside the training region", PointTask(), _build_point),
+    TaskEntry("exp2", "a move inside the training region, forward and down", PointTask(), _build_point),
+    TaskEntry("exp3", "a move inside the training region, across and up", PointTask(), _build_point),
+    TaskEntry("exp4", "a move that starts outside the training region", PointTask(), _build_point),
+    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle),
+    TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line),
+    TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(radius=0.25), _build_lemniscate),
+    TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
+    TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints),
+)
+TASKS = {entry.name: entry for entry in _ENTRIES}
+
+
+def task_names() -> list[str]:
+    """Return the names of all tasks."""
+    return list(TASKS)
+
+
+def find_task(name: str) -> TaskEntry:
+    """Return the task called `name`.
+
+    Raises:
+        ConfigurationError: no such task.
+    """
+    if name not in TASKS:
+        raise ConfigurationError(f"unknown task {name!r}: {suggest(name, TASKS)}")
+    return TASKS[name]
