@@ -40,6 +40,11 @@ MODEL_SOURCES = ("model.c", "instance.c", "kinematics.c")
 EARLIEST_DATE = (1980, 1, 1, 0, 0, 0)  # that a zip can hold
 
 
+def default_actuation() -> Actuation:
+    """Return lag and limits as the kinematic plant has them by default, and a home above the workspace."""
+    return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=as_vector("home", HOME, len(HOME)))
+
+
 @dataclass(frozen=True)
 class ExportOptions:
     """What to export.
@@ -54,7 +59,7 @@ class ExportOptions:
 
     fmi_version: int = 2
     model: HandEyeModel = field(default_factory=nominal_ur5)
-    actuation: Actuation = field(default_factory=lambda: default_actuation())
+    actuation: Actuation = field(default_factory=default_actuation)
     platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))
     mismatch: str = "none"
 
@@ -64,11 +69,6 @@ class ExportOptions:
             raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
-
-
-def default_actuation() -> Actuation:
-    """Return lag and limits as the kinematic plant has them by default, and a home above the workspace."""
-    return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=as_vector("home", HOME, len(HOME)))
 
 
 def export_fmu(path: Path, options: ExportOptions) -> Path:
@@ -88,7 +88,8 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
     """
     if not path.parent.is_dir():
         raise ValueError(f"the folder {path.parent} for the FMU does not exist")
-    contents = {name: text.encode() for name, text in source_files(options).items()}
+    texts = source_files(options) | _companion_files(options)
+    contents = {name: text.encode() for name, text in texts.items()}
     token = _token(contents)
     layout_name = "sources/layout.h"
     contents[layout_name] = contents[layout_name].replace(_PLACEHOLDER.encode(), token.encode())
@@ -104,19 +105,25 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
 
 
 def source_files(options: ExportOptions) -> dict[str, str]:
-    """Return every text of the FMU by its place in the archive; the token is still a placeholder."""
+    """Return the C files of the FMU by their place in the archive; the token in them is still a placeholder."""
     layout, start = arm_layout(options.model.arm.n), parameters_of(options.model, options.actuation)
     own = (*OWN_HEADERS, *LAYERS[options.fmi_version], *(name for name in MODEL_SOURCES if name != "kinematics.c"))
-    folder = files("fmus") / IDENTIFIER
-    texts = {f"sources/{name}": (folder / name).read_text(encoding="utf-8") for name in own}
-    texts |= {f"sources/{name}": _fmi_header(name) for name in HEADERS[options.fmi_version]}
-    texts["sources/kinematics.c"] = _kinematics(layout)
-    texts["sources/layout.h"] = layout_header(layout, start, IDENTIFIER, _PLACEHOLDER)
+    texts = {name: _own_file(name) for name in own} | {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
+    texts["kinematics.c"] = _kinematics(layout)
+    texts["layout.h"] = layout_header(layout, start, IDENTIFIER, _PLACEHOLDER)
+    return {f"sources/{name}": text for name, text in texts.items()}
+
+
+def _companion_files(options: ExportOptions) -> dict[str, str]:
+    """Return documentation, licence and reference run by their place in the archive."""
+    layout = arm_layout(options.model.arm.n)
     run = reference_run(options.model, options.actuation)
-    texts[INPUT_FILE], texts[OUTPUT_FILE] = input_csv(run, layout), output_csv(run, layout)
-    texts["documentation/index.html"] = _documentation(layout, options)
-    texts["documentation/licenses/license.txt"] = (folder / "license.txt").read_text(encoding="utf-8")
-    return texts
+    return {
+        INPUT_FILE: input_csv(run, layout),
+        OUTPUT_FILE: output_csv(run, layout),
+        "documentation/index.html": _documentation(layout, options),
+        "documentation/licenses/license.txt": _own_file("license.txt"),
+    }
 
 
 @cache
@@ -131,6 +138,10 @@ _PLACEHOLDER = "{token}"
 @cache
 def _kinematics(layout: Layout) -> str:
     return kinematics_source(layout)
+
+
+def _own_file(name: str) -> str:
+    return (files("fmus") / IDENTIFIER / name).read_text(encoding="utf-8")
 
 
 def _fmi_header(name: str) -> str:
@@ -164,7 +175,7 @@ def _token(contents: Mapping[str, bytes]) -> str:
 
 
 def _documentation(layout: Layout, options: ExportOptions) -> str:
-    template = (files("fmus") / IDENTIFIER / "documentation.html").read_text(encoding="utf-8")
+    template = _own_file("documentation.html")
     rows = [
         f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
         f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"

@@ -19,7 +19,7 @@ import numpy as np
 
 from fmus.variables import INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
 from plant.signals import FloatArray
-from plant.symbolic import HandEyeGeometry, feature_and_jacobian
+from plant.symbolic import SX, HandEyeGeometry, feature_and_jacobian
 
 # Generated functions leave parts of their calling convention unused, and none of them is an entry point of the library.
 KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */
@@ -94,7 +94,7 @@ def _core_functions(layout: Layout) -> list[Any]:
     ]
 
 
-def _geometry(layout: Layout, p: Any) -> HandEyeGeometry:
+def _geometry(layout: Layout, p: SX) -> HandEyeGeometry:
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.groups[:KINEMATIC_PARAMETERS]}
     columns = casadi.horzcat(part["a"], part["y"], part["d"])
     angles = casadi.horzcat(part["alpha"], part["pitch"], part["yaw"])
@@ -109,7 +109,7 @@ def _geometry(layout: Layout, p: Any) -> HandEyeGeometry:
     )
 
 
-def _rotation(rpy: Any) -> Any:
+def _rotation(rpy: SX) -> SX:
     """Rz(yaw) Ry(pitch) Rx(roll), as `plant.kinematics.rotation_from_rpy`."""
     (cr, cp, cy), (sr, sp, sy) = (casadi.vertsplit(f(rpy)) for f in (casadi.cos, casadi.sin))
     return casadi.vertcat(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from fmus.variables import (
     DERIVATIVE,
@@ -91,7 +92,8 @@ def write_fmi2(description: Description, token: str) -> bytes:
     for section in _Structure(description.layout).sections():
         element = ET.SubElement(structure, section.fmi2)
         for index, dependencies in section.scalars():
-            ET.SubElement(element, "Unknown", index=str(index + 1), **_dependent([i + 1 for i in dependencies]))
+            attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
+            ET.SubElement(element, "Unknown", attributes)
     return _bytes(root)
 
 
@@ -116,7 +118,7 @@ def write_fmi3(description: Description, token: str) -> bytes:
     structure = ET.SubElement(root, "ModelStructure")
     for section in _Structure(description.layout).sections():
         for reference, dependencies in section.arrays():
-            ET.SubElement(structure, section.fmi3, valueReference=str(reference), **_dependent(dependencies))
+            ET.SubElement(structure, section.fmi3, {"valueReference": str(reference)} | _dependent(dependencies))
     return _bytes(root)
 
 
@@ -128,6 +130,9 @@ def write_build_description(description: Description) -> bytes:
     for name in description.sources:
         ET.SubElement(files, "SourceFile", name=name)
     return _bytes(root)
+
+
+_Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]  # unknown, what it depends on, elementwise or as a whole
 
 
 @dataclass(frozen=True)
@@ -166,13 +171,13 @@ class _Structure:
 
     def sections(self) -> tuple[_Section, ...]:
         state = ("joint_position", "joint_velocity")
-        outputs = [(name, (name,), True) for name in state]
+        outputs: _Rows = [(name, (name,), True) for name in state]
         outputs += [(name, ("joint_position",), False) for name in ("ball_position", "jacobian")]
-        derivatives = [
+        derivatives: _Rows = [
             ("der(joint_position)", state, True),
             ("der(joint_velocity)", (*state, "joint_velocity_command"), True),
         ]
-        start = [
+        start: _Rows = [
             ("joint_position", ("home",), True),
             ("joint_velocity", (), True),
             ("der(joint_position)", (), True),
@@ -186,7 +191,7 @@ class _Structure:
             self._section("InitialUnknowns", "InitialUnknown", start),
         )
 
-    def _section(self, fmi2: str, fmi3: str, rows: list[tuple[str, tuple[str, ...], bool]]) -> _Section:
+    def _section(self, fmi2: str, fmi3: str, rows: _Rows) -> _Section:
         unknowns = tuple((self._group[name], names, elementwise) for name, names, elementwise in rows)
         return _Section(fmi2, fmi3, self._layout, unknowns)
 
@@ -236,7 +241,7 @@ def _array_variables(variables: ET.Element, description: Description) -> None:
             variable.attrib["derivative"] = str(layout.offsets[_state_of(group)])
         for size in group.shape:
             ET.SubElement(variable, "Dimension", start=str(size))
-    ET.SubElement(variables, "Float64", name="time", valueReference=str(layout.size), **time)
+    ET.SubElement(variables, "Float64", {"name": "time", "valueReference": str(layout.size)} | time)
 
 
 def _state_of(group: Group) -> str:
@@ -261,4 +266,5 @@ def _dependent(dependencies: list[int]) -> dict[str, str]:
 
 def _bytes(root: ET.Element) -> bytes:
     ET.indent(root)
-    return b'<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="utf-8") + b"\n"
+    text: str = ET.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()

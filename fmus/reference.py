@@ -53,7 +53,7 @@ def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
         q = np.clip(free, -reach, reach)
         v = np.where(q == free, A[1, 1] * v + B[1] * u, 0.0)
     outputs = {"joint_position": positions, "joint_velocity": velocities, "ball_position": model.feature(positions)}
-    return ReferenceRun(np.arange(STEPS + 1) * STEP, wanted, outputs)
+    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, wanted, outputs)
 
 
 def input_csv(run: ReferenceRun, layout: Layout) -> str:

@@ -22,8 +22,10 @@ static fmi2Status report(const Instance *instance, fmi2Status status, const char
 {
     const fmi2CallbackFunctions *callbacks = instance->callbacks;
     if (callbacks->logger != NULL && (instance->logging || status >= fmi2Error)) {
+        char text[MESSAGE_SIZE];
+        compose(text, function, message);
         callbacks->logger(callbacks->componentEnvironment, instance->name, status,
-                          status >= fmi2Error ? "logStatusError" : "logStatusWarning", "%s: %s", function, message);
+                          status >= fmi2Error ? "logStatusError" : "logStatusWarning", text);
     }
     return status;
 }

@@ -24,10 +24,8 @@ static const struct {
 
 static fmi3Status fail(const Instance *instance, const char *function, const char *message)
 {
-    char text[256] = {0};
-    strncat(text, function, 80);
-    strncat(text, ": ", 3);
-    strncat(text, message, 160);
+    char text[MESSAGE_SIZE];
+    compose(text, function, message);
     if (instance->log != NULL) instance->log(instance->environment, fmi3Error, "logStatusError", text);
     return fmi3Error;
 }

@@ -1,5 +1,6 @@
 #include "instance.h"
 
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -23,6 +24,11 @@ Snapshot *snapshot_read(const void *bytes, size_t size)
         return NULL;
     }
     return snapshot;
+}
+
+void compose(char text[MESSAGE_SIZE], const char *function, const char *message)
+{
+    snprintf(text, MESSAGE_SIZE, "%s: %s", function, message);
 }
 
 const char *explain(ModelStatus status)

@@ -27,6 +27,10 @@ Snapshot *snapshot_take(const Model *model, Phase phase);
 /* NULL if `bytes` are not the state of this model. */
 Snapshot *snapshot_read(const void *bytes, size_t size);
 
+#define MESSAGE_SIZE 256
+/* Writes "function: message". Importers without printf formatting get whole texts that way. */
+void compose(char text[MESSAGE_SIZE], const char *function, const char *message);
+
 const char *explain(ModelStatus status);
 
 #endif
