@@ -14,7 +14,8 @@ import platformdirs
 from fmus.compile import this_platform
 from fmus.export import ExportOptions, export_fmu, source_files
 from fmus.variables import Actuation, parameters_of
-from plant.fmu import FmuConfig, FmuMapping, FmuPlant
+from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
 from plant.plant import PlantEntry, PlantSetup
 from plant.signals import check_number
@@ -80,6 +81,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         home="home",
         parameters=parameters,
         max_joint_speed=config.max_joint_speed,
+        clips_itself=True,
         joint_lower=-config.joint_range,
         joint_upper=config.joint_range,
         joint_names=setup.model.arm.joint_names,

@@ -12,6 +12,7 @@ import ctypes
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,9 @@ class FmuPlant(Plant):
         self._config = config
         self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self._substeps = whole_steps(period, mapping.period or period)
-        self._own_step = mapping.period or period
+        self._own_step, self._period = mapping.period or period, period
+        self._delays = config.command_delay_periods > 0
+        self._has_channel = config.latency_periods > 0 or config.drop_probability > 0.0
         self._states: list[ctypes.c_void_p] = []
         self._folder = FmuFolder(mapping.path)
         try:
@@ -94,11 +97,12 @@ class FmuPlant(Plant):
     def _connect(self, mapping: FmuMapping) -> None:
         """Make the ports; the parameters' and the truth's are used outside the loop only."""
         find, slave = self.description.select, self._slave
-        self._has_joints = bool(mapping.joints)
+        self._has_joints, self._clips_itself = bool(mapping.joints), mapping.clips_itself
         self._command = Port(find(mapping.inputs, "inputs"))
         self._result = Port(find((*mapping.joints, *mapping.features), "joints and features"))
-        self._write, self._read, self._advance = slave.writer(self._command), slave.reader(self._result), slave.advance
-        self._zeros = np.zeros(self._result.values.size)
+        self._write, self._read = slave.raw_writer(self._command), slave.raw_reader(self._result)
+        self._advance = slave.stepper(self._own_step)
+        self._split, self._noise_scale = self._result.values.size - self._spec.m, self._config.feature_noise
         self._lower, self._upper = -self._spec.joint_velocity_limit, self._spec.joint_velocity_limit
         self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
         if mapping.home is not None:
@@ -144,25 +148,32 @@ class FmuPlant(Plant):
         Raises:
             FmuError: the FMU failed, or a result is not finite.
         """
-        wanted = command.joint_velocity
-        if wanted.size != self._command.values.size:
-            raise ValueError(f"joint_velocity must have shape ({self._spec.n},), got {wanted.shape}")
-        if self._config.command_delay_periods:
+        wanted, buffer = command.joint_velocity, self._command.values
+        if wanted.shape != buffer.shape:
+            raise ValueError(f"joint_velocity must have shape {buffer.shape}, got {wanted.shape}")
+        if self._delays:
             self._commands.append(wanted)
             wanted = self._commands.popleft()
-        buffer = self._command.values
-        np.minimum(wanted, self._upper, out=buffer)
-        np.maximum(buffer, self._lower, out=buffer)
-        self._write()
-        first, h = self._k * self._substeps, self._own_step
-        for i in range(first, first + self._substeps):
-            self._advance(i * h, h)
+        if self._clips_itself:
+            buffer[:] = wanted
+        else:
+            np.minimum(wanted, self._upper, out=buffer)
+            np.maximum(buffer, self._lower, out=buffer)
+        status = self._write()
+        if status:
+            self._slave.check("writing the command", status)
+        if self._substeps == 1:
+            self._advance(self._k * self._own_step)
+        else:
+            for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
+                self._advance(i * self._own_step)
         self._k += 1
         if not self._has_joints:
-            self._integrated = self._integrated + buffer * self._spec.period
-        joints, measured = self._measure()
-        feature, valid = self._channel.deliver(measured)
-        return trusted_observation(self._k * self._spec.period, joints, feature, valid)
+            self._integrated = self._integrated + buffer * self._period
+            self._integrated.setflags(write=False)
+        joints, feature = self._measure()
+        feature, valid = self._channel.deliver(feature) if self._has_channel else (feature, True)
+        return trusted_observation(self._k * self._period, joints, feature, valid)
 
     def truth(self) -> Truth:
         """Return the FMU's own feature and, where the mapping names it, its Jacobian."""
@@ -221,18 +232,21 @@ class FmuPlant(Plant):
         self._folder.close()
 
     def _measure(self) -> tuple[FloatArray, FloatArray]:
-        """Read joints and feature; the feature with noise."""
-        self._read()
+        """Read joints and feature, both read-only; the feature with noise."""
+        status = self._read()
+        if status:
+            self._slave.check("reading joints and features", status)
         values = self._result.values.copy()
-        # One product instead of a mask: anything that is not finite makes it NaN, at a tenth of the cost.
-        if values.dot(self._zeros) != 0.0:
+        # Anything that is not finite leaves the sum so; a mask costs five times as much.
+        if not isfinite(sum(values.tolist())):
             bad = [label for label, value in zip(self._result.labels, values, strict=True) if not np.isfinite(value)]
             raise FmuError(f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}")
-        m = self._spec.m
-        feature = values[-m:]
-        if self._config.feature_noise > 0.0:
-            feature = feature + self._noise.normal(scale=self._config.feature_noise, size=m)
-        return (values[:-m] if self._has_joints else self._integrated), feature
+        values.setflags(write=False)
+        feature = values[self._split :]
+        if self._noise_scale > 0.0:
+            feature = feature + self._noise.normal(scale=self._noise_scale, size=feature.size)
+            feature.setflags(write=False)
+        return (values[: self._split] if self._has_joints else self._integrated), feature
 
 
 def open_slave(description: FmuDescription, folder: FmuFolder) -> Slave:
@@ -242,23 +256,26 @@ def open_slave(description: FmuDescription, folder: FmuFolder) -> Slave:
 
 
 def trusted_observation(time: float, joints: FloatArray, feature: FloatArray, valid: bool) -> Observation:
-    """Return an observation of arrays that are known to be fresh, finite and float64.
+    """Return an observation of arrays that are known to be fresh, finite, float64 and read-only.
 
-    `Observation` checks and copies what it is given, which costs more than the FMU's step; here both arrays are copies
-    of a buffer that has just been checked.
+    `Observation` checks and copies what it is given, which costs more than the FMU's step; here both arrays come out of
+    a buffer that has just been checked.
     """
-    joints.setflags(write=False)
-    feature.setflags(write=False)
-    observation = object.__new__(Observation)
-    put = object.__setattr__
-    put(observation, "time", time)
-    put(observation, "joint_position", joints)
-    put(observation, "feature", feature)
-    put(observation, "feature_valid", valid)
+    observation = _new(Observation)
+    _set_time(observation, time)
+    _set_joints(observation, joints)
+    _set_feature(observation, feature)
+    _set_valid(observation, valid)
     return observation
 
 
-def _closed() -> None:
+_new = object.__new__
+_set_time, _set_joints, _set_feature, _set_valid = (
+    getattr(Observation, name).__set__ for name in ("time", "joint_position", "feature", "feature_valid")
+)
+
+
+def _closed() -> int:
     raise FmuError("the plant has been closed")
 
 

@@ -60,6 +60,7 @@ class FmuMapping:
         parameters: values by name, set before every run.
         period: the FMU's step, s; None for the control period.
         max_joint_speed: rad/s; commands are clipped to it.
+        clips_itself: the FMU does the clipping.
         joint_lower: rad, of all joints.
         joint_upper: rad, of all joints.
         joint_names: for the log; None for joint_1, joint_2, …
@@ -77,6 +78,7 @@ class FmuMapping:
     parameters: Mapping[str, FloatArray] = field(default_factory=dict)
     period: float | None = None
     max_joint_speed: float = 1.0
+    clips_itself: bool = False
     joint_lower: float = -2 * np.pi
     joint_upper: float = 2 * np.pi
     joint_names: Names | None = None
@@ -89,6 +91,8 @@ class FmuMapping:
             if not getattr(self, name):
                 raise ValueError(f"{name} must name at least one variable of the FMU, got none")
         check_number("max_joint_speed", self.max_joint_speed, above=0.0)
+        if self.clips_itself and not self.joints:
+            raise ValueError("clips_itself needs joints: commands cannot be integrated if the FMU changes them")
         if self.period is not None:
             check_number("period", self.period, above=0.0)
 
@@ -117,7 +121,7 @@ def _arguments(table: dict[str, Any]) -> dict[str, Any]:
     """Return the arguments of `FmuMapping` that a TOML table holds."""
     parameters = table.pop("parameters", {})
     if not isinstance(parameters, dict):
-        raise ValueError("parameters must be a section, [parameters]")
+        raise ValueError("parameters must be a section, [parameters]")  # noqa: TRY004 - of a file, not of a call
     arguments: dict[str, Any] = {"parameters": {name: _numbers(name, value) for name, value in parameters.items()}}
     for key, value in _flatten(table):
         if key not in _KEYS:
@@ -142,7 +146,7 @@ def _flatten(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _text(key: str, value: object) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"{key} must be text, got {value!r}")
+        raise ValueError(f"{key} must be text, got {value!r}")  # noqa: TRY004
     return value
 
 
@@ -159,7 +163,7 @@ def _names(key: str, value: object) -> Names:
 
 def _number(key: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{key} must be a number, got {value!r}")
+        raise ValueError(f"{key} must be a number, got {value!r}")  # noqa: TRY004
     return float(value)
 
 

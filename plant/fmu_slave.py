@@ -13,6 +13,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
@@ -24,6 +25,7 @@ from plant.signals import FloatArray, RunFault
 logger = logging.getLogger("servobench.fmu")
 
 Call: TypeAlias = Callable[[], None]
+RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
 STATUS_WORDS = ("ok", "warning", "discard", "error", "fatal", "pending")
 OK, WARNING, DISCARD = 0, 1, 2
 REMEMBERED = 5  # messages
@@ -52,6 +54,11 @@ class Port:
         self.values: FloatArray = np.zeros(total_size(variables))
         self.count = len(variables)
         self.references = (ctypes.c_uint32 * self.count)(*(variable.reference for variable in variables))
+
+    @property
+    def summary(self) -> str:
+        """A few names, for messages."""
+        return ", ".join(self.labels[:3]) + (", …" if len(self.labels) > 3 else "")
 
     @property
     def pointer(self) -> Any:  # noqa: ANN401 - a ctypes pointer
@@ -119,16 +126,27 @@ class Slave(ABC):
         """Return to the state after instantiation."""
 
     @abstractmethod
+    def raw_reader(self, port: Port) -> RawCall:
+        """Return a function that reads the port's variables into its buffer, for the inner loop."""
+
+    @abstractmethod
+    def raw_writer(self, port: Port) -> RawCall:
+        """Return a function that writes the port's buffer into its variables, for the inner loop."""
+
+    @abstractmethod
+    def stepper(self, step: float) -> Callable[[float], None]:
+        """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+
     def reader(self, port: Port) -> Call:
-        """Return a function that reads the port's variables into its buffer."""
+        """Return a function that reads the port's variables into its buffer and checks the status."""
+        return self._checked(f"reading {port.summary}", self.raw_reader(port))
 
-    @abstractmethod
     def writer(self, port: Port) -> Call:
-        """Return a function that writes the port's buffer into its variables."""
+        """Return a function that writes the port's buffer into its variables and checks the status."""
+        return self._checked(f"writing {port.summary}", self.raw_writer(port))
 
-    @abstractmethod
-    def advance(self, time: float, step: float) -> None:
-        """Advance from `time` by `step`, both in s."""
+    def _checked(self, what: str, call: RawCall) -> Call:
+        return lambda: self.check(what, call())
 
     @abstractmethod
     def save(self) -> ctypes.c_void_p:
@@ -191,16 +209,9 @@ class Slave(ABC):
         except AttributeError as error:
             raise ValueError(f"the library in {self.description.path.name} does not export {name}") from error
 
-    def prebuilt(self, name: str, *arguments: Any) -> Call:  # noqa: ANN401 - what C takes
+    def prebuilt(self, name: str, *arguments: Any) -> RawCall:  # noqa: ANN401 - what C takes
         """Return a function that calls `name` on the instance with arguments that are converted now."""
-        function, component, failed = self.function(name), self._component, self.check
-
-        def call() -> None:
-            status = function(component, *arguments)
-            if status:
-                failed(name, status)
-
-        return call
+        return partial(self.function(name), self._component, *arguments)
 
 
 def library_folders(version: int) -> tuple[str, ...]:

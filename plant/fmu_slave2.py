@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import weakref
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from plant.fmu_slave import DISCARD, Call, MessageLog, Port, Slave
+from plant.fmu_slave import DISCARD, MessageLog, Port, RawCall, Slave
 
 CO_SIMULATION = 1
 LAST_SUCCESSFUL_TIME = 2
@@ -44,8 +46,6 @@ class Slave2(Slave):
 
     def _instantiate(self) -> int | None:
         self._callbacks = _callbacks(self.log)
-        self._time, self._step = ctypes.c_double(), ctypes.c_double()
-        self._do_step = self.function("fmi2DoStep")
         create = self.function("fmi2Instantiate")
         create.restype = ctypes.c_void_p
         address: int | None = create(
@@ -76,31 +76,41 @@ class Slave2(Slave):
         """Return to the state after instantiation."""
         self.call("fmi2Reset")
 
-    def reader(self, port: Port) -> Call:
-        """Return a function that reads the port's variables into its buffer."""
+    def raw_reader(self, port: Port) -> RawCall:
+        """Return a function that reads the port's variables into its buffer, for the inner loop."""
         return self.prebuilt("fmi2GetReal", port.references, ctypes.c_size_t(port.count), port.pointer)
 
-    def writer(self, port: Port) -> Call:
-        """Return a function that writes the port's buffer into its variables."""
+    def raw_writer(self, port: Port) -> RawCall:
+        """Return a function that writes the port's buffer into its variables, for the inner loop."""
         return self.prebuilt("fmi2SetReal", port.references, ctypes.c_size_t(port.count), port.pointer)
 
-    def advance(self, time: float, step: float) -> None:
-        """Advance from `time` by `step`; a step that ended early is taken up where it ended.
+    def stepper(self, step: float) -> Callable[[float], None]:
+        """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+        now, do_step = ctypes.c_double(), self.function("fmi2DoStep")
+        call = partial(do_step, self._component, now, ctypes.c_double(step), _YES)
+
+        def advance(time: float) -> None:
+            now.value = time
+            status = call()
+            if status:
+                self._recover(status, time, step)
+
+        return advance
+
+    def _recover(self, status: int, time: float, step: float) -> None:
+        """Take a step up where it ended, if it was only cut short.
 
         Raises:
             FmuError: the step failed, or made no progress.
         """
-        self._time.value, self._step.value = time, step
-        status = self._do_step(self._component, self._time, self._step, _YES)
-        if status:
-            if status != DISCARD:
-                self.check("fmi2DoStep", status)
-                return
-            reached = self._last_successful_time()
-            if not reached > time + LEAST_PROGRESS * step:
-                raise self.log.failure("fmi2DoStep", status)
-            if reached < time + step:
-                self.advance(reached, time + step - reached)
+        if status != DISCARD:
+            self.check("fmi2DoStep", status)
+            return
+        reached = self._last_successful_time()
+        if not reached > time + LEAST_PROGRESS * step:
+            raise self.log.failure("fmi2DoStep", status)
+        if reached < time + step:
+            self.stepper(time + step - reached)(reached)
 
     def _last_successful_time(self) -> float:
         reached = ctypes.c_double()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import os
+from collections.abc import Callable
+from functools import partial
 
-from plant.fmu_slave import Call, FmuError, Port, Slave
+from plant.fmu_slave import FmuError, Port, RawCall, Slave
 
 LEAST_PROGRESS = 1e-9  # of a step
 LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
@@ -21,11 +23,6 @@ class Slave3(Slave):
             log.add(status, (message or b"").decode("utf-8", errors="replace"))
 
         self._on_message = LogMessage(on_message)
-        self._time, self._step, self._reached = ctypes.c_double(), ctypes.c_double(), ctypes.c_double()
-        self._event, self._end, self._early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
-        flags = (self._event, self._end, self._early, self._reached)
-        self._do_step = self.function("fmi3DoStep")
-        self._arguments = (self._time, self._step, ctypes.c_bool(True), *(ctypes.byref(flag) for flag in flags))
         create = self.function("fmi3InstantiateCoSimulation")
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
@@ -60,38 +57,48 @@ class Slave3(Slave):
         """Return to the state after instantiation."""
         self.call("fmi3Reset")
 
-    def reader(self, port: Port) -> Call:
-        """Return a function that reads the port's variables into its buffer."""
+    def raw_reader(self, port: Port) -> RawCall:
+        """Return a function that reads the port's variables into its buffer, for the inner loop."""
         return self._access("fmi3GetFloat64", port)
 
-    def writer(self, port: Port) -> Call:
-        """Return a function that writes the port's buffer into its variables."""
+    def raw_writer(self, port: Port) -> RawCall:
+        """Return a function that writes the port's buffer into its variables, for the inner loop."""
         return self._access("fmi3SetFloat64", port)
 
-    def _access(self, function: str, port: Port) -> Call:
+    def _access(self, function: str, port: Port) -> RawCall:
         sizes = ctypes.c_size_t(port.count), ctypes.c_size_t(port.values.size)
         return self.prebuilt(function, port.references, sizes[0], port.pointer, sizes[1])
 
-    def advance(self, time: float, step: float) -> None:
-        """Advance from `time` by `step`; a step that returned early is taken up where it ended.
+    def stepper(self, step: float) -> Callable[[float], None]:
+        """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+        now, reached = ctypes.c_double(), ctypes.c_double()
+        event, end, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
+        results = [ctypes.byref(result) for result in (event, end, early, reached)]
+        do_step = self.function("fmi3DoStep")
+        call = partial(do_step, self._component, now, ctypes.c_double(step), ctypes.c_bool(True), *results)
+
+        def advance(time: float) -> None:
+            now.value = time
+            status = call()
+            if status:
+                self.check("fmi3DoStep", status)
+            if end.value:
+                raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
+            if early.value:
+                self._resume(reached.value, time, step)
+
+        return advance
+
+    def _resume(self, reached: float, time: float, step: float) -> None:
+        """Take a step that returned early up where it ended.
 
         Raises:
-            FmuError: the step failed, made no progress, or asked to end the simulation.
+            FmuError: it made no progress.
         """
-        self._time.value, self._step.value = time, step
-        status = self._do_step(self._component, *self._arguments)
-        if status:
-            self.check("fmi3DoStep", status)
-        if self._end.value:
-            raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
-        if self._early.value:
-            reached = self._reached.value
-            if not reached > time + LEAST_PROGRESS * step:
-                raise FmuError(
-                    f"{self.description.path.name}: fmi3DoStep returned early at {reached:.6g} s, no further"
-                )
-            if reached < time + step:
-                self.advance(reached, time + step - reached)
+        if not reached > time + LEAST_PROGRESS * step:
+            raise FmuError(f"{self.description.path.name}: fmi3DoStep returned early at {reached:.6g} s, no further")
+        if reached < time + step:
+            self.stepper(time + step - reached)(reached)
 
     def save(self) -> ctypes.c_void_p:
         """Return the present state; it has to be given to `free`."""
