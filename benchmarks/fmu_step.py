@@ -20,8 +20,8 @@ from plant.plant import PlantSetup
 from plant.signals import Command
 from plant.ur5 import HOME, nominal_ur5
 
-CALLS = 2000
-ROUNDS = 40
+CALLS = 200
+ROUNDS = 400
 PERIOD = 0.05
 
 
