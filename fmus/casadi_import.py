@@ -2,8 +2,8 @@
 
     q -> (y, ∂y/∂q)
 
-The result has the signature of `plant.symbolic.symbolic_model`, so that whatever is built on the project's own equations
-(the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU whose equations nobody has.
+The result has the signature of `plant.symbolic.symbolic_model`, so that whatever is built on the project's own
+equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU whose equations nobody has.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from plant.signals import FloatArray
 
 
 class FmuModel:
-    """y = h(q) of a model-exchange FMU, with J = ∂h/∂q by fmi2GetDirectionalDerivative; other states stay at their start.
+    """y = h(q) of a model-exchange FMU, with J = ∂h/∂q by its directional derivatives; other states stay at their start.
 
     Attributes:
         function: (n,) rad -> (m,) and (m, n), a `casadi.Function`; it lives as long as this object.
@@ -94,8 +94,9 @@ def _model_function(
     x = casadi.vertcat(*(q[place[name]] if name in place else rest[name] for name in states))
     inputs = casadi.DM(_starts(builder, list(builder.u())))
     feature = whole(x, inputs, casadi.DM([float(values[name]) for name in constants]))
-    outputs = [feature, casadi.jacobian(feature, q)]
-    return casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
+    results: list[Any] = [feature, casadi.jacobian(feature, q)]
+    create: Any = casadi.Function  # its annotations do not know MX
+    return create("hand_eye", [q], results, ["joint_position"], ["feature", "jacobian"])
 
 
 def _starts(builder: Any, names: list[str]) -> list[float]:  # noqa: ANN401 - a casadi.DaeBuilder

@@ -94,6 +94,7 @@ CAPABILITIES = (
     "canGetAndSetFMUstate",
     "canSerializeFMUstate",
     "providesDirectionalDerivative",
+    "providesDirectionalDerivatives",
     "canBeInstantiatedOnlyOncePerProcess",
     "needsExecutionTool",
 )

@@ -59,7 +59,7 @@ def arm_groups(n: int) -> tuple[Group, ...]:
 
     The kinematic parameters come first and in the order in which the generated core takes them.
     """
-    table = "transform after joint i (standard DH with three more columns, as factory calibrations need)"
+    table = "transform after joint i"
     return (
         Group("base_position", (3,), PARAMETER, "m", "Axis of joint 1 in the base frame."),
         Group("base_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of joint 1 in the base frame."),

@@ -76,12 +76,10 @@ def info(file: FileArgument) -> None:
     sources = "; with sources" if information.has_sources else ""
     console.print(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
     console.print(f"capabilities: {', '.join(information.capabilities) or 'none'}")
-    table = Table("name", "causality", "size", "unit", "start", "description")
+    table = Table("name", "causality", "size", "unit", "start")
     for variable in information.variables:
         size = " × ".join(map(str, variable.shape)) or "1"
-        table.add_row(
-            variable.name, variable.causality, size, variable.unit, _shortened(variable.start), variable.description
-        )
+        table.add_row(variable.name, variable.causality, size, variable.unit, _shortened(variable.start))
     console.print(table)
 
 
