@@ -11,11 +11,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault
 
+if TYPE_CHECKING:
+    from controllers.network_file import TrainedNetworks
+    from controllers.training_config import TrainingConfig
+
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
+SymbolicFeature: TypeAlias = Callable[[Any], Any]
 Diagnostics: TypeAlias = Mapping[str, float]
 
 
@@ -47,12 +52,20 @@ class RobotKnowledge:
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
         true_jacobian: the same of the true robot; only handed to a controller whose entry asks for the truth.
+        true_symbolic: a CasADi expression q, (n, 1) rad -> the expression of the true robot's feature, (m, 1); under
+            the same condition. None where the plant has no closed form.
+        region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
+            trained there.
+        train: returns trained networks, from a cache where it has them; None: networks are trained on the spot.
     """
 
     spec: PlantSpec
     preview: int
     nominal_jacobian: JacobianFunction | None = None
     true_jacobian: JacobianFunction | None = None
+    true_symbolic: SymbolicFeature | None = None
+    region: tuple[FloatArray, FloatArray] | None = None
+    train: Callable[[TrainingConfig], TrainedNetworks] | None = None
 
 
 class Controller(ABC):
@@ -97,7 +110,7 @@ class ControllerEntry:
         summary: one line for `servobench controllers`.
         config: frozen dataclass with a default for every field.
         build: makes the controller from its configuration and what it may know.
-        needs_truth: it is told the true Jacobian: a bound, not a competitor.
+        needs_truth: it is told the true Jacobian and kinematics: a bound, not a competitor.
     """
 
     name: str

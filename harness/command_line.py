@@ -15,14 +15,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from controllers.composed import ESTIMATORS, LAWS
 from harness import results
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
+from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
 from harness.manifest import describe_batch
 from harness.registry import controller_names, find_controller, find_plant, plant_names
-from harness.summary import summary_table
+from harness.summary import summary_tables
 from harness.tasks import TASKS, find_task, task_names
+from harness.training import cache_folder
 
 INTERRUPTED = 130
 MAX_DEFAULT_WORKERS = 8
@@ -64,7 +67,8 @@ def tasks(name: NameArgument = None) -> None:
 @app.command()
 def run(
     plant: Annotated[str, typer.Option(help="Name of the plant.")] = "bullet",
-    controller: Annotated[str, typer.Option(help="Name of the controller.")] = "ukf_mfac",
+    controller: Annotated[str, typer.Option(help="Name of the controller, or of a law with --estimator.")] = "ukf_mfac",
+    estimator: Annotated[str | None, typer.Option(help="Compose the law --controller with this estimator.")] = None,
     task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",
     mismatch: Annotated[str, typer.Option(help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.")] = (
         "moderate"
@@ -81,7 +85,8 @@ def run(
         if plant != "bullet":
             raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
         assignments.append("bullet.view=true")
-    batch = Batch((plant,), (controller,), (task,), (mismatch,), parse_seeds(f"{seed},"))
+    name = f"{controller}+{estimator}" if estimator else controller
+    batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
     _carry_out(batch, read_settings(config, assignments), 1, out)
 
 
@@ -110,6 +115,28 @@ def compare(
 
 
 @app.command()
+def train(
+    controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
+    set_: SetOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Train the networks of a controller on the nominal model, or find them trained, and tell their held-out error."""
+    settings = read_settings(config, set_ or [])
+    settings.check_sections([*known_sections(), controller])
+    with _progress() as progress:
+        bar = progress.add_task("training", total=1.0)
+        trained = train_networks(
+            controller, settings, lambda share, what: progress.update(bar, completed=share, description=what)
+        )
+        progress.update(bar, completed=1.0, description="done")
+    table = Table("network", "held-out error")
+    table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
+    table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
+    console.print(table)
+    console.print(f"kept in {cache_folder()}", soft_wrap=True)
+
+
+@app.command()
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
     """Put the finished runs of a killed batch together into its tables."""
     results.check_folder(folder)
@@ -130,8 +157,10 @@ def main() -> None:
 
 def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None) -> None:
     """Check everything, run everything, and leave tables and figures behind."""
-    with console.status("checking the configuration"):
-        check_batch(batch, settings)
+    with console.status("checking the configuration") as status:
+        check_batch(
+            batch, settings, lambda share, what: status.update(f"training networks once: {100 * share:3.0f} %, {what}")
+        )
     requests = batch.requests()
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     results.create_folder(folder, describe_batch(requests, settings))
@@ -145,7 +174,7 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None)
             interrupted = True
     results.collect(folder)
     runs = results.load_runs(folder)
-    console.print(summary_table(runs))
+    console.print(summary_tables(runs))
     _print_faults(runs)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
@@ -181,7 +210,7 @@ def _names(kind: str, text: str, known: list[str]) -> tuple[str, ...]:
     if not names:
         raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:
-        if name not in known:
+        if name not in known and "+" not in name:
             raise ConfigurationError(f"unknown name {name!r} in --{kind}: {suggest(name, known)}")
     return names
 
@@ -201,6 +230,9 @@ def _list_or_show(
         for known in names:
             table.add_row(known, find(known).summary)
     console.print(table)
+    if kind == "controllers" and not name:
+        console.print(f"or any law with any estimator, such as mfac+rls: laws {', '.join(LAWS)};", soft_wrap=True)
+        console.print(f"estimators {', '.join(ESTIMATORS)}", soft_wrap=True)
 
 
 if __name__ == "__main__":

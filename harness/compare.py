@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import joblib
 
+from controllers.training import Progress
 from harness import results
 from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest, build_experiment, known_sections, run_experiment
@@ -60,24 +61,30 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(seeds))
 
 
-def check_batch(batch: Batch, settings: Settings) -> None:
-    """Build every combination of plant, controller, task and mismatch once, so that a bad one is refused at once.
+def check_batch(batch: Batch, settings: Settings, progress: Progress | None = None) -> None:
+    """Build every plant, controller, task and mismatch once, so that a bad one is refused before anything is written.
+
+    Networks that controllers need are trained on the way.
+
+    Args:
+        batch: what will be run.
+        settings: overrides of the defaults.
+        progress: told how far a training of networks is.
 
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used.
     """
-    settings.check_sections(known_sections())
-    first = batch.seeds[0]
-    for plant, mismatch in product(batch.plants, batch.mismatches):
-        build_experiment(
-            RunRequest(plant, batch.controllers[0], batch.tasks[0], mismatch, first), settings
-        ).plant.close()
-    for plant, controller in product(batch.plants, batch.controllers[1:]):
-        request = RunRequest(plant, controller, batch.tasks[0], batch.mismatches[0], first)
-        build_experiment(request, settings).plant.close()
-    for task in batch.tasks[1:]:
-        request = RunRequest(batch.plants[0], batch.controllers[0], task, batch.mismatches[0], first)
-        build_experiment(request, settings).plant.close()
+    settings.check_sections([*known_sections(), *batch.controllers])
+    first = RunRequest(batch.plants[0], batch.controllers[0], batch.tasks[0], batch.mismatches[0], batch.seeds[0])
+    requests = dict.fromkeys(
+        [
+            *(replace(first, plant=plant, mismatch=name) for plant, name in product(batch.plants, batch.mismatches)),
+            *(replace(first, plant=plant, controller=name) for plant, name in product(batch.plants, batch.controllers)),
+            *(replace(first, task=name) for name in batch.tasks),
+        ]
+    )
+    for request in requests:
+        build_experiment(request, settings, progress=progress).plant.close()
 
 
 def run_batch(
@@ -105,9 +112,10 @@ def _carry_out(
 ) -> dict[str, Any]:
     if in_worker:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    result = run_experiment(request, settings, picture=picture)
+    result = run_experiment(request, settings, picture=picture, keep=folder)
     results.write_part(folder, index, result.row, result.steps)
     if result.picture is not None:
         (folder / PICTURES).mkdir(exist_ok=True)
-        cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), result.picture[..., ::-1])
+        large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), cv2.cvtColor(large, cv2.COLOR_RGB2BGR))
     return result.row

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,18 +14,24 @@ import pandas as pd
 from threadpoolctl import threadpool_limits
 
 from controllers.controller import Controller, RobotKnowledge
+from controllers.network_file import TrainedNetworks
+from controllers.training import Progress
+from controllers.training_config import TrainingConfig
 from harness.configuration import ConfigurationError, Settings
 from harness.log import StepLog
 from harness.loop import LoopSettings, run_loop
 from harness.metrics import Judgement, judge_run
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.tasks import Scenario, find_task, task_names
-from plant.hand_eye import HandEyeModel
+from harness.training import network_source
+from plant.hand_eye import HandEyeModel, hand_eye_spec
+from plant.kinematic import KinematicConfig
 from plant.mismatch import MismatchSample, parse_mismatch, sample_mismatch
 from plant.plant import ImageArray, Plant, PlantSetup
 from plant.seeds import named_seed
-from plant.signals import RunFault, check_number
-from plant.ur5 import nominal_ur5
+from plant.signals import PlantSpec, RunFault, check_number
+from plant.symbolic import symbolic_feature
+from plant.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 
 COMPLETED = "completed"
 
@@ -99,8 +106,16 @@ def known_sections() -> list[str]:
     return ["run", *plant_names(), *controller_names(), *task_names()]
 
 
-def build_experiment(request: RunRequest, settings: Settings) -> Experiment:
+def build_experiment(
+    request: RunRequest, settings: Settings, *, keep: Path | None = None, progress: Progress | None = None
+) -> Experiment:
     """Make a run ready.
+
+    Args:
+        request: what to run.
+        settings: overrides of the defaults.
+        keep: results folder in which trained networks are kept beside the runs.
+        progress: told how far a training of networks is.
 
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
@@ -118,25 +133,53 @@ def build_experiment(request: RunRequest, settings: Settings) -> Experiment:
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     try:
-        controller = _build_controller(request, settings, plant, nominal, true, run)
+        source = network_source(nominal.jacobian, plant.spec, keep, progress)
+        knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
+        controller = _build_controller(request, settings, knowledge, true)
     except BaseException:
         plant.close()
         raise
     return Experiment(plant, controller, scenario, run, sample)
 
 
-def run_experiment(request: RunRequest, settings: Settings, *, picture: bool = False) -> RunResult:
+def train_networks(controller: str, settings: Settings, progress: Progress) -> TrainedNetworks:
+    """Return the networks that a controller of this name starts from, trained where the cache has none.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used, or a controller without networks.
+    """
+    trained: list[TrainedNetworks] = []
+    run = settings.resolve("run", RunSettings())
+    plant = KinematicConfig()
+    nominal = nominal_ur5()
+    knowledge = _nominal_knowledge(hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range), run)
+    source = network_source(nominal.jacobian, knowledge.spec, progress=progress)
+
+    def obtain(config: TrainingConfig) -> TrainedNetworks:
+        trained.append(source(config))
+        return trained[-1]
+
+    _build_controller(RunRequest("", controller, "", "", 0), settings, replace(knowledge, train=obtain), nominal)
+    if not trained:
+        raise ConfigurationError(f"controller {controller} has no networks to train")
+    return trained[-1]
+
+
+def run_experiment(
+    request: RunRequest, settings: Settings, *, picture: bool = False, keep: Path | None = None
+) -> RunResult:
     """Carry one run out; a fault on the way is told in the row's `status` and `reason`.
 
     Args:
         request: what to run.
         settings: overrides of the defaults.
         picture: also return what the camera saw last, where there is one.
+        keep: results folder in which trained networks are kept beside the runs.
 
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    experiment = build_experiment(request, settings)
+    experiment = build_experiment(request, settings, keep=keep)
     plant, spec, scenario = experiment.plant, experiment.plant.spec, experiment.scenario
     log = StepLog(spec, full_jacobian=experiment.run.full_jacobian)
     loop = LoopSettings(experiment.periods, experiment.run.preview, experiment.run.lost_after_periods)
@@ -171,6 +214,16 @@ def run_experiment(request: RunRequest, settings: Settings, *, picture: bool = F
     return RunResult(row, steps, image)
 
 
+def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
+    """Return what every controller may know."""
+    return RobotKnowledge(
+        spec=spec,
+        preview=run.preview,
+        nominal_jacobian=nominal_ur5().jacobian,
+        region=(np.array(TRAINING_LOWER), np.array(TRAINING_UPPER)),
+    )
+
+
 def _build_plant(request: RunRequest, settings: Settings, setup: PlantSetup) -> Plant:
     entry = find_plant(request.plant)
     config = settings.resolve(request.plant, entry.config())
@@ -181,16 +234,12 @@ def _build_plant(request: RunRequest, settings: Settings, setup: PlantSetup) -> 
 
 
 def _build_controller(
-    request: RunRequest, settings: Settings, plant: Plant, nominal: HandEyeModel, true: HandEyeModel, run: RunSettings
+    request: RunRequest, settings: Settings, knowledge: RobotKnowledge, true: HandEyeModel
 ) -> Controller:
     entry = find_controller(request.controller)
     config = settings.resolve(request.controller, entry.config())
-    knowledge = RobotKnowledge(
-        spec=plant.spec,
-        preview=run.preview,
-        nominal_jacobian=nominal.jacobian,
-        true_jacobian=true.jacobian if entry.needs_truth else None,
-    )
+    if entry.needs_truth:
+        knowledge = replace(knowledge, true_jacobian=true.jacobian, true_symbolic=symbolic_feature(true))
     try:
         return entry.build(config, knowledge)
     except ValueError as error:

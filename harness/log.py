@@ -12,8 +12,6 @@ import pandas as pd
 from controllers.controller import Diagnostics
 from plant.signals import Command, FloatArray, Observation, PlantSpec, Truth
 
-TIMING_COLUMNS = ("controller_time_us", "plant_time_us")
-
 
 class StepLog:
     """Collects the rows of one run."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
+from controllers.composed import compose
 from controllers.controller import ControllerEntry
 from harness.configuration import ConfigurationError, suggest
 from plant.plant import PlantEntry
@@ -21,9 +22,17 @@ PLANTS = {
     "bullet": "plant.bullet:ENTRY",
 }
 CONTROLLERS = {
+    "rbfnn_mfac": "controllers.rbfnn_mfac:ENTRY",
+    "ukf_mfac": "controllers.ukf_mfac:ENTRY",
+    "ukf_mpc": "controllers.ukf_mpc:ENTRY",
+    "rbf_pid": "controllers.rbf_pid:ENTRY",
     "constant": "controllers.constant:ENTRY",
     "calibrated": "controllers.calibrated:ENTRY",
-    "ukf_mfac": "controllers.ukf_mfac:ENTRY",
+    "nmpc_calibrated": "controllers.nmpc_calibrated:ENTRY",
+    "broyden": "controllers.broyden:ENTRY",
+    "rls": "controllers.rls:ENTRY",
+    "kalman_mfac": "controllers.kalman_mfac:ENTRY",
+    "cfdl_mfac": "controllers.cfdl_mfac:ENTRY",
 }
 
 
@@ -52,11 +61,17 @@ def find_plant(name: str) -> PlantEntry:
 
 
 def find_controller(name: str) -> ControllerEntry:
-    """Return the controller called `name`.
+    """Return the controller called `name`, or the one composed for a name like `mfac+rls` (law + estimator).
 
     Raises:
         ConfigurationError: no such controller, or a third party's that cannot be loaded.
     """
+    law, plus, estimator = name.partition("+")
+    if plus:
+        try:
+            return compose(law, estimator)
+        except ValueError as error:
+            raise ConfigurationError(f"controller {name!r}: {error}") from error
     entry = _load(CONTROLLER_GROUP, "controller", name)
     if not isinstance(entry, ControllerEntry):
         raise ConfigurationError(

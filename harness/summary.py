@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pandas as pd
+from rich.box import SIMPLE_HEAD
+from rich.console import Group
 from rich.table import Table
 
 from harness.experiment import COMPLETED
@@ -34,42 +36,28 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def summary_table(runs: pd.DataFrame) -> Table:
-    """Return the summary as a table for the terminal."""
-    table = Table(title="medians over runs; settled = within 5 mm and stays", title_justify="left")
-    for heading, justify in (
-        ("plant", "left"),
-        ("mismatch", "left"),
-        ("task", "left"),
-        ("controller", "left"),
-        ("completed", "right"),
-        ("settled", "right"),
-        ("settling [s]", "right"),
-        ("overshoot [%]", "right"),
-        ("RMS end [mm]", "right"),
-        ("path ratio", "right"),
-        ("step [µs]", "right"),
-    ):
-        table.add_column(heading, justify="left" if justify == "left" else "right", no_wrap=True)
-    previous: tuple[str, ...] | None = None
-    for row in summarise(runs).to_dict("records"):
-        block = (row["plant"], row["mismatch"], row["task"])
-        if previous is not None and block != previous:
-            table.add_section()
-        shown = block if block != previous else ("", "", "")
-        previous = block
-        table.add_row(
-            *shown,
-            row["controller"],
-            f"{row['completed']}/{row['runs']}",
-            f"{row['settled']}/{row['runs']}",
-            _number(row["settling_time_s"], 1.0, 2),
-            _number(row["overshoot"], 100.0, 0),
-            _number(row["rms_error_evaluated_m"], 1000.0, 1),
-            _number(row["path_length_ratio"], 1.0, 2),
-            _number(row["controller_time_median_us"], 1.0, 0),
-        )
-    return table
+def summary_tables(runs: pd.DataFrame) -> Group:
+    """Return the summary for the terminal, a table for each plant, mismatch and task."""
+    tables = []
+    for (plant, mismatch, task), group in summarise(runs).groupby(["plant", "mismatch", "task"], sort=False):
+        table = Table(title=f"{task} on {plant}, {mismatch}", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        table.add_column("controller", no_wrap=True, min_width=15)
+        for heading in ("done", "settled", "after\ns", "overshoot\n%", "RMS end\nmm", "path\nratio", "step\nµs"):
+            table.add_column(heading, justify="right", no_wrap=True)
+        for row in group.to_dict("records"):
+            table.add_row(
+                row["controller"],
+                f"{row['completed']}/{row['runs']}",
+                f"{row['settled']}/{row['runs']}",
+                _number(row["settling_time_s"], 1.0, 2),
+                _number(row["overshoot"], 100.0, 0),
+                _number(row["rms_error_evaluated_m"], 1000.0, 1),
+                _number(row["path_length_ratio"], 1.0, 2),
+                _number(row["controller_time_median_us"], 1.0, 0),
+            )
+        tables.append(table)
+    legend = "done: reached the last period; settled: came within 5 mm and stayed; the rest are medians over runs"
+    return Group(*tables, legend)
 
 
 def _column(group: pd.DataFrame, name: str) -> pd.Series[float]:

@@ -181,15 +181,29 @@ def _build_waypoints(config: WaypointTask, true: HandEyeModel, _: int) -> Scenar
     return Scenario(as_vector("start", config.start, true.arm.n), reference, duration, 0.5 * duration)
 
 
-def _near_home(*change: float) -> Vector:
-    return tuple(float(q) for q in np.array(HOME) + np.array(change))
-
+# Start and target as joint positions, and beside them the ball on the nominal robot in the base frame.
+EXP1 = PointTask(
+    start=(0.169, -1.669, -2.250, 0.893, 1.156, 0.0),  # (0.50, -0.10, 0.35) m
+    target=(1.484, -1.897, -2.052, 0.793, 1.624, 0.0),  # (0.15, 0.58, 0.30) m; the shoulder is 0.63 rad outside
+)
+EXP2 = PointTask(
+    start=(0.097, -1.434, -2.282, 0.990, 1.124, 0.0),  # (0.40, -0.15, 0.45) m
+    target=(0.441, -2.006, -2.124, 0.760, 1.255, 0.0),  # (0.60, 0.10, 0.20) m
+)
+EXP3 = PointTask(
+    start=(0.583, -2.093, -1.976, 0.720, 1.301, 0.0),  # (0.62, 0.22, 0.20) m
+    target=(-0.114, -1.648, -2.157, 0.894, 1.067, 0.0),  # (0.45, -0.25, 0.40) m
+)
+EXP4 = PointTask(
+    start=(-0.938, -1.724, -1.814, 0.812, 0.855, 0.0),  # (0.12, -0.55, 0.50) m; the shoulder is 0.69 rad outside
+    target=(0.403, -1.847, -2.248, 0.826, 1.231, 0.0),  # (0.55, 0.05, 0.25) m
+)
 
 _ENTRIES = (
-    TaskEntry("exp1", "a move whose target lies outside the training region", PointTask(), _build_point),
-    TaskEntry("exp2", "a move inside the training region, forward and down", PointTask(), _build_point),
-    TaskEntry("exp3", "a move inside the training region, across and up", PointTask(), _build_point),
-    TaskEntry("exp4", "a move that starts outside the training region", PointTask(), _build_point),
+    TaskEntry("exp1", "a move whose target lies outside the training region", EXP1, _build_point),
+    TaskEntry("exp2", "a move inside the training region, forward and down", EXP2, _build_point),
+    TaskEntry("exp3", "a move inside the training region, across and up", EXP3, _build_point),
+    TaskEntry("exp4", "a move that starts outside the training region", EXP4, _build_point),
     TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle),
     TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line),
     TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(radius=0.25), _build_lemniscate),

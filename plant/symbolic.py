@@ -8,6 +8,7 @@ function (or generated C code) whose geometry stays a parameter.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
@@ -99,6 +100,12 @@ def symbolic_model(model: HandEyeModel) -> casadi.Function:
     q = casadi.SX.sym("joint_position", model.arm.n)
     outputs = list(feature_and_jacobian(q, geometry_of(model)))
     return casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
+
+
+def symbolic_feature(model: HandEyeModel) -> Callable[[SX], SX]:
+    """Return the function from the expression of q, (n, 1) rad, to that of the feature, (3, 1) m."""
+    geometry = geometry_of(model)
+    return lambda joint_position: feature_and_jacobian(joint_position, geometry)[0]
 
 
 def _rotation(rpy: SX) -> SX:

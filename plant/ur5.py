@@ -45,15 +45,21 @@ MAX_TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # Nm
 MAX_JOINT_SPEED = np.pi  # rad/s, the vendor's limit
 JOINT_RANGE = 2 * np.pi  # rad, each way
 
+# For the looks only: tube radii, and how far a link's tube runs beside its joints, along the joint's axis.
+TUBE_RADIUS = (0.062, 0.056, 0.047, 0.04, 0.04, 0.038)  # m
+SIDE_STEP = (0.0, 0.136, 0.0165, 0.0, 0.0, 0.0)  # m
+
 # The ball stands off the flange so that the wrist does not hide it from above.
 TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
 BALL_RADIUS = 0.035  # m
 
 # The camera hangs above the workspace and looks straight down; image up is +x of the base.
 # The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
-HOME = (2.79, -1.45, 2.34, 2.25, -1.22, -0.19)  # rad
-TRAINING_LOWER = tuple(q - 0.6 for q in HOME)
-TRAINING_UPPER = tuple(q + 0.6 for q in HOME)
+HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
+
+# The box of joint positions in which networks are trained on the nominal model, rad.
+TRAINING_LOWER = (-0.25, -2.29, -3.04, 0.39, 0.92, -0.3)
+TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
 
 WORKSPACE_CENTRE = (0.5, 0.0, 0.25)  # m, base frame
 CAMERA_DISTANCE = 1.3  # m, from the camera to the workspace's centre

@@ -117,13 +117,16 @@ def _draw_trajectory(tracks: dict[str, pd.DataFrame], styles: dict[str, MethodSt
     longest = max(tracks.values(), key=len)
     reference = longest[[kind.replace("true_feature", "reference") for kind in kinds]].to_numpy()
     start = longest[kinds].to_numpy()[0]
+    axes.scatter(*start, color="black", marker="s", s=35, label="start", zorder=10)
     if np.ptp(reference, axis=0).max() > 0.0:
         axes.plot(*reference.T, color="black", linewidth=2.5, alpha=0.3, label="reference")
-    axes.scatter(*start, color="black", marker="s", s=35, label="start", zorder=10)
-    axes.scatter(*reference[-1], color="black", marker="*", s=90, label="target", zorder=10)
+    else:
+        axes.scatter(*reference[0], color="black", marker="*", s=90, label="target", zorder=10)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z (depth) [m]")
+    axes.zaxis.labelpad = 12.0
+    axes.set_title(" ")  # keeps the figure's title off the axis label
     axes.set_aspect("equal", adjustable="datalim")
-    axes.view_init(elev=-60.0, azim=-80.0, roll=0.0)
+    axes.view_init(elev=-62.0, azim=-90.0, roll=0.0)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_major_locator(mpl.ticker.MaxNLocator(4))
     _add_legend(figure, axes)
@@ -142,7 +145,8 @@ def _draw_joint_speeds(tracks: dict[str, pd.DataFrame], styles: dict[str, Method
         axes.set_title(column.removeprefix("joint_velocity_command_").removesuffix("_rad_s"), fontsize=9)
     for axes in panels[len(columns) :]:
         axes.set_visible(False)
-    figure.supxlabel("time [s]", fontsize=9)
+    for axes in panels[len(columns) - 2 : len(columns)]:
+        axes.set_xlabel("time [s]")
     figure.supylabel("commanded joint speed [rad/s]", fontsize=9)
     _add_legend(figure, panels[0])
     return figure

@@ -1,0 +1,66 @@
+"""What a period of the `bullet` plant costs over the render and physics calls it cannot do without.
+
+Both are measured in the same run, in turns: a whole `BulletPlant.step`, and the same number of motor and physics steps
+plus one `getCameraImage` of the same camera in a world like it.
+Run it from an installed checkout: `python benchmarks/bullet_period.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from plant.bullet import PHYSICS_STEP, BulletConfig, BulletPlant, ur5_body
+from plant.plant import PlantSetup, whole_steps
+from plant.scene import Scene, view_of
+from plant.signals import Command
+from plant.ur5 import nominal_ur5
+
+HOME = np.array([2.97, -1.72, 2.05, -0.40, 1.70, 0.0])
+
+
+def milliseconds(call: Callable[[], object]) -> float:
+    """Return how long a call takes, ms."""
+    start = time.perf_counter()
+    call()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def measure(config: BulletConfig, period: float, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times, ms, (repeats,) of whole periods and of bare ones."""
+    model = nominal_ur5()
+    plant = BulletPlant(config, PlantSetup(model, HOME, period))
+    scene = Scene(model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=False)
+    view = view_of(config.camera(), model.X_BC)
+    plant.reset(0)
+    scene.place(HOME)
+    steps = whole_steps(period, PHYSICS_STEP)
+    whole, bare = np.empty(repeats), np.empty(repeats)
+    for k in range(repeats):
+        speed = 0.2 * np.sin(0.3 * k) * np.ones(6)
+        targets = [speed.tolist()] * steps
+        command = Command(speed)
+        bare[k] = milliseconds(lambda targets=targets: (scene.advance(targets), scene.render(view)))
+        whole[k] = milliseconds(lambda command=command: plant.step(command))
+    plant.close()
+    scene.close()
+    return whole, bare
+
+
+def main() -> None:
+    """Print medians and their ratio, with and without table and floor."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=300)
+    parser.add_argument("--period", type=float, default=0.05, help="s")
+    options = parser.parse_args()
+    for name, config in (("default", BulletConfig()), ("without scenery", BulletConfig(scenery=False))):
+        whole, bare = measure(config, options.period, options.repeats)
+        ratio = np.median(whole) / np.median(bare)
+        print(f"{name:16s} whole {np.median(whole):6.2f} ms   bare {np.median(bare):6.2f} ms   ratio {ratio:.3f}")
+
+
+if __name__ == "__main__":
+    main()

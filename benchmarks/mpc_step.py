@@ -1,0 +1,126 @@
+"""Time of one predictive step, against the same problem in do-mpc with IPOPT in the same run, call by call in turn.
+
+Both get H free moves, the frozen Jacobian, the previewed targets, and the limits on joint speed and joint position; the
+joint steps they answer with are compared.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+
+from controllers.controller import RobotKnowledge
+from controllers.laws.mpc import MpcConfig, MpcLaw
+from controllers.laws.mpc_closed_form import decay_targets
+from plant.hand_eye import hand_eye_spec
+from plant.signals import FloatArray, Observation
+from plant.ur5 import nominal_ur5
+
+PROBLEMS, FACTOR, AGREEMENT = 60, 10.0, 5e-4  # IPOPT stops some 1e-4 rad short: its barrier
+CONFIG = MpcConfig()
+MODEL = nominal_ur5()
+SPEC = hand_eye_spec(MODEL, 0.05, 1.0, 2 * np.pi)
+START = np.array([2.8, -1.4, 2.3, 2.2, -1.2, -0.2])
+
+
+def problems() -> list[tuple[FloatArray, Observation, FloatArray]]:
+    """Return Jacobian, observation and reference of the instants along a random walk of the joints, target ahead."""
+    rng = np.random.default_rng(0)
+    walk = START + np.cumsum(rng.normal(scale=0.01, size=(PROBLEMS, SPEC.n)), axis=0)
+    drift = np.outer(np.arange(CONFIG.horizon + 1), [0.004, -0.003, 0.002])
+    rows = []
+    for k, q in enumerate(walk):
+        y = MODEL.feature(q)
+        reference = y + rng.normal(scale=0.1, size=SPEC.m) + drift
+        rows.append((MODEL.jacobian(q), Observation(k * SPEC.period, q, y), reference))
+    return rows
+
+
+class DoMpc:
+    """The same problem in do-mpc: states are the feature's displacement and q, inputs dq, the rest varies in time."""
+
+    def __init__(self) -> None:
+        """Build model and controller.
+
+        Raises:
+            ImportError: do-mpc is not installed.
+        """
+        import do_mpc  # noqa: PLC0415 - reported when missing
+
+        model = do_mpc.model.Model("discrete", "SX")
+        shift, q = model.set_variable("_x", "shift", (SPEC.m, 1)), model.set_variable("_x", "q", (SPEC.n, 1))
+        dq = model.set_variable("_u", "dq", (SPEC.n, 1))
+        J = model.set_variable("_tvp", "J", (SPEC.m, SPEC.n))
+        target, weight = model.set_variable("_tvp", "target", (SPEC.m, 1)), model.set_variable("_tvp", "weight", (1, 1))
+        model.set_rhs("shift", shift + J @ dq)
+        model.set_rhs("q", q + dq)
+        model.setup()
+        self._mpc = do_mpc.controller.MPC(model)
+        self._mpc.settings.n_horizon = CONFIG.horizon
+        self._mpc.settings.t_step = SPEC.period
+        self._mpc.settings.supress_ipopt_output()
+        miss = target - shift
+        track = 0.5 * weight * (miss.T @ miss)
+        self._mpc.set_objective(mterm=track, lterm=track + 0.5 * CONFIG.move_weight * (dq.T @ dq))
+        self._mpc.set_rterm(dq=0.0)
+        largest = SPEC.joint_velocity_limit * SPEC.period
+        self._mpc.bounds["lower", "_u", "dq"], self._mpc.bounds["upper", "_u", "dq"] = -largest, largest
+        self._mpc.bounds["lower", "_x", "q"], self._mpc.bounds["upper", "_x", "q"] = SPEC.joint_lower, SPEC.joint_upper
+        self._template = self._mpc.get_tvp_template()
+        self._mpc.set_tvp_fun(lambda _time: self._template)
+        self._mpc.setup()
+        self._started = False
+
+    def step(self, J: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+        """Return the first joint step, (n,), rad."""
+        error = reference[0] - observation.feature
+        targets = decay_targets(error, reference[1:] - reference[0], CONFIG.rho)
+        self._template["_tvp", :, "J"] = [J] * (CONFIG.horizon + 1)
+        self._template["_tvp", :, "target"] = [np.zeros(SPEC.m), *targets]
+        self._template["_tvp", :, "weight"] = [0.0] + [1.0] * CONFIG.horizon
+        state: Any = np.concatenate([np.zeros(SPEC.m), observation.joint_position])[:, None]
+        if not self._started:
+            self._mpc.x0 = state
+            self._mpc.set_initial_guess()
+            self._started = True
+        return np.asarray(self._mpc.make_step(state))[:, 0]
+
+
+def main() -> None:
+    """Print both medians, their ratio and the largest difference of the joint steps.
+
+    Raises:
+        SystemExit: do-mpc is not installed, the answers differ, or the ratio is below the wanted one.
+    """
+    warnings.simplefilter("ignore")  # do-mpc tells of optional parts, CasADi of do-mpc's use of numpy
+    try:
+        other = DoMpc()
+    except ImportError as error:
+        sys.exit(f"mpc_step: skipped: `pip install do-mpc` into this environment to compare ({error})")
+    law = MpcLaw(CONFIG, RobotKnowledge(SPEC, CONFIG.horizon))
+    times: tuple[list[float], list[float]] = ([], [])
+    difference = 0.0
+    for J, observation, reference in problems():
+        started = time.perf_counter()
+        own_step = law.command(J, observation, reference) * SPEC.period
+        between = time.perf_counter()
+        other_step = other.step(J, observation, reference)
+        ended = time.perf_counter()
+        times[0].append(between - started)
+        times[1].append(ended - between)
+        difference = max(difference, float(np.abs(own_step - other_step).max()))
+    own, theirs = (1e3 * float(np.median(column)) for column in times)
+    print(f"mpc law {own:.3f} ms, do-mpc with IPOPT {theirs:.3f} ms: {theirs / own:.1f} times (wanted {FACTOR:g})")
+    print(f"largest difference of a joint step: {difference:.1e} rad")
+    if difference > AGREEMENT:
+        sys.exit(f"the joint steps differ by more than {AGREEMENT:g} rad: it is not the same problem")
+    if theirs < FACTOR * own:
+        sys.exit(f"mpc_step is {theirs / own:.1f} times faster than do-mpc, wanted {FACTOR:g}")
+
+
+if __name__ == "__main__":
+    main()

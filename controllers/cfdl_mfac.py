@@ -1,0 +1,28 @@
+"""Compact-form model-free adaptive control after Hou and Jin: both halves as in their method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from controllers.composed import servo_entry
+from controllers.estimators.cfdl import CfdlConfig
+from controllers.initial import InitialConfig
+from controllers.laws.mfac import MfacConfig
+
+
+@dataclass(frozen=True)
+class CfdlMfacConfig:
+    """Settings of `cfdl_mfac`."""
+
+    estimator: CfdlConfig = field(default_factory=CfdlConfig)  # pseudo-Jacobian matrix
+    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 44
+    initial: InitialConfig = field(default_factory=InitialConfig)  # where the first Jacobian comes from
+
+
+ENTRY = servo_entry(
+    "cfdl_mfac",
+    "compact-form model-free adaptive control of Hou and Jin",
+    CfdlMfacConfig,
+    law="mfac",
+    estimator="cfdl",
+)

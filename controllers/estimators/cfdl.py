@@ -1,0 +1,80 @@
+"""Compact-form dynamic linearisation: the pseudo-Jacobian estimate of model-free adaptive control.
+
+    Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²),      0 < η < 2,  μ > 0
+
+Source: Z. Hou, S. Jin, "Model Free Adaptive Control: Theory and Applications", 2013, projection algorithm with reset.
+η = 1 and μ → 0 are Broyden's update; μ is what makes it bear rest and noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Diagnostics
+from controllers.estimators.broyden import projection_update
+from controllers.estimators.estimator import Estimator, Motion
+from plant.signals import FloatArray, check_number
+
+
+@dataclass(frozen=True)
+class CfdlConfig:
+    """Settings of the compact-form estimate."""
+
+    step_factor: float = 0.5  # η, half of the fastest rate
+    regularisation: float = 1e-3  # μ, rad², the square of 0.03 rad: motions below change Φ little
+    min_joint_step: float = 0.005  # rad, motions below are left out: 1 mm of noise hides them
+    reset: bool = True  # return to Φ₀ when Φ loses its sign or vanishes
+    reset_norm: float = 1e-2  # m/rad, ‖Φ‖ below which Φ counts as vanished
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("step_factor", self.step_factor, above=0.0, below=2.0)
+        check_number("regularisation", self.regularisation, above=0.0)
+        check_number("min_joint_step", self.min_joint_step, at_least=0.0)
+        check_number("reset_norm", self.reset_norm, at_least=0.0)
+
+
+@final
+class CfdlEstimator(Estimator):
+    """Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²), back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
+
+    Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly
+    changes the sign of single entries, so the sign of the whole is taken: ⟨Φ, Φ₀⟩ = trace(ΦᵀΦ₀) ≤ 0 counts as changed.
+    The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, what was learnt stays.
+    """
+
+    def __init__(self, config: CfdlConfig) -> None:
+        """Take the settings."""
+        self._config = config
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Start from Φ₀, (m, n), m/rad."""
+        self._J0 = jacobian.copy()
+        self._J = jacobian.copy()
+        self._updated = False
+        self._resets = 0
+
+    def update(self, motion: Motion) -> None:
+        """Correct by one motion."""
+        config, dq = self._config, motion.joint_step
+        self._updated = bool(np.linalg.norm(dq) >= config.min_joint_step)
+        if not self._updated:
+            return
+        self._J = projection_update(
+            self._J, dq, motion.feature_step, step_factor=config.step_factor, regularisation=config.regularisation
+        )
+        lost = np.sum(self._J * self._J0) <= 0.0 or np.linalg.norm(self._J) < config.reset_norm
+        if config.reset and lost:
+            self._J = self._J0.copy()
+            self._resets += 1
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return the present estimate, (m, n), m/rad."""
+        return self._J.copy()
+
+    def diagnostics(self) -> Diagnostics:
+        """Return whether the last motion was used and how often Φ was reset in this run."""
+        return {"estimator_updated": float(self._updated), "jacobian_resets": float(self._resets)}

@@ -1,0 +1,35 @@
+"""The estimator that learns nothing: the lower bound of every comparison."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+from controllers.controller import Diagnostics
+from controllers.estimators.estimator import Estimator, Motion
+from plant.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class ConstantConfig:
+    """The constant estimator has no settings; its Ĵ₀ is set under `initial`."""
+
+
+@final
+class ConstantEstimator(Estimator):
+    """Ĵ(k) = Ĵ₀ for ever."""
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Keep Ĵ₀, (m, n), m/rad."""
+        self._J = jacobian.copy()
+
+    def update(self, motion: Motion) -> None:
+        """Learn nothing."""
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return Ĵ₀, wherever the arm is."""
+        return self._J.copy()
+
+    def diagnostics(self) -> Diagnostics:
+        """Return nothing: nothing changes."""
+        return {}

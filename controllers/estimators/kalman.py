@@ -1,0 +1,185 @@
+"""Kalman filter for the Jacobian: a random walk that is seen through every motion.
+
+State x = vec(J) by rows, (mn,), so that entry i·n + j is ∂y_i/∂q_j:
+
+    x(k) = x(k−1) + w,   w ~ N(0, Q)
+    Δy(k) = H x(k) + v,  H = I_m ⊗ Δqᵀ,  v ~ N(0, R),  R = 2σ² I  (Δy is the difference of two measurements)
+
+The measurement is linear in x, so this filter and the unscented one of `controllers.estimators.ukf` are the same.
+With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, one a feature, that share one covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+
+from controllers.controller import Diagnostics, FilterDiverged
+from controllers.estimators.estimator import Estimator, Motion
+from plant.signals import FloatArray, check_number
+
+FORMS = ("split", "full")
+
+
+@dataclass(frozen=True)
+class KalmanConfig:
+    """Settings of the Kalman filter."""
+
+    initial_deviation: float = 0.05  # m/rad, of an entry of Ĵ₀; tuned: softer lets latency spoil the first motions
+    process_deviation: float = 0.02  # m/rad, of an entry's walk over one motion; tuned on mismatched kinematic plants
+    feature_noise: float = 0.001  # m, standard deviation of the feature an axis; R = 2σ² I
+    min_joint_step: float = 0.002  # rad, motions below, in which 1 mm of noise is all there is, are left out
+    form: Literal["split", "full"] = "split"  # the same numbers; "full" is the readable reference
+
+    def __post_init__(self) -> None:
+        """Check the numbers and the choice."""
+        check_filter_numbers(self.initial_deviation, self.process_deviation, self.feature_noise, self.min_joint_step)
+        if self.form not in FORMS:
+            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {self.form!r}")
+
+
+def check_filter_numbers(
+    initial_deviation: float, process_deviation: float, feature_noise: float, min_joint_step: float
+) -> None:
+    """Check the numbers that all Kalman-like filters share; positive deviations keep every covariance definite.
+
+    Raises:
+        ValueError: one of them is out of its bounds.
+    """
+    check_number("initial_deviation", initial_deviation, above=0.0)
+    check_number("process_deviation", process_deviation, at_least=0.0)
+    check_number("feature_noise", feature_noise, above=0.0)
+    check_number("min_joint_step", min_joint_step, at_least=0.0)
+
+
+def cholesky_of(P: FloatArray) -> FloatArray:
+    """Return the lower Cholesky factor of a covariance.
+
+    Raises:
+        FilterDiverged: P is not finite or not positive definite.
+    """
+    try:
+        L = np.asarray(np.linalg.cholesky(P))
+    except np.linalg.LinAlgError as error:
+        lowest = float(np.linalg.eigvalsh(P).min())
+        raise FilterDiverged(f"covariance is not positive definite: smallest eigenvalue {lowest:.3e}") from error
+    if not np.isfinite(L).all():  # LAPACK lets NaN pass
+        raise FilterDiverged(f"covariance is not finite: diagonal {np.diag(P).tolist()}")
+    return L
+
+
+def measurement_matrix(joint_step: FloatArray, m: int) -> FloatArray:
+    """Return H = I_m ⊗ Δqᵀ, (m, mn), for Δq (n,)."""
+    return np.asarray(np.kron(np.eye(m), joint_step[None, :]), dtype=np.float64)
+
+
+def kalman_update(
+    x: FloatArray, P: FloatArray, H: FloatArray, z: FloatArray, *, Q: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Predict a random walk and correct it by one measurement, covariance in Joseph form.
+
+    Args:
+        x: state, (s,).
+        P: its covariance, (s, s).
+        H: measurement matrix, (m, s).
+        z: measurement, (m,).
+        Q: process covariance, (s, s).
+        R: measurement covariance, (m, m).
+
+    Returns:
+        The new state and covariance.
+    """
+    P = P + Q
+    S = H @ P @ H.T + R
+    K = np.linalg.solve(S, H @ P).T
+    A = np.eye(x.size) - K @ H
+    P = A @ P @ A.T + K @ R @ K.T
+    return x + K @ (z - H @ x), (P + P.T) / 2
+
+
+def split_update(
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: float, r: float
+) -> tuple[FloatArray, FloatArray]:
+    """Do the same for P = I_m ⊗ P_n, Q = q I, R = r I: all rows of J share the gain K (n,).
+
+        P ← P + q I,   K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
+
+    Args:
+        J: Jacobian, (m, n), m/rad.
+        P: covariance of each of its rows, (n, n), (m/rad)².
+        joint_step: Δq, (n,), rad.
+        feature_step: Δy, (m,), m.
+        q: variance of the walk, (m/rad)².
+        r: variance of Δy, m².
+
+    Returns:
+        The new Jacobian and covariance.
+    """
+    P = P.copy()
+    P.flat[:: P.shape[0] + 1] += q
+    PH = P @ joint_step
+    S = joint_step @ PH + r
+    K = PH / S
+    # (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ with A = P − K PHᵀ multiplied out: A − (A Δq) Kᵀ + r K Kᵀ
+    A = P - np.outer(K, PH)
+    P = A + np.outer(r * K - A @ joint_step, K)
+    return J + np.outer(feature_step - J @ joint_step, K), (P + P.T) / 2
+
+
+@final
+class KalmanEstimator(Estimator):
+    """x ← x + K (Δy − H x), K = P Hᵀ (H P Hᵀ + R)⁻¹, P in Joseph form; motions below a minimum ‖Δq‖ are left out.
+
+    J changes only where the arm moves, so a motion that is left out adds no process noise either.
+    """
+
+    def __init__(self, config: KalmanConfig) -> None:
+        """Take the settings."""
+        self._config = config
+        self._q = config.process_deviation**2
+        self._r = 2.0 * config.feature_noise**2
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Start from Ĵ₀, (m, n), m/rad, with the configured covariance."""
+        m, n = jacobian.shape
+        self._J = jacobian.copy()
+        self._P = np.eye(n if self._config.form == "split" else m * n) * self._config.initial_deviation**2
+        self._updated = False
+
+    def update(self, motion: Motion) -> None:
+        """Correct by one motion.
+
+        Raises:
+            FilterDiverged: the covariance is no longer positive definite.
+        """
+        self._updated = bool(np.linalg.norm(motion.joint_step) >= self._config.min_joint_step)
+        if not self._updated:
+            return
+        if self._config.form == "split":
+            self._J, self._P = split_update(
+                self._J, self._P, motion.joint_step, motion.feature_step, q=self._q, r=self._r
+            )
+        else:
+            m, size = self._J.shape[0], self._J.size
+            H = measurement_matrix(motion.joint_step, m)
+            Q, R = np.eye(size) * self._q, np.eye(m) * self._r
+            x, self._P = kalman_update(self._J.ravel(), self._P, H, motion.feature_step, Q=Q, R=R)
+            self._J = x.reshape(self._J.shape)
+        cholesky_of(self._P)
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return the present estimate, (m, n), m/rad."""
+        return self._J.copy()
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
+        if self._config.form == "split":
+            return np.asarray(np.kron(np.eye(self._J.shape[0]), self._P), dtype=np.float64)
+        return self._P.copy()
+
+    def diagnostics(self) -> Diagnostics:
+        """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
+        deviation = float(np.sqrt(np.trace(self._P) / self._P.shape[0]))
+        return {"estimator_updated": float(self._updated), "jacobian_deviation": deviation}

@@ -1,0 +1,113 @@
+"""Estimator of the RBF + PID method: the same Jacobian network under a Lyapunov update (eqs. 40–44)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Diagnostics
+from controllers.estimators.estimator import Estimator, Motion
+from controllers.networks import JacobianNetwork, jacobian_features, jacobian_output
+from plant.signals import FloatArray, check_number
+
+
+@dataclass(frozen=True)
+class RbfLyapunovConfig:
+    """Settings of the update; the gains are small as they meet ‖θ‖² of some ten and units that differ."""
+
+    n2: float = 0.005  # n₂, weight of the error, 1/(m s)
+    n3: float = 0.05  # n₃, weight of the prediction error, 1/m
+
+    def __post_init__(self) -> None:
+        """Check the gains."""
+        check_number("n2", self.n2, above=0.0)
+        check_number("n3", self.n3, above=0.0)
+
+
+def lyapunov_step(
+    theta: FloatArray, motion: Motion, jacobian: FloatArray, n2: float, n3: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the change of the weights over one motion, and the prediction error.
+
+    Args:
+        theta: θ(q), (n, L).
+        motion: what was observed.
+        jacobian: Ĵ(q), (m, n), m/rad.
+        n2: n₂.
+        n3: n₃.
+
+    Returns:
+        ΔW_i = Δq_i (n₃ s − n₂ e) θ_iᵀ, (n, m, L), and s = (Δy − ĴΔq) / duration, (m,), m/s.
+    """
+    s = (motion.feature_step - jacobian @ motion.joint_step) / motion.duration
+    pull = n3 * s - n2 * motion.error
+    return np.einsum("i,m,il->iml", motion.joint_step, pull, theta), s
+
+
+@final
+class RbfLyapunovEstimator(Estimator):
+    """Jacobian network whose update makes V = ½ n₂ eᵀe + ½ Σ‖W̃_i‖² decrease under u = K_p Ĵ⁺ e.
+
+        Ĵ_i(q) = W_i θ_i(q)                                            (eqs. 40, 41)
+        Ẇ_i = q̇_i (n₃ s − n₂ e) θ_i(q)ᵀ,   s = ẏ − Ĵ q̇                  (eq. 42)
+        V̇ = −K_p n₂ ‖e‖² − n₃ ‖s‖² ≤ 0                                 (eq. 44)
+
+    Symbols: e = y_ref − y (m,) m; s prediction error (m,) m/s; q̇ (n,) rad/s; W_i weights (m, L) m/rad; W̃_i their
+    error; θ_i features (L,); n₂ and n₃ gains. Discretised with the duration of the motion: W_i ← W_i + ΔW_i with
+    ΔW_i = Δq_i (n₃ s − n₂ e) θ_iᵀ.
+
+    Departures from the paper: n₂ enters with a minus, since e = y_ref − y here and y − y_ref there. V̇ ≤ 0 holds for a
+    target at rest; a moving one adds n₂ eᵀẏ_ref to V̇, which no choice of Ẇ cancels: the update stays as it is (s does
+    not see the target), and the law may cancel the term by feeding ẏ_ref forward. In discrete time the gains must be
+    small: n₃ Σ Δq_i² ‖θ_i‖² / duration < 2 for the s-part alone.
+    """
+
+    def __init__(self, config: RbfLyapunovConfig, network: JacobianNetwork) -> None:
+        """Start from the offline `network`."""
+        self._config = config
+        self._network = network
+        self._weights = network.weights
+        self._restore()
+
+    @property
+    def weights(self) -> FloatArray:
+        """W as it is now, (n, m, L), m/rad; a copy."""
+        return np.array(self._weights)
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Forget everything and restore the offline network.
+
+        Args:
+            jacobian: Ĵ₀, (m, n); only its size is looked at, see `RbfEstimator.reset`.
+
+        Raises:
+            ValueError: `jacobian` is of another size than the network.
+        """
+        if jacobian.shape != (self._network.m, self._network.n):
+            raise ValueError(f"jacobian must have shape {(self._network.m, self._network.n)}, got {jacobian.shape}")
+        self._restore()
+
+    def update(self, motion: Motion) -> None:
+        """Learn from one motion."""
+        theta = self._features(motion.joint_position)
+        J = jacobian_output(self._weights, theta)
+        change, s = lyapunov_step(theta, motion, J, self._config.n2, self._config.n3)
+        self._weights = self._weights + change
+        self._rate_error = float(np.linalg.norm(s))
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return Ĵ at `joint_position` (n,), rad."""
+        return jacobian_output(self._weights, self._features(joint_position))
+
+    def diagnostics(self) -> Diagnostics:
+        """Return ‖s‖, the prediction error of the feature's velocity (m/s), and the norm of all weights."""
+        return {"rate_error": self._rate_error, "estimator_weight_norm": float(np.linalg.norm(self._weights))}
+
+    def _features(self, q: FloatArray) -> FloatArray:
+        return jacobian_features(q, self._network.centres, self._network.widths)
+
+    def _restore(self) -> None:
+        self._weights = self._network.weights.copy()
+        self._rate_error = 0.0

@@ -1,0 +1,48 @@
+"""The estimator that is told the truth: the upper bound of every comparison, not a competitor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Diagnostics, RobotKnowledge
+from controllers.estimators.estimator import Estimator, Motion
+from plant.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class TrueConfig:
+    """The true Jacobian has no settings."""
+
+
+@final
+class TrueEstimator(Estimator):
+    """Ĵ(k) = J(q(k)), the Jacobian of the true robot."""
+
+    def __init__(self, knowledge: RobotKnowledge) -> None:
+        """Take the true Jacobian.
+
+        Raises:
+            ValueError: nobody told it.
+        """
+        if knowledge.true_jacobian is None:
+            raise ValueError(
+                "true_jacobian must be known for the estimator 'true'; this plant cannot tell it: take another"
+            )
+        self._true_jacobian = knowledge.true_jacobian
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Ignore Ĵ₀: the truth is known."""
+
+    def update(self, motion: Motion) -> None:
+        """Learn nothing: there is nothing to learn."""
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return J(q), (m, n), m/rad."""
+        return np.array(self._true_jacobian(joint_position), dtype=np.float64)
+
+    def diagnostics(self) -> Diagnostics:
+        """Return nothing: nothing is estimated."""
+        return {}

@@ -1,0 +1,177 @@
+"""Unscented Kalman filter for the Jacobian, as methods 2 and 3 of the paper use it.
+
+State x = vec(J) by rows, s = mn, a random walk with covariance Q; measurement Δy = J Δq with covariance R. Van der
+Merwe's scaled sigma points, 2s+1 of them, with Λ = α²(s + κ) − s and L Lᵀ = P + Q:
+
+    χ₀ = x,  χ_i = x ± √(s + Λ) L_i          (a random walk passes x on unchanged and turns P into P + Q, exactly)
+    ζ_i = reshape(χ_i) Δq,  ẑ = Σ wᵐ_i ζ_i
+    S = Σ wᶜ_i (ζ_i − ẑ)(ζ_i − ẑ)ᵀ + R,   C = Σ wᶜ_i (χ_i − x)(ζ_i − ẑ)ᵀ,   K = C S⁻¹
+    x ← x + K (Δy − ẑ),   P ← P + Q − K S Kᵀ
+
+Δy is linear in x, so the transform is exact for any α, β, κ: this filter *is* the Kalman filter of
+`controllers.estimators.kalman`. That is a fact about the method, and the tests check it to 1e-9. With P₀, Q and R
+multiples of the identity it even splits by rows: the form "split" gives the same numbers for a small part of the cost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, final
+
+import numpy as np
+
+from controllers.controller import Diagnostics
+from controllers.estimators.estimator import Estimator, Motion
+from controllers.estimators.kalman import check_filter_numbers, cholesky_of, split_update
+from plant.signals import FloatArray, check_number
+
+FORMS = ("sigma_points", "split")
+
+
+@dataclass(frozen=True)
+class UkfConfig:
+    """Settings of the unscented Kalman filter."""
+
+    initial_deviation: float = 0.05  # m/rad, of an entry of Ĵ₀; tuned: softer lets latency spoil the first motions
+    process_deviation: float = 0.02  # m/rad, of an entry's walk over one motion; tuned on mismatched kinematic plants
+    feature_noise: float = 0.001  # m, standard deviation of the feature an axis; R = 2σ² I
+    min_joint_step: float = 0.002  # rad, motions below, in which 1 mm of noise is all there is, are left out
+    alpha: float = 1.0  # spread of the sigma points; 1 keeps all weights from being negative
+    beta: float = 2.0  # prior knowledge of the distribution; 2 suits a Gaussian
+    kappa: float = 0.0  # secondary spread
+    form: Literal["sigma_points", "split"] = "sigma_points"  # the same numbers; "split" is several times faster
+
+    def __post_init__(self) -> None:
+        """Check the numbers and the choice."""
+        check_filter_numbers(self.initial_deviation, self.process_deviation, self.feature_noise, self.min_joint_step)
+        check_number("alpha", self.alpha, above=0.0)
+        check_number("beta", self.beta, at_least=0.0)
+        check_number("kappa", self.kappa, at_least=0.0)
+        if self.form not in FORMS:
+            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {self.form!r}")
+
+
+@dataclass(frozen=True, eq=False)
+class SigmaWeights:
+    """Weights of the scaled sigma points.
+
+    Attributes:
+        reach: √(s + Λ), how many deviations the points stand off.
+        mean: wᵐ, (2s+1,).
+        covariance: wᶜ, (2s+1,).
+    """
+
+    reach: float
+    mean: FloatArray
+    covariance: FloatArray
+
+
+def sigma_weights(size: int, alpha: float, beta: float, kappa: float) -> SigmaWeights:
+    """Return van der Merwe's weights for a state of `size` entries; α = 1, β = 0 are Julier's."""
+    spread = alpha**2 * (size + kappa)
+    mean = np.full(2 * size + 1, 0.5 / spread)
+    mean[0] = (spread - size) / spread
+    covariance = mean.copy()
+    covariance[0] += 1.0 - alpha**2 + beta
+    return SigmaWeights(float(np.sqrt(spread)), mean, covariance)
+
+
+def unscented_update(
+    J: FloatArray,
+    P: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    Q: FloatArray,
+    R: FloatArray,
+    weights: SigmaWeights,
+) -> tuple[FloatArray, FloatArray]:
+    """Predict the random walk and correct it by one motion with sigma points.
+
+    Args:
+        J: Jacobian, (m, n), m/rad.
+        P: covariance of vec(J) by rows, (mn, mn), (m/rad)².
+        joint_step: Δq, (n,), rad.
+        feature_step: Δy, (m,), m.
+        Q: process covariance, (mn, mn), (m/rad)².
+        R: covariance of Δy, (m, m), m².
+        weights: from `sigma_weights` with s = mn.
+
+    Returns:
+        The new Jacobian and covariance.
+
+    Raises:
+        FilterDiverged: P + Q is not positive definite.
+    """
+    size = J.size
+    P = P + Q
+    offsets = np.zeros((2 * size + 1, size))
+    offsets[1 : size + 1] = weights.reach * cholesky_of(P).T
+    offsets[size + 1 :] = -offsets[1 : size + 1]
+    points = (J.ravel() + offsets).reshape(-1, *J.shape)
+    Z = points @ joint_step
+    z = weights.mean @ Z
+    deviations = Z - z
+    weighted = weights.covariance[:, None] * deviations
+    S = deviations.T @ weighted + R
+    C = offsets.T @ weighted
+    K = np.linalg.solve(S, C.T).T
+    P = P - K @ S @ K.T
+    return J + (K @ (feature_step - z)).reshape(J.shape), (P + P.T) / 2
+
+
+@final
+class UkfEstimator(Estimator):
+    """x ← x + K (Δy − ẑ) with the gain of the unscented transform; motions below a minimum ‖Δq‖ are left out.
+
+    J changes only where the arm moves, so a motion that is left out adds no process noise either. The paper does not
+    say how P₀, Q and R are chosen, nor what happens at rest; R is kept honest here (2σ² of the feature's noise).
+    """
+
+    def __init__(self, config: UkfConfig) -> None:
+        """Take the settings."""
+        self._config = config
+        self._q = config.process_deviation**2
+        self._r = 2.0 * config.feature_noise**2
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Start from Ĵ₀, (m, n), m/rad, with the configured covariance."""
+        config, (m, n) = self._config, jacobian.shape
+        size = n if config.form == "split" else m * n
+        self._J = jacobian.copy()
+        self._P = np.eye(size) * config.initial_deviation**2
+        self._Q, self._R = np.eye(size) * self._q, np.eye(m) * self._r
+        self._weights = sigma_weights(size, config.alpha, config.beta, config.kappa)
+        self._updated = False
+
+    def update(self, motion: Motion) -> None:
+        """Correct by one motion.
+
+        Raises:
+            FilterDiverged: the covariance is no longer positive definite.
+        """
+        dq, dy = motion.joint_step, motion.feature_step
+        self._updated = bool(np.linalg.norm(dq) >= self._config.min_joint_step)
+        if not self._updated:
+            return
+        if self._config.form == "split":
+            self._J, self._P = split_update(self._J, self._P, dq, dy, q=self._q, r=self._r)
+            cholesky_of(self._P)
+        else:
+            weights = self._weights
+            self._J, self._P = unscented_update(self._J, self._P, dq, dy, Q=self._Q, R=self._R, weights=weights)
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return the present estimate, (m, n), m/rad."""
+        return self._J.copy()
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
+        if self._config.form == "split":
+            return np.asarray(np.kron(np.eye(self._J.shape[0]), self._P), dtype=np.float64)
+        return self._P.copy()
+
+    def diagnostics(self) -> Diagnostics:
+        """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
+        deviation = float(np.sqrt(np.trace(self._P) / self._P.shape[0]))
+        return {"estimator_updated": float(self._updated), "jacobian_deviation": deviation}

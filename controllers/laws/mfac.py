@@ -1,0 +1,87 @@
+"""Model-free adaptive control (eq. 44 of the paper).
+
+    dq(k) = ρ (λI + ĴᵀĴ)⁻¹ Ĵᵀ e(k) = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e(k),      u(k) = dq(k) / dt,      ρ ∈ (0, 1], λ > 0
+
+For ρ = 1 the step minimises ‖e − Ĵ dq‖² + λ‖dq‖². The paper has ρ = 1 and the error of the period before; here the
+newest measured error is used. Along a singular value σ of Ĵ the loop gain a period is ρσ²/(λ + σ²).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Diagnostics, RobotKnowledge
+from controllers.laws.law import Law, scale_to_limit
+from plant.signals import FloatArray, Observation, check_number
+
+
+@dataclass(frozen=True)
+class MfacConfig:
+    """Settings of the MFAC law."""
+
+    step_factor: float = 0.15  # ρ, not the paper's 1: with three periods of delay a gain of 0.44 a period is unstable
+    step_weight: float = 0.02  # λ, m²/rad², the unit of ‖J‖²: halves the gain where σ = 0.14 m/rad
+    feedforward: bool = False  # aim the reference's next step as well; needs a preview of at least 1, not in the paper
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("step_factor", self.step_factor, above=0.0, at_most=1.0)
+        check_number("step_weight", self.step_weight, above=0.0)
+
+
+def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: float) -> FloatArray:
+    """Return dq = ρ Jᵀ (λI + JJᵀ)⁻¹ e, the form of eq. 44 that solves m equations instead of n.
+
+    Args:
+        J: (m, n), m/rad.
+        e: y_ref − y, (m,), m.
+        step_factor: ρ.
+        step_weight: λ, m²/rad².
+
+    Returns:
+        The joint step of one period, (n,), rad.
+    """
+    return np.asarray(step_factor * (J.T @ np.linalg.solve(J @ J.T + step_weight * np.eye(J.shape[0]), e)))
+
+
+@final
+class MfacLaw(Law):
+    """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 44), limited as a whole so that the direction stays.
+
+    With `feedforward` the motion of the reference over the coming period is added without the factor ρ:
+    dq = Ĵᵀ (λI + ĴĴᵀ)⁻¹ (ρ e + y_ref(k+1) − y_ref(k)).
+    """
+
+    def __init__(self, config: MfacConfig, knowledge: RobotKnowledge) -> None:
+        """Take settings, limits and period.
+
+        Raises:
+            ValueError: a feedforward without a preview.
+        """
+        if config.feedforward and knowledge.preview < 1:
+            raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
+        self._config = config
+        self._limit = knowledge.spec.joint_velocity_limit
+        self._dt = knowledge.spec.period
+        self._saturated = False
+
+    def reset(self, observation: Observation) -> None:
+        """Forget the last command; the law itself has no state."""
+        self._saturated = False
+
+    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+        """Return u, (n,), rad/s; see `Law.command`."""
+        config = self._config
+        dq = mfac_step(jacobian, reference[0] - observation.feature, config.step_factor, config.step_weight)
+        if config.feedforward:
+            dq = dq + mfac_step(jacobian, reference[1] - reference[0], 1.0, config.step_weight)
+        wanted = dq / self._dt
+        self._saturated = bool((np.abs(wanted) > self._limit).any())
+        return scale_to_limit(wanted, self._limit)
+
+    def diagnostics(self) -> Diagnostics:
+        """Return whether the last command was limited."""
+        return {"saturated": float(self._saturated)}

@@ -1,0 +1,116 @@
+"""Resolved-rate control with a discrete PID on the error (eq. 43 of the paper, extended).
+
+    v(k) = K_p e(k) + K_i I(k) + K_d d(k) [+ ẏ_ref(k)],      u(k) = Ĵᵀ (ĴĴᵀ + δ²I)⁻¹ v(k)
+
+with e = y_ref − y (m,), its integral I and its filtered derivative d:
+
+    I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt),   ẏ_ref(k) = (y_ref(k+1) − y_ref(k)) / dt
+
+K_i = K_d = 0 and δ = 0 is eq. 43, whose minus sign belongs to the paper's error y − y_ref.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Diagnostics, RobotKnowledge
+from controllers.laws.law import Law, scale_to_limit
+from plant.signals import FloatArray, Observation, check_number
+
+
+@dataclass(frozen=True)
+class PidConfig:
+    """Settings of the PID law; defaults damp a loop with three periods of delay at 20 Hz well."""
+
+    proportional_gain: float = 2.5  # K_p, 1/s; K_p dt = 0.125 a period, as quick as MFAC's default
+    integral_gain: float = 0.0  # K_i, 1/s²; 0 as in the paper
+    derivative_gain: float = 0.0  # K_d, 1; 0 as in the paper
+    derivative_filter: float = 0.1  # τ, s, two periods at 20 Hz
+    damping: float = 0.02  # δ, m/rad, a tenth of the smallest singular value in a UR5's workspace
+    feedforward: bool = False  # add the reference's own velocity; needs a preview of at least 1
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("proportional_gain", self.proportional_gain, above=0.0)
+        for name in ("integral_gain", "derivative_gain", "derivative_filter", "damping"):
+            check_number(name, getattr(self, name), at_least=0.0)
+
+
+def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
+    """Return Jᵀ (JJᵀ + δ²I)⁻¹, (n, m), rad/m, for J (m, n); the pseudo-inverse where δ = 0.
+
+    Args:
+        J: (m, n), m/rad.
+        damping: δ, m/rad: directions in which J is weaker than this are not chased.
+    """
+    if damping == 0.0:
+        return np.asarray(np.linalg.pinv(J))
+    return np.asarray(np.linalg.solve(J @ J.T + damping**2 * np.eye(J.shape[0]), J).T)
+
+
+def reference_velocity(reference: FloatArray, period: float) -> FloatArray:
+    """Return ẏ_ref = (y_ref(k+1) − y_ref(k)) / dt, (m,), m/s, from a reference (1 + preview, m) with preview ≥ 1."""
+    return np.asarray((reference[1] - reference[0]) / period)
+
+
+@final
+class PidLaw(Law):
+    """u = Ĵ⁺ (K_p e + K_i I + K_d d [+ ẏ_ref]), limited as a whole so that the direction stays.
+
+    Anti-windup by conditional integration: while the command is limited, the integral grows no further (it may shrink).
+    Without a valid feature the integral and the derivative wait.
+    """
+
+    def __init__(self, config: PidConfig, knowledge: RobotKnowledge) -> None:
+        """Take settings, limits and period.
+
+        Raises:
+            ValueError: a feedforward without a preview.
+        """
+        if config.feedforward and knowledge.preview < 1:
+            raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
+        self._config = config
+        self._limit = knowledge.spec.joint_velocity_limit
+        self._dt = knowledge.spec.period
+        self._m = knowledge.spec.m
+        self._forget()
+
+    def _forget(self) -> None:
+        self._integral = np.zeros(self._m)
+        self._derivative = np.zeros(self._m)
+        self._last_error: FloatArray | None = None
+        self._saturated = False
+
+    def reset(self, observation: Observation) -> None:
+        """Forget integral and derivative."""
+        self._forget()
+
+    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+        """Return u, (n,), rad/s; see `Law.command`."""
+        config = self._config
+        e = reference[0] - observation.feature
+        if observation.feature_valid:
+            self._differentiate(e)
+        integral = self._integral + self._dt * e if observation.feature_valid else self._integral
+        v = config.proportional_gain * e + config.integral_gain * integral + config.derivative_gain * self._derivative
+        if config.feedforward:
+            v = v + reference_velocity(reference, self._dt)
+        wanted = damped_inverse(jacobian, config.damping) @ v
+        u = scale_to_limit(wanted, self._limit)
+        self._saturated = bool((np.abs(wanted) > self._limit).any())
+        if not self._saturated or integral @ integral < self._integral @ self._integral:
+            self._integral = integral
+        return u
+
+    def diagnostics(self) -> Diagnostics:
+        """Return the norm of the integral, m s, and whether the command was limited."""
+        return {"integral_norm": float(np.linalg.norm(self._integral)), "saturated": float(self._saturated)}
+
+    def _differentiate(self, e: FloatArray) -> None:
+        if self._last_error is not None:
+            tau = self._config.derivative_filter
+            self._derivative = (tau * self._derivative + e - self._last_error) / (tau + self._dt)
+        self._last_error = e

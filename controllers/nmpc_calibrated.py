@@ -1,0 +1,233 @@
+"""A second upper bound: nonlinear predictive control over the kinematics of the true robot. It is told the truth."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Final, Literal, final, get_args
+
+import casadi
+import numpy as np
+
+from controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge, SolverFailed
+from controllers.laws.mpc_closed_form import decay_targets, move_weights
+from controllers.laws.mpc_limits import LimitedProgram, joint_bounds
+from controllers.laws.mpc_qp import SOLVERS, QpShape, QpSolution
+from plant.signals import Command, FloatArray, Observation, check_number
+
+Fallback = Literal["hold", "raise"]
+Solver = Literal["daqp", "qpoases"]
+
+_CONVERGED: Final = 1e-9  # rad: a smaller change of the plan ends the iterations
+
+
+@dataclass(frozen=True)
+class NmpcCalibratedConfig:
+    """Settings of `nmpc_calibrated`; "tuned" = on simulated UR5s with joint lag and a command delay of one period."""
+
+    horizon: int = 8  # H, periods; with the delay within the default preview of 10
+    delay_periods: int = 2  # periods until a command moves the joints: one of transport, one of lag; bridged
+    rho: float = 1.0  # ρ, 1/period: the error should decay as exp(−ρ τ); tuned
+    move_weight: float = 0.001  # q of Q = q I, m²/rad²; small, it only settles the free joints
+    terminal_weight: float = 0.0  # extra weight of the error after H periods
+    iterations: int = 2  # Gauss-Newton steps a period at most; 1 is the real-time iteration
+    disturbance_gain: float = (
+        0.0  # share of the model's error on the camera fed back a period; 0 trusts encoders and model
+    )
+    joint_acceleration_limit: float = math.inf  # rad/s², between two commands; inf = none
+    limit_position: bool = True  # keep the predicted joint positions within the plant's limits
+    solver: Solver = "daqp"  # of the quadratic programs; "qpoases" to cross-check
+    fallback: Fallback = "hold"  # no solution: zero velocity | SolverFailed
+
+    def __post_init__(self) -> None:
+        """Check every number and word that needs no knowledge of the plant."""
+        for name, words in (("solver", SOLVERS), ("fallback", get_args(Fallback))):
+            if getattr(self, name) not in words:
+                raise ValueError(f"{name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
+        check_number("horizon", self.horizon, at_least=1)
+        check_number("delay_periods", self.delay_periods, at_least=0)
+        check_number("rho", self.rho, above=0.0)
+        check_number("move_weight", self.move_weight, above=0.0)
+        check_number("terminal_weight", self.terminal_weight, at_least=0.0)
+        check_number("iterations", self.iterations, at_least=1)
+        check_number("disturbance_gain", self.disturbance_gain, at_least=0.0, at_most=1.0)
+        if not self.joint_acceleration_limit > 0.0:
+            raise ValueError(f"joint_acceleration_limit must be above 0, got {self.joint_acceleration_limit}")
+
+
+@final
+class NmpcCalibrated(Controller):
+    """Predictive control with the true forward kinematics h, solved by sequential quadratic programming.
+
+        min  ½ Σ_τ w_τ ‖y_ref(k+d+τ) − β^τ e − h(q_τ) − b‖² + ½ q Σ_τ ‖dq_τ‖²,   q_τ = q̂(k+d) + Σ_{s≤τ} dq_s
+
+    over speed, acceleration and position limits; e = y_ref(k+d) − h(q̂(k+d)) − b, β = exp(−ρ). The joints are taken
+    as ideal after d periods: q̂(k+d) = q + the last d steps sent. b follows the camera, b ← b + γ (y − h(q) − b); with
+    the default γ = 0 the controller does not look at it and shows what perfect calibration alone is worth. Each
+    iteration is a Gauss-Newton step: h is linearised along the present plan and the program of `mpc_qp` gives the next
+    one, starting from the last plan shifted by one period. Not in the paper.
+
+    | here | meaning | shape | unit |
+    |---|---|---|---|
+    | `plan` | dq_1 … dq_H | (H, n) | rad |
+    | `J` | ∂h/∂q along the plan | (H, m, n) | m/rad |
+    | `b` | what the camera sees besides the model | (m,) | m |
+    """
+
+    def __init__(self, config: NmpcCalibratedConfig, knowledge: RobotKnowledge) -> None:
+        """Build the linearisation and the quadratic program.
+
+        Raises:
+            ValueError: nobody told the symbolic kinematics, it has another size, or the preview is too short.
+        """
+        reach = config.horizon + config.delay_periods
+        if knowledge.preview < reach:
+            raise ValueError(f"preview must be at least horizon + delay_periods = {reach}, got {knowledge.preview}")
+        if knowledge.true_symbolic is None:
+            raise ValueError("true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics")
+        self._config, self._spec = config, knowledge.spec
+        n, m = self._spec.n, self._spec.m
+        self._model = _linearisation(knowledge.true_symbolic, n, m)
+        self._along_plan = self._model.map(config.horizon)
+        self._weights = move_weights(config.horizon, 1.0, config.terminal_weight)
+        shape = QpShape(
+            n=n,
+            m=m,
+            weights=self._weights,
+            move_weight=np.full(n, config.move_weight),
+            constant_gain=None,
+            limit_acceleration=math.isfinite(config.joint_acceleration_limit),
+            limit_position=config.limit_position,
+            view_rows=np.zeros((0, m)),
+            varying_jacobian=True,
+        )
+        self._program = LimitedProgram(shape, config.solver)
+        self._b: FloatArray = np.zeros(m)
+        self._jacobian: FloatArray | None = None
+        self._forget()
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Forget plan, warm start, commands sent and disturbance; nothing is random."""
+        del observation, seed
+        self._program.reset()
+        self._forget()
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """Return the first step of the best plan as a joint velocity; see `Controller.step`.
+
+        Raises:
+            SolverFailed: no solution, and the fallback is "raise".
+        """
+        config, delay = self._config, self._config.delay_periods
+        present = observation.joint_position
+        feature, self._jacobian = self._evaluate(present)
+        if observation.feature_valid:
+            self._b = self._b + config.disturbance_gain * (observation.feature - feature - self._b)
+        start = present + sum(self._sent, np.zeros(self._spec.n))
+        rows = reference[delay : delay + config.horizon + 1]
+        error = rows[0] - self._evaluate(start)[0] - self._b
+        wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], config.rho) - self._b
+        plan, success = self._improve(start, wanted)
+        limit = self._spec.joint_velocity_limit
+        velocity = np.clip(plan[0] / self._spec.period, -limit, limit) if success else np.zeros(self._spec.n)
+        self._plan = np.concatenate([plan[1:], plan[-1:]]) if success else np.zeros_like(plan)
+        self._last = velocity * self._spec.period
+        self._sent.append(self._last)
+        return Command(velocity)
+
+    def diagnostics(self) -> Diagnostics:
+        """Return solver success, iterations, last change of the plan, objective, fallbacks so far, predicted error."""
+        return dict(self._diagnostics)
+
+    def estimated_jacobian(self) -> FloatArray | None:
+        """Return the true Jacobian (m, n) at the last observation, or None before there was one."""
+        return None if self._jacobian is None else self._jacobian.copy()
+
+    def _forget(self) -> None:
+        n, delay = self._spec.n, self._config.delay_periods
+        self._plan = np.zeros((self._config.horizon, n))
+        self._sent: deque[FloatArray] = deque([np.zeros(n)] * delay, maxlen=delay)
+        self._last = np.zeros(n)
+        self._b = np.zeros(self._spec.m)
+        self._jacobian = None
+        self._fallbacks = 0
+        self._diagnostics: dict[str, float] = {}
+
+    def _evaluate(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        feature, jacobian = self._model(joint_position)
+        return np.asarray(feature)[:, 0], np.asarray(jacobian)
+
+    def _improve(self, start: FloatArray, wanted: FloatArray) -> tuple[FloatArray, bool]:
+        """Return the plan after the Gauss-Newton steps, (H, n) rad, and whether there is one.
+
+        Args:
+            start: joint position at which the plan begins, (n,), rad.
+            wanted: features that the model should show along the plan, (H, m), m.
+        """
+        config = self._config
+        bounds = joint_bounds(
+            self._spec,
+            config.horizon,
+            self._last,
+            acceleration_limit=config.joint_acceleration_limit,
+            joint_position=start,
+            view_margin=np.zeros(0),
+        )
+        plan, change, iterations = self._plan, math.inf, 0
+        while iterations < config.iterations and change > _CONVERGED:
+            J, targets = self._linearise(start, plan, wanted)
+            solution = self._program.solve(J, targets, bounds)
+            if not solution.success:
+                return self._fail(solution), False
+            change = float(np.abs(solution.moves - plan).max())
+            plan, iterations = solution.moves, iterations + 1
+        terminal_error = float(np.linalg.norm(targets[-1] - J[-1] @ plan.sum(axis=0)))
+        self._note(solution, iterations, change, terminal_error)
+        return plan, True
+
+    def _linearise(self, start: FloatArray, plan: FloatArray, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return J (H, m, n) along the plan and the targets (H, m) that J Σ dq should meet."""
+        travel = np.cumsum(plan, axis=0)
+        features, jacobians = self._along_plan((start + travel).T)
+        J = np.asarray(jacobians).reshape(self._spec.m, self._config.horizon, self._spec.n).swapaxes(0, 1)
+        return J, wanted - np.asarray(features).T + np.einsum("tij,tj->ti", J, travel)
+
+    def _fail(self, solution: QpSolution) -> FloatArray:
+        self._fallbacks += 1
+        if self._config.fallback == "raise":
+            raise SolverFailed(f"{self._config.solver} found no solution within the limits: {solution.status}")
+        self._note(solution, 0, math.nan, math.nan)
+        return self._plan
+
+    def _note(self, solution: QpSolution, iterations: int, change: float, terminal_error: float) -> None:
+        self._diagnostics = {
+            "solver_success": float(solution.success),
+            "solver_iterations": float(iterations),
+            "plan_change": change,
+            "objective": solution.objective if solution.success else math.nan,
+            "fallbacks": float(self._fallbacks),
+            "predicted_terminal_error": terminal_error,
+        }
+
+
+def _linearisation(symbolic: Any, n: int, m: int) -> casadi.Function:  # noqa: ANN401 - CasADi expressions
+    """Return q -> (h(q), ∂h/∂q) with CasADi's own differentiation.
+
+    Raises:
+        ValueError: an expression of another size than (m, 1).
+    """
+    q = casadi.SX.sym("joint_position", n)
+    feature = symbolic(q)
+    if feature.shape != (m, 1):
+        raise ValueError(f"true_symbolic must give an expression of shape ({m}, 1), got {feature.shape}")
+    return casadi.Function("linearisation", [q], [feature, casadi.jacobian(feature, q)])
+
+
+ENTRY = ControllerEntry(
+    name="nmpc_calibrated",
+    summary="nonlinear predictive control over the true kinematics: an upper bound with limits and preview",
+    config=NmpcCalibratedConfig,
+    build=NmpcCalibrated,
+    needs_truth=True,
+)

@@ -1,0 +1,138 @@
+"""A controller composed of a Jacobian estimator, a control law and a provider of the initial Jacobian.
+
+    J(k) ← estimator(Δy, Δq),      u(k) = law(J(k), y(k), y_ref(k), y_ref(k+1), …)
+
+Any estimator works with any law. Which of them are known by name is written in `controllers.composed`.
+"""
+
+from __future__ import annotations
+
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Controller, ControllerDiverged, Diagnostics, RobotKnowledge
+from controllers.estimators.estimator import Estimator, Motion
+from controllers.initial import InitialJacobian
+from controllers.laws.law import Law
+from plant.signals import Command, FloatArray, Observation
+
+
+@final
+class ServoController(Controller):
+    """Estimates the Jacobian from what moved and commands by what it estimates.
+
+    Each step learns from the motion between the last valid feature and the present one, so that Δy and Δq span the same
+    gap when frames are lost; a step without a valid feature learns nothing. Joint positions are read without delay, so
+    under camera latency Δy is that of a motion a little earlier: while the arm speeds up or slows down, an estimator is
+    misled. While the initial Jacobian is probed, the probing moves are the command; estimator and law are not asked.
+
+    Attributes:
+        estimator: the Jacobian estimator, for a look at its state.
+        law: the control law, likewise.
+    """
+
+    def __init__(self, estimator: Estimator, law: Law, initial: InitialJacobian, knowledge: RobotKnowledge) -> None:
+        """Compose a controller; `reset` must be called before the first `step`."""
+        self.estimator = estimator
+        self.law = law
+        self._initial = initial
+        self._spec = knowledge.spec
+        self._preview = knowledge.preview
+        self._forget()
+
+    def _forget(self) -> None:
+        self._ready = False
+        self._probing = False
+        self._last_valid: Observation | None = None
+        self._jacobian: FloatArray | None = None
+        self._prediction_error = float("nan")
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Forget everything; see `Controller.reset`. No part draws random numbers, so `seed` changes nothing.
+
+        Raises:
+            ValueError: an observation of the wrong size.
+        """
+        del seed
+        self._check_observation(observation)
+        self._initial.reset(observation)
+        self._forget()
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """Return the command for the period that begins now; see `Controller.step`.
+
+        Raises:
+            ValueError: an observation or a reference of the wrong size.
+            ControllerDiverged: the estimate, or what the law asked for, is not finite.
+        """
+        self._check_observation(observation)
+        self._check_reference(reference)
+        probing = None if self._ready else self._initial.step(observation)
+        if probing is not None:
+            self._probing = True
+            return Command(probing)
+        if not self._ready:
+            self.estimator.reset(self._initial.jacobian())
+            self.law.reset(observation)
+            self._ready, self._probing = True, False
+        self._learn(observation, reference)
+        J = self._jacobian = self.estimator.jacobian(observation.joint_position)
+        if not np.isfinite(J).all():
+            raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
+        u = self.law.command(J, observation, reference)
+        if not np.isfinite(u).all():
+            raise ControllerDiverged(
+                f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
+            )
+        return Command(u)
+
+    def diagnostics(self) -> Diagnostics:
+        """Return what estimator and law tell, besides `probing` and `jacobian_prediction_error`.
+
+        `jacobian_prediction_error` is ‖Δy − ĴΔq‖ in m of the last motion, with Ĵ from before its update; NaN until
+        something has moved. `probing` is 1 while the initial Jacobian is being measured.
+        """
+        own = {"probing": float(self._probing), "jacobian_prediction_error": self._prediction_error}
+        if not self._ready:
+            return own
+        return {**own, **self.estimator.diagnostics(), **self.law.diagnostics()}
+
+    def estimated_jacobian(self) -> FloatArray | None:
+        """Return the Jacobian (m, n) that the last step used, or None before there is one."""
+        return None if self._jacobian is None else self._jacobian.copy()
+
+    def _learn(self, observation: Observation, reference: FloatArray) -> None:
+        if not observation.feature_valid:
+            return
+        last, self._last_valid = self._last_valid, observation
+        if last is None or observation.time <= last.time:
+            return
+        motion = Motion(
+            joint_position=last.joint_position,
+            joint_step=observation.joint_position - last.joint_position,
+            feature_step=observation.feature - last.feature,
+            error=reference[0] - observation.feature,
+            duration=observation.time - last.time,
+        )
+        J = self.estimator.jacobian(motion.joint_position)
+        self._prediction_error = float(np.linalg.norm(motion.feature_step - J @ motion.joint_step))
+        self.estimator.update(motion)
+
+    def _check_observation(self, observation: Observation) -> None:
+        sizes = (
+            ("joint_position", observation.joint_position, self._spec.n),
+            ("feature", observation.feature, self._spec.m),
+        )
+        for name, value, size in sizes:
+            if value.shape != (size,):
+                raise ValueError(f"observation.{name} must have shape ({size},), got {value.shape}")
+
+    def _check_reference(self, reference: FloatArray) -> None:
+        wanted = (1 + self._preview, self._spec.m)
+        if np.shape(reference) != wanted:
+            raise ValueError(
+                f"reference must have shape {wanted} for a preview of {self._preview}, got {np.shape(reference)}"
+            )
+        if not np.isfinite(reference).all():
+            raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")

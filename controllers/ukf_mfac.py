@@ -1,0 +1,28 @@
+"""Method 2 of the paper: unscented Kalman filter for the Jacobian, model-free adaptive control (eq. 44)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from controllers.composed import servo_entry
+from controllers.estimators.ukf import UkfConfig
+from controllers.initial import InitialConfig
+from controllers.laws.mfac import MfacConfig
+
+
+@dataclass(frozen=True)
+class UkfMfacConfig:
+    """Settings of `ukf_mfac`."""
+
+    estimator: UkfConfig = field(default_factory=UkfConfig)  # Jacobian filter
+    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 44
+    initial: InitialConfig = field(default_factory=InitialConfig)  # where the first Jacobian comes from
+
+
+ENTRY = servo_entry(
+    "ukf_mfac",
+    "unscented Kalman filter with model-free adaptive control (eq. 44)",
+    UkfMfacConfig,
+    law="mfac",
+    estimator="ukf",
+)
