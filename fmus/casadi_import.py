@@ -21,7 +21,7 @@ from plant.signals import FloatArray
 
 
 class FmuModel:
-    """y = h(q) of a model-exchange FMU, with J = ∂h/∂q by its directional derivatives; other states stay at their start.
+    """y = h(q) of a model-exchange FMU, J = ∂h/∂q by its directional derivatives; other states rest at their start.
 
     Attributes:
         function: (n,) rad -> (m,) and (m, n), a `casadi.Function`; it lives as long as this object.
@@ -51,6 +51,10 @@ class FmuModel:
         except BaseException:
             self._folder.close()
             raise
+
+    def symbolic(self, joint_position: Any) -> Any:  # noqa: ANN401 - CasADi expressions
+        """Return the feature, (m, 1), as an expression of `joint_position`, an MX expression of shape (n, 1) in rad."""
+        return self.function(joint_position)[0]
 
     def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the feature, (m,), at joint positions (n,) in rad."""

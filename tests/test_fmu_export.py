@@ -10,6 +10,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import casadi
 import numpy as np
 import pytest
 from fmpy import simulate_fmu
@@ -216,6 +217,10 @@ def test_casadi_reads_the_equations_back():
     q = np.random.default_rng(0).uniform(-3.0, 3.0, (10, 6))
     np.testing.assert_allclose(model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9)
     np.testing.assert_allclose(model.feature(q[0]), mismatched("severe").feature(q[0]), rtol=0, atol=1e-9)
+    symbol = casadi.MX.sym("q", 6)
+    squared = casadi.Function("squared", [symbol], [casadi.gradient(casadi.sumsqr(model.symbolic(symbol)), symbol)])
+    wanted = 2.0 * mismatched("severe").jacobian(q[1]).T @ mismatched("severe").feature(q[1])
+    np.testing.assert_allclose(np.asarray(squared(q[1])).ravel(), wanted, rtol=0, atol=1e-9)
     model.close()
 
 
