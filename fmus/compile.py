@@ -1,0 +1,136 @@
+"""Compiles the C sources of an FMU: by the system's C compiler for this machine, or by zig for many at once."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror")
+# No fused multiply-add, so that every platform rounds alike; only the FMI functions are visible.
+CODE = ("-std=c11", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared")
+COMPILERS = ("cc", "gcc", "clang")
+
+
+class CompilerMissing(RuntimeError):
+    """There is no C compiler for what was asked; the message names the ways out."""
+
+
+class CompilationFailed(RuntimeError):
+    """The compiler refused the sources; the message is the compiler's first error."""
+
+
+@dataclass(frozen=True)
+class Platform:
+    """A kind of machine.
+
+    Attributes:
+        name: platform tuple of FMI 3.0.
+        fmi2_folder: what FMI 2.0 calls it.
+        suffix: of shared libraries.
+        zig_target: what zig calls it.
+        flags: compiler flags.
+    """
+
+    name: str
+    fmi2_folder: str
+    suffix: str
+    zig_target: str
+    flags: tuple[str, ...] = ()
+
+    def folder(self, fmi_version: int) -> str:
+        """Return the folder below binaries/ of an FMU."""
+        return self.fmi2_folder if fmi_version == 2 else self.name
+
+
+_LINUX = ("-fPIC", "-Wl,--build-id=none", "-s")
+PLATFORMS = {
+    platform.name: platform
+    for platform in (
+        # glibc 2.17 is what the oldest supported distributions have.
+        Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17", _LINUX),
+        Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17", _LINUX),
+        Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos", ("-fPIC",)),
+        Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos", ("-fPIC",)),
+        Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu", ("-s",)),
+    )
+}
+
+
+def this_platform() -> Platform:
+    """Return the platform of this machine.
+
+    Raises:
+        ValueError: FMUs cannot be built for it.
+    """
+    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
+    system = {"win32": "windows"}.get(sys.platform, sys.platform)
+    name = f"{machine}-{system}"
+    if name not in PLATFORMS:
+        raise ValueError(f"this machine is {name!r}, for which no FMU can be built; known are {', '.join(PLATFORMS)}")
+    return PLATFORMS[name]
+
+
+def parse_platforms(text: str | None) -> tuple[Platform, ...]:
+    """Return the platforms that `text` names, separated by commas: None for this machine, "all" for all.
+
+    Raises:
+        ValueError: a name that is not known.
+    """
+    if text is None:
+        return (this_platform(),)
+    if text == "all":
+        return tuple(PLATFORMS.values())
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in PLATFORMS:
+            raise ValueError(f"platforms holds {name!r}; known are {', '.join(PLATFORMS)} and 'all'")
+    return tuple(PLATFORMS[name] for name in dict.fromkeys(names))
+
+
+def compile_library(folder: Path, sources: Sequence[str], target: Platform, library: Path) -> None:
+    """Compile `sources` in `folder` into the shared library `library`.
+
+    Args:
+        folder: where the sources and their headers are; the compiler runs there, so that no path gets into the library.
+        sources: file names.
+        target: for which platform.
+        library: the file to write.
+
+    Raises:
+        CompilerMissing: no compiler for this platform is installed.
+        CompilationFailed: the compiler did not accept the sources.
+    """
+    library.parent.mkdir(parents=True, exist_ok=True)
+    output = library.resolve()
+    libraries = () if target.suffix == ".dll" else ("-lm",)
+    arguments = [*_compiler(target), *CODE, *WARNINGS, *target.flags, *sources, "-o", str(output), *libraries]
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": "315532800", "ZERO_AR_DATE": "1"}
+    done = subprocess.run(
+        arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False, errors="replace"
+    )
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
+        raise CompilationFailed(f"{arguments[0]} failed for {target.name}: {lines[0] if lines else 'no message'}")
+
+
+def _compiler(target: Platform) -> list[str]:
+    """Return the command that compiles for `target`; the system's compiler knows this machine only."""
+    if target == this_platform():
+        named = os.environ.get("CC")
+        for command in [named] if named else COMPILERS:
+            path = shutil.which(command)
+            if path is not None:
+                return [path]
+    if importlib.util.find_spec("ziglang") is not None:
+        return [sys.executable, "-m", "ziglang", "cc", "-target", target.zig_target]
+    wanted = "no C compiler was found" if target == this_platform() else "only zig compiles for another machine"
+    raise CompilerMissing(
+        f"{target.name}: {wanted}; install gcc or clang (for this machine), or zig with pip install 'servobench[zig]'"
+    )

@@ -1,0 +1,219 @@
+"""Exports the UR5 with mismatched kinematics as an FMU: sources, libraries, description, documentation, reference run.
+
+Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import os
+import string
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from fmus.compile import Platform, compile_library, this_platform
+from fmus.generate import kinematics_source, layout_header
+from fmus.model_description import Description, write_build_description, write_fmi2, write_fmi3
+from fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
+from fmus.variables import Actuation, Layout, arm_groups, parameters_of
+from plant.hand_eye import HandEyeModel
+from plant.signals import as_vector
+from plant.ur5 import HOME, nominal_ur5
+
+IDENTIFIER = "ur5_mismatched"
+HEADERS = {
+    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
+OWN_HEADERS = ("instance.h", "kinematics.h", "model.h")
+LAYERS = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_absent.c")}
+MODEL_SOURCES = ("model.c", "instance.c", "kinematics.c")
+EARLIEST_DATE = (1980, 1, 1, 0, 0, 0)  # that a zip can hold
+
+
+def default_actuation() -> Actuation:
+    """Return lag and limits as the kinematic plant has them by default, and a home above the workspace."""
+    return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=as_vector("home", HOME, len(HOME)))
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """What to export.
+
+    Attributes:
+        fmi_version: 2 (co-simulation and model exchange) or 3 (co-simulation).
+        model: arm and camera whose numbers become the start values.
+        actuation: lag, limits and home that become start values.
+        platforms: for which to compile.
+        mismatch: how the model differs from the nominal one, in words, for the documentation.
+    """
+
+    fmi_version: int = 2
+    model: HandEyeModel = field(default_factory=nominal_ur5)
+    actuation: Actuation = field(default_factory=default_actuation)
+    platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))
+    mismatch: str = "none"
+
+    def __post_init__(self) -> None:
+        """Check version and platforms."""
+        if self.fmi_version not in LAYERS:
+            raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
+        if not self.platforms:
+            raise ValueError("platforms must name at least one platform, got none")
+
+
+def export_fmu(path: Path, options: ExportOptions) -> Path:
+    """Write the FMU to `path`, whole or not at all.
+
+    Args:
+        path: the .fmu file; its folder must exist.
+        options: what to export.
+
+    Returns:
+        The path.
+
+    Raises:
+        ValueError: the folder does not exist.
+        CompilerMissing: no compiler for one of the platforms.
+        CompilationFailed: a compiler refused the sources.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"the folder {path.parent} for the FMU does not exist")
+    texts = source_files(options) | _companion_files(options)
+    contents = {name: text.encode() for name, text in texts.items()}
+    token = _token(contents)
+    layout_name = "sources/layout.h"
+    contents[layout_name] = contents[layout_name].replace(_PLACEHOLDER.encode(), token.encode())
+    description = _description(options)
+    write = write_fmi2 if options.fmi_version == 2 else write_fmi3
+    contents["modelDescription.xml"] = write(description, token)
+    if options.fmi_version == 3:
+        contents["sources/buildDescription.xml"] = write_build_description(description)
+    with tempfile.TemporaryDirectory(prefix="servobench-export-") as folder:
+        _compile(Path(folder), contents, options)
+        _write_archive(path, contents)
+    return path
+
+
+def source_files(options: ExportOptions) -> dict[str, str]:
+    """Return the C files of the FMU by their place in the archive; the token in them is still a placeholder."""
+    layout, start = arm_layout(options.model.arm.n), parameters_of(options.model, options.actuation)
+    own = (*OWN_HEADERS, *LAYERS[options.fmi_version], *(name for name in MODEL_SOURCES if name != "kinematics.c"))
+    texts = {name: _own_file(name) for name in own} | {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
+    texts["kinematics.c"] = _kinematics(layout)
+    texts["layout.h"] = layout_header(layout, start, IDENTIFIER, _PLACEHOLDER)
+    return {f"sources/{name}": text for name, text in texts.items()}
+
+
+def _companion_files(options: ExportOptions) -> dict[str, str]:
+    """Return documentation, licence and reference run by their place in the archive."""
+    layout = arm_layout(options.model.arm.n)
+    run = reference_run(options.model, options.actuation)
+    return {
+        INPUT_FILE: input_csv(run, layout),
+        OUTPUT_FILE: output_csv(run, layout),
+        "documentation/index.html": _documentation(layout, options),
+        "documentation/licenses/license.txt": _own_file("license.txt"),
+    }
+
+
+@cache
+def arm_layout(n: int) -> Layout:
+    """Return the layout of an arm with `n` joints."""
+    return Layout(arm_groups(n))
+
+
+_PLACEHOLDER = "{token}"
+
+
+@cache
+def _kinematics(layout: Layout) -> str:
+    return kinematics_source(layout)
+
+
+def _own_file(name: str) -> str:
+    return (files("fmus") / IDENTIFIER / name).read_text(encoding="utf-8")
+
+
+def _fmi_header(name: str) -> str:
+    return (files("fmpy") / "c-code" / name).read_text(encoding="utf-8")
+
+
+def _description(options: ExportOptions) -> Description:
+    return Description(
+        model_name="UR5 with mismatched kinematics",
+        model_identifier=IDENTIFIER,
+        summary=_SUMMARY,
+        layout=arm_layout(options.model.arm.n),
+        start=parameters_of(options.model, options.actuation),
+        sources=(*LAYERS[options.fmi_version], *MODEL_SOURCES),
+        tool=f"servobench {version('servobench')}",
+    )
+
+
+_SUMMARY = (
+    "A UR5 with a ball on its flange under a fixed camera; every length, angle and offset is a tunable parameter."
+)
+
+
+def _token(contents: Mapping[str, bytes]) -> str:
+    """Return a GUID that changes with anything in the FMU but its libraries."""
+    digest = hashlib.sha256()
+    for name in sorted(contents):
+        digest.update(name.encode() + b"\0" + contents[name] + b"\0")
+    text = digest.hexdigest()
+    return "{" + "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:32])) + "}"
+
+
+def _documentation(layout: Layout, options: ExportOptions) -> str:
+    template = _own_file("documentation.html")
+    rows = [
+        f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
+        f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
+        for group in layout.groups
+    ]
+    return string.Template(template).substitute(
+        title="UR5 with mismatched kinematics",
+        summary=_SUMMARY,
+        joints=options.model.arm.n,
+        mismatch="the nominal model"
+        if options.mismatch == "none"
+        else f"the mismatch “{html.escape(options.mismatch)}”",
+        rows="\n".join(rows),
+    )
+
+
+def _compile(folder: Path, contents: dict[str, bytes], options: ExportOptions) -> None:
+    for name, content in contents.items():
+        if name.startswith("sources/"):
+            file = folder / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+    for target in options.platforms:
+        library = folder / "library" / target.name / f"{IDENTIFIER}{target.suffix}"
+        compile_library(folder / "sources", (*LAYERS[options.fmi_version], *MODEL_SOURCES), target, library)
+        contents[f"binaries/{target.folder(options.fmi_version)}/{library.name}"] = library.read_bytes()
+
+
+def _write_archive(path: Path, contents: Mapping[str, bytes]) -> None:
+    handle, name = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
+            for inside in sorted(contents, key=lambda name: (name != "modelDescription.xml", name)):
+                entry = zipfile.ZipInfo(inside, EARLIEST_DATE)
+                entry.compress_type, entry.create_system = zipfile.ZIP_DEFLATED, 3
+                entry.external_attr = 0o644 << 16
+                archive.writestr(entry, contents[inside], compresslevel=9)
+        Path(name).chmod(0o644)
+        Path(name).replace(path)
+    finally:
+        Path(name).unlink(missing_ok=True)

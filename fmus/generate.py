@@ -1,0 +1,135 @@
+"""Generates the C that depends on the arm: its kinematics, from the project's symbolic model, and the layout header.
+
+The kinematic core holds three functions, each in CasADi's calling convention and without anything but libm:
+
+    arm_ball      q, p -> y                    ball in the camera frame
+    arm_jacobian  q, p -> J                    row-major, 3 × n
+    arm_forward   q, p, q̇, ṗ -> ẏ, J̇          forward derivatives along (q̇, ṗ)
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+
+from fmus.variables import INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
+from plant.signals import FloatArray
+from plant.symbolic import SX, HandEyeGeometry, feature_and_jacobian
+
+# Generated functions leave parts of their calling convention unused, and none of them is an entry point of the library.
+KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */
+#ifdef __GNUC__
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+#define CASADI_SYMBOL_EXPORT
+#include "kinematics.h"
+"""
+
+
+def kinematics_source(layout: Layout) -> str:
+    """Return the C source of the kinematic core for the arm that `layout` describes."""
+    functions = _core_functions(layout)
+    generator = casadi.CodeGenerator("kinematics.c", {"with_header": False, "casadi_int": "int"})
+    for function in functions:
+        generator.add(function)
+    with tempfile.TemporaryDirectory() as folder:
+        generator.generate(f"{folder}/")
+        generated = (Path(folder) / "kinematics.c").read_text(encoding="utf-8")
+    return KINEMATICS_HEAD + generated
+
+
+def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: str, token: str) -> str:
+    """Return the C header with sizes, offsets, start values and minima.
+
+    Args:
+        layout: groups of the model.
+        start: start values of parameters, flat arrays by group.
+        model_name: for log messages.
+        token: what `fmi2Instantiate` and `fmi3Instantiate…` must be given.
+    """
+    lines = [
+        "/* Generated from the table of variables; not meant to be edited. */",
+        "#ifndef LAYOUT_H",
+        "#define LAYOUT_H",
+    ]
+    work = max(function.sz_w() for function in _core_functions(layout))
+    lines += [f'#define MODEL_NAME "{model_name}"', f'#define TOKEN "{token}"']
+    lines += [f"#define N_JOINTS {_size(layout, 'joint_position')}", f"#define N_GROUPS {len(layout.groups)}"]
+    lines += [f"#define N_KINEMATIC {kinematic_size(layout)}", f"#define N_WORK {max(work, 1)}"]
+    lines += [f"#define N_VALUES {layout.size}", f"#define N_SETTABLE {layout.offsets['der(joint_position)']}"]
+    for group in layout.groups:
+        lines.append(f"#define OFFSET_{_macro(group.name)} {layout.offsets[group.name]}")
+    sizes = ", ".join(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups)
+    zero = np.zeros(1)
+    values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
+    settable = layout.of_role(PARAMETER, INPUT, STATE)
+    minima = [bound for group in settable for bound in [_bound(group.minimum)] * group.size]
+    lines += [f"#define GROUPS {{{sizes}}}"]
+    lines += [_initialiser("START_VALUES", [float(value).hex() for value in values])]
+    lines += [_initialiser("MINIMA", minima), "#endif", ""]
+    return "\n".join(lines)
+
+
+def kinematic_size(layout: Layout) -> int:
+    """Return how many numbers the kinematic parameters hold."""
+    return sum(group.size for group in layout.groups[:KINEMATIC_PARAMETERS])
+
+
+def _core_functions(layout: Layout) -> list[Any]:
+    n = _size(layout, "joint_position")
+    q, p = casadi.SX.sym("q", n), casadi.SX.sym("p", kinematic_size(layout))
+    dq, dp = casadi.SX.sym("dq", n), casadi.SX.sym("dp", kinematic_size(layout))
+    feature, jacobian = feature_and_jacobian(q, _geometry(layout, p))
+    row_major = casadi.vec(jacobian.T)
+    along = casadi.jtimes(casadi.vertcat(feature, row_major), casadi.vertcat(q, p), casadi.vertcat(dq, dp))
+    return [
+        casadi.Function("arm_ball", [q, p], [feature], {"cse": True}),
+        casadi.Function("arm_jacobian", [q, p], [row_major], {"cse": True}),
+        casadi.Function("arm_forward", [q, p, dq, dp], [along], {"cse": True}),
+    ]
+
+
+def _geometry(layout: Layout, p: SX) -> HandEyeGeometry:
+    part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.groups[:KINEMATIC_PARAMETERS]}
+    columns = casadi.horzcat(part["a"], part["y"], part["d"])
+    angles = casadi.horzcat(part["alpha"], part["pitch"], part["yaw"])
+    return HandEyeGeometry(
+        translation=casadi.vertcat(part["base_position"].T, columns),
+        rpy=casadi.vertcat(part["base_rpy"].T, angles),
+        joint_offset=part["joint_offset"],
+        gear_ratio=part["gear_ratio"],
+        tool=part["tool"],
+        R_BC=_rotation(part["camera_rpy"]),
+        p_BC=part["camera_position"],
+    )
+
+
+def _rotation(rpy: SX) -> SX:
+    """Rz(yaw) Ry(pitch) Rx(roll), as `plant.kinematics.rotation_from_rpy`."""
+    (cr, cp, cy), (sr, sp, sy) = (casadi.vertsplit(f(rpy)) for f in (casadi.cos, casadi.sin))
+    return casadi.vertcat(
+        casadi.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        casadi.horzcat(sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        casadi.horzcat(-sp, cp * sr, cp * cr),
+    )
+
+
+def _size(layout: Layout, name: str) -> int:
+    return next(group.size for group in layout.groups if group.name == name)
+
+
+def _macro(name: str) -> str:
+    return name.upper().replace("DER(", "DER_").replace(")", "")
+
+
+def _bound(minimum: float | None) -> str:
+    return "-HUGE_VAL" if minimum is None else float(minimum).hex()
+
+
+def _initialiser(name: str, values: list[str]) -> str:
+    return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"

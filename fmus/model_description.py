@@ -1,0 +1,270 @@
+"""Writes modelDescription.xml for FMI 2.0 (co-simulation and model exchange) and FMI 3.0 (co-simulation).
+
+Dependencies are explicit. No date and no machine enters, so that equal models give equal bytes.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from fmus.variables import (
+    DERIVATIVE,
+    INPUT,
+    KINEMATIC_PARAMETERS,
+    OUTPUT,
+    PARAMETER,
+    STATE,
+    Group,
+    Layout,
+)
+from plant.signals import FloatArray
+
+UNITS: dict[str, dict[str, str]] = {
+    "1": {},
+    "m": {"m": "1"},
+    "rad": {"rad": "1"},
+    "s": {"s": "1"},
+    "rad/s": {"rad": "1", "s": "-1"},
+    "rad/s2": {"rad": "1", "s": "-2"},
+    "m/rad": {"m": "1", "rad": "-1"},
+}
+ATTRIBUTES = {
+    PARAMETER: {"causality": "parameter", "variability": "tunable", "initial": "exact"},
+    INPUT: {"causality": "input", "variability": "continuous"},
+    STATE: {"causality": "output", "variability": "continuous", "initial": "calculated"},
+    DERIVATIVE: {"causality": "local", "variability": "continuous", "initial": "calculated"},
+    OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
+}
+LOG_CATEGORIES = {"logStatusError": "What went wrong.", "logStatusWarning": "What was refused."}
+DEFAULT_EXPERIMENT = {"startTime": "0", "stopTime": "10", "stepSize": "0.05"}
+
+
+@dataclass(frozen=True)
+class Description:
+    """What goes into a model description.
+
+    Attributes:
+        model_name: for people.
+        model_identifier: file name of the libraries.
+        summary: one sentence.
+        layout: the variables.
+        start: start values of parameters, flat arrays by group.
+        sources: C files that have to be compiled, in order.
+        tool: name and version of the exporter.
+    """
+
+    model_name: str
+    model_identifier: str
+    summary: str
+    layout: Layout
+    start: Mapping[str, FloatArray]
+    sources: tuple[str, ...]
+    tool: str
+
+
+def write_fmi2(description: Description, token: str) -> bytes:
+    """Return modelDescription.xml of FMI 2.0 with the GUID `token`."""
+    root = ET.Element("fmiModelDescription", fmiVersion="2.0", modelName=description.model_name, guid=token)
+    _describe(root, description)
+    root.attrib["numberOfEventIndicators"] = "0"
+    capabilities = {
+        "modelIdentifier": description.model_identifier,
+        "canNotUseMemoryManagementFunctions": "true",
+        "canGetAndSetFMUstate": "true",
+        "canSerializeFMUstate": "true",
+        "providesDirectionalDerivative": "true",
+    }
+    for interface, more in (
+        ("ModelExchange", {}),
+        ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
+    ):
+        files = ET.SubElement(ET.SubElement(root, interface, {**capabilities, **more}), "SourceFiles")
+        for name in description.sources:
+            ET.SubElement(files, "File", name=name)
+    _units(root)
+    _log_categories(root)
+    ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
+    _scalar_variables(ET.SubElement(root, "ModelVariables"), description)
+    structure = ET.SubElement(root, "ModelStructure")
+    for section in _Structure(description.layout).sections():
+        element = ET.SubElement(structure, section.fmi2)
+        for index, dependencies in section.scalars():
+            attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
+            ET.SubElement(element, "Unknown", attributes)
+    return _bytes(root)
+
+
+def write_fmi3(description: Description, token: str) -> bytes:
+    """Return modelDescription.xml of FMI 3.0 with the instantiation token `token`."""
+    root = ET.Element("fmiModelDescription", fmiVersion="3.0", modelName=description.model_name)
+    root.attrib["instantiationToken"] = token
+    _describe(root, description)
+    ET.SubElement(
+        root,
+        "CoSimulation",
+        modelIdentifier=description.model_identifier,
+        canGetAndSetFMUState="true",
+        canSerializeFMUState="true",
+        providesDirectionalDerivatives="true",
+        canHandleVariableCommunicationStepSize="true",
+    )
+    _units(root)
+    _log_categories(root)
+    ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
+    _array_variables(ET.SubElement(root, "ModelVariables"), description)
+    structure = ET.SubElement(root, "ModelStructure")
+    for section in _Structure(description.layout).sections():
+        for reference, dependencies in section.arrays():
+            ET.SubElement(structure, section.fmi3, {"valueReference": str(reference)} | _dependent(dependencies))
+    return _bytes(root)
+
+
+def write_build_description(description: Description) -> bytes:
+    """Return sources/buildDescription.xml of FMI 3.0."""
+    root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
+    configuration = ET.SubElement(root, "BuildConfiguration", modelIdentifier=description.model_identifier)
+    files = ET.SubElement(configuration, "SourceFileSet", language="C11")
+    for name in description.sources:
+        ET.SubElement(files, "SourceFile", name=name)
+    return _bytes(root)
+
+
+_Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]  # unknown, what it depends on, elementwise or as a whole
+
+
+@dataclass(frozen=True)
+class _Section:
+    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole."""
+
+    fmi2: str
+    fmi3: str
+    layout: Layout
+    unknowns: tuple[tuple[Group, tuple[str, ...], bool], ...]
+
+    def scalars(self) -> Iterable[tuple[int, list[int]]]:
+        """Yield index and dependencies of every number; FMI 2 wants them in ascending order."""
+        sizes = {group.name: group.size for group in self.layout.groups}
+        for group, names, elementwise in self.unknowns:
+            for k in range(group.size):
+                dependencies: list[int] = []
+                for name in names:
+                    first = self.layout.offsets[name]
+                    dependencies += [first + k] if elementwise else range(first, first + sizes[name])
+                yield self.layout.offsets[group.name] + k, sorted(dependencies)
+
+    def arrays(self) -> Iterable[tuple[int, list[int]]]:
+        """Yield value reference and dependencies of every group."""
+        for group, names, _ in self.unknowns:
+            yield self.layout.offsets[group.name], sorted(self.layout.offsets[name] for name in names)
+
+
+class _Structure:
+    """Outputs, derivatives and initial unknowns of the arm with what they depend on."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._group = {group.name: group for group in layout.groups}
+        self._geometry = tuple(group.name for group in layout.groups[:KINEMATIC_PARAMETERS])
+
+    def sections(self) -> tuple[_Section, ...]:
+        state = ("joint_position", "joint_velocity")
+        outputs: _Rows = [(name, (name,), True) for name in state]
+        outputs += [(name, ("joint_position",), False) for name in ("ball_position", "jacobian")]
+        derivatives: _Rows = [
+            ("der(joint_position)", state, True),
+            ("der(joint_velocity)", (*state, "joint_velocity_command"), True),
+        ]
+        start: _Rows = [
+            ("joint_position", ("home",), True),
+            ("joint_velocity", (), True),
+            ("der(joint_position)", (), True),
+            ("der(joint_velocity)", ("lag", "max_speed", "joint_velocity_command"), True),
+            ("ball_position", (*self._geometry, "home"), False),
+            ("jacobian", (*self._geometry, "home"), False),
+        ]
+        return (
+            self._section("Outputs", "Output", outputs),
+            self._section("Derivatives", "ContinuousStateDerivative", derivatives),
+            self._section("InitialUnknowns", "InitialUnknown", start),
+        )
+
+    def _section(self, fmi2: str, fmi3: str, rows: _Rows) -> _Section:
+        unknowns = tuple((self._group[name], names, elementwise) for name, names, elementwise in rows)
+        return _Section(fmi2, fmi3, self._layout, unknowns)
+
+
+def _describe(root: ET.Element, description: Description) -> None:
+    root.attrib["description"] = description.summary
+    root.attrib["generationTool"] = description.tool
+    root.attrib["license"] = "BSD-3-Clause"
+    root.attrib["variableNamingConvention"] = "structured"
+
+
+def _units(root: ET.Element) -> None:
+    definitions = ET.SubElement(root, "UnitDefinitions")
+    for name, exponents in UNITS.items():
+        ET.SubElement(ET.SubElement(definitions, "Unit", name=name), "BaseUnit", exponents)
+
+
+def _log_categories(root: ET.Element) -> None:
+    categories = ET.SubElement(root, "LogCategories")
+    for name, text in LOG_CATEGORIES.items():
+        ET.SubElement(categories, "Category", name=name, description=text)
+
+
+def _scalar_variables(variables: ET.Element, description: Description) -> None:
+    layout = description.layout
+    for group in layout.groups:
+        for k, name in enumerate(group.scalar_names()):
+            reference = layout.offsets[group.name] + k
+            variable = ET.SubElement(variables, "ScalarVariable", name=name, valueReference=str(reference))
+            variable.attrib.update(ATTRIBUTES[group.role] | {"description": group.description})
+            real = ET.SubElement(variable, "Real", _real(group))
+            if group.role in (PARAMETER, INPUT):
+                real.attrib["start"] = _starts(description, group)[k]
+            if group.role == DERIVATIVE:
+                real.attrib["derivative"] = str(layout.offsets[_state_of(group)] + k + 1)
+
+
+def _array_variables(variables: ET.Element, description: Description) -> None:
+    layout = description.layout
+    time = {"causality": "independent", "variability": "continuous", "unit": "s", "description": "Simulation time."}
+    for group in layout.groups:
+        variable = ET.SubElement(variables, "Float64", name=group.name, valueReference=str(layout.offsets[group.name]))
+        variable.attrib.update(ATTRIBUTES[group.role] | {"description": group.description} | _real(group))
+        if group.role in (PARAMETER, INPUT):
+            variable.attrib["start"] = " ".join(_starts(description, group))
+        if group.role == DERIVATIVE:
+            variable.attrib["derivative"] = str(layout.offsets[_state_of(group)])
+        for size in group.shape:
+            ET.SubElement(variable, "Dimension", start=str(size))
+    ET.SubElement(variables, "Float64", {"name": "time", "valueReference": str(layout.size)} | time)
+
+
+def _state_of(group: Group) -> str:
+    return group.name.removeprefix("der(").removesuffix(")")
+
+
+def _real(group: Group) -> dict[str, str]:
+    return {"unit": group.unit} | ({} if group.minimum is None else {"min": repr(group.minimum)})
+
+
+def _starts(description: Description, group: Group) -> list[str]:
+    values = description.start.get(group.name)
+    return ["0.0"] * group.size if values is None else [repr(float(value)) for value in values]
+
+
+def _dependent(dependencies: list[int]) -> dict[str, str]:
+    return {
+        "dependencies": " ".join(map(str, dependencies)),
+        "dependenciesKind": " ".join(["dependent"] * len(dependencies)),
+    }
+
+
+def _bytes(root: ET.Element) -> bytes:
+    ET.indent(root)
+    text: str = ET.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()

@@ -1,0 +1,88 @@
+"""The reference run that every exported FMU brings: random commands and what numpy, not the FMU, makes of them."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fmus.variables import Actuation, Layout
+from plant.hand_eye import HandEyeModel
+from plant.kinematic import discretise_lag
+from plant.seeds import named_generator
+from plant.signals import FloatArray
+
+STEP = 0.05  # s
+STEPS = 200
+INPUT_FILE = "extra/servobench/reference_input.csv"
+OUTPUT_FILE = "extra/servobench/reference_output.csv"
+COMMAND = "joint_velocity_command"
+OUTPUTS = ("joint_position", "joint_velocity", "ball_position")
+
+
+@dataclass(frozen=True)
+class ReferenceRun:
+    """Commands, each held over the step that begins at its time, and the outputs at those times.
+
+    Attributes:
+        time: (k,), s.
+        command: (k, n), rad/s.
+        outputs: by name, (k, size).
+    """
+
+    time: FloatArray
+    command: FloatArray
+    outputs: dict[str, FloatArray]
+
+
+def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
+    """Return the reference run of `model`, by numpy; some of the commands lie beyond the speed limit."""
+    n = model.arm.n
+    limit, reach = actuation.max_speed, actuation.joint_range
+    wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, n))
+    A, B = discretise_lag(actuation.lag, STEP)
+    positions, velocities = np.empty((STEPS + 1, n)), np.empty((STEPS + 1, n))
+    q, v = np.array(actuation.home, dtype=np.float64), np.zeros(n)
+    for k in range(STEPS + 1):
+        positions[k], velocities[k] = q, v
+        u = np.clip(wanted[k], -limit, limit)
+        free = q + A[0, 1] * v + B[0] * u
+        q = np.clip(free, -reach, reach)
+        v = np.where(q == free, A[1, 1] * v + B[1] * u, 0.0)
+    outputs = {"joint_position": positions, "joint_velocity": velocities, "ball_position": model.feature(positions)}
+    return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, wanted, outputs)
+
+
+def input_csv(run: ReferenceRun, layout: Layout) -> str:
+    """Return the commands as CSV, a column a scalar."""
+    return _table(run.time, {COMMAND: run.command}, layout)
+
+
+def output_csv(run: ReferenceRun, layout: Layout) -> str:
+    """Return the outputs as CSV, a column a scalar."""
+    return _table(run.time, run.outputs, layout)
+
+
+def read_table(text: str) -> tuple[list[str], FloatArray]:
+    """Return the header and the numbers of a CSV table.
+
+    Raises:
+        ValueError: not such a table.
+    """
+    rows = list(csv.reader(io.StringIO(text)))
+    if len(rows) < 2:
+        raise ValueError("a reference table needs a header and at least one row")
+    return rows[0], np.array([[float(cell) for cell in row] for row in rows[1:]])
+
+
+def _table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -> str:
+    groups = {group.name: group for group in layout.groups}
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["time", *(scalar for name in columns for scalar in groups[name].scalar_names())])
+    for row in np.column_stack([time, *columns.values()]):
+        writer.writerow([repr(float(value)) for value in row])
+    return text.getvalue()

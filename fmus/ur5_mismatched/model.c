@@ -1,0 +1,186 @@
+#include "model.h"
+#include "kinematics.h"
+
+#include <math.h>
+#include <string.h>
+
+/* In continuous time a lag of zero would make the equations algebraic; below this it counts as this. */
+#define SMALLEST_LAG 1e-6
+
+enum { STALE_BALL = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
+
+static const double start_values[N_VALUES] = START_VALUES;
+static const double minima[N_SETTABLE] = MINIMA;
+
+static double clip(double value, double lower, double upper)
+{
+    return value < lower ? lower : value > upper ? upper : value;
+}
+
+static double clipped_command(const Model *model, size_t i)
+{
+    const double limit = model->values[OFFSET_MAX_SPEED + i];
+    return clip(model->values[OFFSET_JOINT_VELOCITY_COMMAND + i], -limit, limit);
+}
+
+static double continuous_lag(const Model *model, size_t i)
+{
+    return fmax(model->values[OFFSET_LAG + i], SMALLEST_LAG);
+}
+
+/* A joint at its stop that is driven further into it. */
+static int is_blocked(const Model *model, size_t i)
+{
+    const double q = model->values[OFFSET_JOINT_POSITION + i], v = model->values[OFFSET_JOINT_VELOCITY + i];
+    return (q >= model->values[OFFSET_JOINT_UPPER + i] && v > 0.0) ||
+           (q <= model->values[OFFSET_JOINT_LOWER + i] && v < 0.0);
+}
+
+void model_reset(Model *model)
+{
+    memset(model, 0, sizeof *model);
+    memcpy(model->values, start_values, sizeof start_values);
+    model->gain_step = -1.0;
+    model_start(model);
+}
+
+void model_start(Model *model)
+{
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        model->values[OFFSET_JOINT_POSITION + i] = model->values[OFFSET_HOME + i];
+        model->values[OFFSET_JOINT_VELOCITY + i] = 0.0;
+    }
+    model->stale = STALE_ALL;
+}
+
+int model_has_empty_range(const Model *model)
+{
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        if (!(model->values[OFFSET_JOINT_LOWER + i] < model->values[OFFSET_JOINT_UPPER + i])) return 1;
+    }
+    return 0;
+}
+
+ModelStatus model_set(Model *model, size_t index, double value)
+{
+    if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
+    if (index >= N_SETTABLE) return MODEL_NOT_SETTABLE;
+    if (!isfinite(value) || value < minima[index]) return MODEL_BAD_VALUE;
+    model->values[index] = value;
+    if (index >= OFFSET_JOINT_VELOCITY_COMMAND && index < OFFSET_JOINT_POSITION) {
+        model->stale |= STALE_DERIVATIVES;
+    } else {
+        model->stale = STALE_ALL;
+    }
+    if (index < OFFSET_JOINT_VELOCITY_COMMAND) model->gain_step = -1.0;
+    return MODEL_OK;
+}
+
+static void refresh_kinematics(Model *model, int part)
+{
+    double work[N_WORK];
+    const double *arguments[2] = {model->values + OFFSET_JOINT_POSITION, model->values};
+    if (part == STALE_BALL) {
+        double *results[1] = {model->values + OFFSET_BALL_POSITION};
+        arm_ball(arguments, results, NULL, work, 0);
+    } else {
+        double *results[1] = {model->values + OFFSET_JACOBIAN};
+        arm_jacobian(arguments, results, NULL, work, 0);
+    }
+    model->stale &= ~part;
+}
+
+static void refresh_derivatives(Model *model)
+{
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        const double v = model->values[OFFSET_JOINT_VELOCITY + i];
+        const double u = clipped_command(model, i);
+        const int blocked = is_blocked(model, i);
+        const double towards = blocked && u * v > 0.0 ? 0.0 : u;
+        model->values[OFFSET_DER_JOINT_POSITION + i] = blocked ? 0.0 : v;
+        model->values[OFFSET_DER_JOINT_VELOCITY + i] = (towards - v) / continuous_lag(model, i);
+    }
+    model->stale &= ~STALE_DERIVATIVES;
+}
+
+ModelStatus model_get(Model *model, size_t index, double *value)
+{
+    if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
+    if (model->stale != 0 && index >= OFFSET_DER_JOINT_POSITION) {
+        if (index >= OFFSET_JACOBIAN) {
+            if (model->stale & STALE_JACOBIAN) refresh_kinematics(model, STALE_JACOBIAN);
+        } else if (index >= OFFSET_BALL_POSITION) {
+            if (model->stale & STALE_BALL) refresh_kinematics(model, STALE_BALL);
+        } else if (model->stale & STALE_DERIVATIVES) {
+            refresh_derivatives(model);
+        }
+    }
+    *value = model->values[index];
+    return MODEL_OK;
+}
+
+void model_set_states(Model *model, const double *states)
+{
+    memcpy(model->values + OFFSET_JOINT_POSITION, states, 2 * N_JOINTS * sizeof(double));
+    model->stale = STALE_ALL;
+}
+
+/* Zero-order hold of dq/dt = v, dv/dt = (u - v) / lag; expm1 keeps the digits of a step that is short beside the lag. */
+static void refresh_gains(Model *model, double step)
+{
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        const double lag = model->values[OFFSET_LAG + i];
+        const double gone = lag > 0.0 ? -expm1(-step / lag) : 1.0;
+        model->drift[i] = lag > 0.0 ? lag * gone : 0.0;
+        model->push[i] = step - model->drift[i];
+        model->decay[i] = 1.0 - gone;
+    }
+    model->gain_step = step;
+}
+
+int model_step(Model *model, double step)
+{
+    double *position = model->values + OFFSET_JOINT_POSITION, *velocity = model->values + OFFSET_JOINT_VELOCITY;
+    if (step != model->gain_step) refresh_gains(model, step);
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        const double u = clipped_command(model, i), v = velocity[i];
+        const double q = position[i] + model->drift[i] * v + model->push[i] * u;
+        if (!isfinite(q)) return 1;
+        position[i] = clip(q, model->values[OFFSET_JOINT_LOWER + i], model->values[OFFSET_JOINT_UPPER + i]);
+        velocity[i] = position[i] == q ? model->decay[i] * v + (1.0 - model->decay[i]) * u : 0.0;
+    }
+    model->stale = STALE_ALL;
+    return 0;
+}
+
+static double derive_acceleration(const Model *model, const double *direction, size_t i, int blocked)
+{
+    const double lag = continuous_lag(model, i), limit = model->values[OFFSET_MAX_SPEED + i];
+    const double v = model->values[OFFSET_JOINT_VELOCITY + i], command = model->values[OFFSET_JOINT_VELOCITY_COMMAND + i];
+    double u = command, du = direction[OFFSET_JOINT_VELOCITY_COMMAND + i];
+    if (fabs(command) > limit) {
+        u = command > 0.0 ? limit : -limit;
+        du = command > 0.0 ? direction[OFFSET_MAX_SPEED + i] : -direction[OFFSET_MAX_SPEED + i];
+    }
+    if (blocked && u * v > 0.0) u = du = 0.0;
+    const double dlag = model->values[OFFSET_LAG + i] > SMALLEST_LAG ? direction[OFFSET_LAG + i] : 0.0;
+    return (du - direction[OFFSET_JOINT_VELOCITY + i]) / lag - (u - v) / (lag * lag) * dlag;
+}
+
+void model_derive(const Model *model, double direction[N_VALUES], int starting)
+{
+    if (starting) {
+        memcpy(direction + OFFSET_JOINT_POSITION, direction + OFFSET_HOME, N_JOINTS * sizeof(double));
+        memset(direction + OFFSET_JOINT_VELOCITY, 0, N_JOINTS * sizeof(double));
+    }
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        const int blocked = is_blocked(model, i);
+        direction[OFFSET_DER_JOINT_POSITION + i] = blocked ? 0.0 : direction[OFFSET_JOINT_VELOCITY + i];
+        direction[OFFSET_DER_JOINT_VELOCITY + i] = derive_acceleration(model, direction, i, blocked);
+    }
+    double work[N_WORK];
+    const double *arguments[4] = {model->values + OFFSET_JOINT_POSITION, model->values,
+                                  direction + OFFSET_JOINT_POSITION, direction};
+    double *results[1] = {direction + OFFSET_BALL_POSITION}; /* the Jacobian follows it */
+    arm_forward(arguments, results, NULL, work, 0);
+}

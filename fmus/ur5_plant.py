@@ -1,0 +1,108 @@
+"""The plant `fmu`: the exported UR5, built on first use and kept in the user's cache folder."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import platformdirs
+
+from fmus.compile import this_platform
+from fmus.export import ExportOptions, export_fmu, source_files
+from fmus.variables import Actuation, parameters_of
+from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu_mapping import FmuMapping
+from plant.hand_eye import FEATURE_NAMES
+from plant.plant import PlantEntry, PlantSetup
+from plant.signals import check_number
+
+
+@dataclass(frozen=True)
+class Ur5FmuConfig:
+    """Settings of the exported UR5; the same as those of the kinematic plant."""
+
+    fmi_version: Literal[2, 3] = 2  # of FMI
+    max_joint_speed: float = 1.0  # rad/s, a cautious share of the vendor's limit of π
+    joint_range: float = 2 * np.pi  # rad each way, vendor's range
+    lag: float = 0.05  # s, time constant of the joints' velocity loops; 0 = none
+    command_delay_periods: int = 1  # periods between a command and its first effect
+    feature_noise: float = 0.001  # m, standard deviation an axis
+    latency_periods: int = 0  # periods between exposure and delivery of the feature
+    drop_probability: float = 0.0  # chance that a frame is lost
+
+    def __post_init__(self) -> None:
+        """Check the numbers that no part below checks."""
+        if self.fmi_version not in (2, 3):
+            raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
+        check_number("max_joint_speed", self.max_joint_speed, above=0.0)
+        check_number("joint_range", self.joint_range, above=0.0)
+        check_number("lag", self.lag, at_least=0.0)
+        self.around()
+
+    def around(self) -> FmuConfig:
+        """Return the settings of what lies around the FMU."""
+        return FmuConfig(self.command_delay_periods, self.feature_noise, self.latency_periods, self.drop_probability)
+
+
+@cache
+def cached_fmu(fmi_version: int) -> Path:
+    """Return the nominal UR5 as FMU, from the user's cache folder; it is built there if anything in it has changed.
+
+    Raises:
+        CompilerMissing: it has to be built and there is no compiler.
+    """
+    options = ExportOptions(fmi_version)
+    digest = hashlib.sha256(this_platform().name.encode())
+    for name, text in sorted(source_files(options).items()):
+        digest.update(f"{name}\0{text}\0".encode())
+    folder = Path(platformdirs.user_cache_dir("servobench")) / "fmus"
+    path = folder / f"ur5_mismatched-fmi{fmi_version}-{digest.hexdigest()[:16]}.fmu"
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        export_fmu(path, options)
+    return path
+
+
+def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
+    """Return the mapping of the exported UR5, with the true model of `setup` as its parameters."""
+    actuation = Actuation(config.lag, config.max_joint_speed, config.joint_range, setup.start)
+    parameters = parameters_of(setup.model, actuation)
+    del parameters["home"]
+    return FmuMapping(
+        path=path,
+        inputs=("joint_velocity_command",),
+        joints=("joint_position",),
+        features=("ball_position",),
+        true_jacobian=("jacobian",),
+        home="home",
+        parameters=parameters,
+        max_joint_speed=config.max_joint_speed,
+        clips_itself=True,
+        joint_lower=-config.joint_range,
+        joint_upper=config.joint_range,
+        joint_names=setup.model.arm.joint_names,
+        feature_names=FEATURE_NAMES,
+    )
+
+
+def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> FmuPlant:
+    """Return the exported UR5 as a plant.
+
+    Raises:
+        ValueError: a setting out of its bounds, or a start of the wrong size.
+        CompilerMissing: the FMU has to be built and there is no compiler.
+    """
+    path = cached_fmu(config.fmi_version)
+    return FmuPlant(config.around(), ur5_mapping(path, config, setup), setup.start, setup.period)
+
+
+ENTRY = PlantEntry(
+    name="fmu",
+    summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
+    config=Ur5FmuConfig,
+    build=build_ur5,
+)

@@ -1,0 +1,86 @@
+"""Checks an FMU: the archive, fmpy's validation of the description, and a run against the reference it brings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from fmpy.validation import validate_fmu as validate_by_fmpy
+
+from fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
+from plant.fmu import open_slave
+from plant.fmu_archive import FmuFolder
+from plant.fmu_slave import FmuError, Port
+from plant.fmu_variables import FmuDescription, Variable, read_description
+from plant.signals import FloatArray
+
+TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What was found.
+
+    Attributes:
+        problems: one line each; none if the FMU is sound.
+        deviation: largest difference from the reference run, or None if there was none to compare with.
+    """
+
+    problems: tuple[str, ...]
+    deviation: float | None
+
+
+def validate_fmu(path: Path) -> Validation:
+    """Check the FMU at `path`.
+
+    Raises:
+        ValueError: it is not a co-simulation FMU of FMI 2 or 3 that could be checked at all.
+    """
+    folder = FmuFolder(path)
+    try:
+        problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
+        description = read_description(path, folder.root)
+        deviation = None
+        if (folder.root / INPUT_FILE).is_file() and (folder.root / OUTPUT_FILE).is_file():
+            try:
+                deviation = _deviation(description, folder)
+            except (FmuError, ValueError) as error:
+                problems.append(f"the reference run failed: {error}")
+        if deviation is not None and not deviation <= TOLERANCE:
+            problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
+        return Validation(tuple(problems), deviation)
+    finally:
+        folder.close()
+
+
+def _deviation(description: FmuDescription, folder: FmuFolder) -> float:
+    """Run the FMU under the reference commands and return the largest difference of its outputs."""
+    header_in, commands = read_table((folder.root / INPUT_FILE).read_text(encoding="utf-8"))
+    header_out, wanted = read_table((folder.root / OUTPUT_FILE).read_text(encoding="utf-8"))
+    inputs, outputs = Port(_variables(description, header_in)), Port(_variables(description, header_out))
+    if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (len(commands), outputs.values.size + 1):
+        raise ValueError("the reference tables do not fit the FMU's variables")
+    slave = open_slave(description, folder)
+    try:
+        write, read = slave.writer(inputs), slave.reader(outputs)
+        times = commands[:, 0]
+        slave.start(float(times[0]))
+        came: FloatArray = np.empty_like(wanted[:, 1:])
+        for k, time in enumerate(times):
+            read()
+            came[k] = outputs.values
+            inputs.values[:] = commands[k, 1:]
+            write()
+            if k + 1 < len(times):
+                slave.stepper(float(times[k + 1] - time))(float(time))
+    finally:
+        slave.close()
+    return float(np.abs(came - wanted[:, 1:]).max())
+
+
+def _variables(description: FmuDescription, header: list[str]) -> list[Variable]:
+    """Return the variables of the columns; where FMI 3 has an array, its columns `name[1]`, … are one variable."""
+    known = {variable.name for variable in description.variables}
+    names = [name if name in known else name.partition("[")[0] for name in header[1:]]
+    return [variable for name in dict.fromkeys(names) for variable in description.find(name, "reference run")]

@@ -1,0 +1,180 @@
+"""The variables of the exported arm: one table from which the description, the C header and the documentation are made.
+
+Every variable is a group of numbers in row-major order. FMI 2 shows each number as a scalar, `lag[3]`; FMI 3 shows the
+group as an array, `lag`. Both use the group's offset in one flat vector of values as value reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from math import prod
+
+import numpy as np
+
+from plant.hand_eye import HandEyeModel
+from plant.kinematics import SerialArm, rotation_from_rpy
+from plant.signals import FloatArray, as_vector
+
+PARAMETER, INPUT, STATE, DERIVATIVE, OUTPUT = "parameter", "input", "state", "derivative", "output"
+
+
+@dataclass(frozen=True)
+class Group:
+    """One variable of the model.
+
+    Attributes:
+        name: as FMI 3 shows it.
+        shape: sizes of its axes.
+        role: parameter, input, state, derivative or output.
+        unit: as in the description; "1" for none.
+        description: one sentence.
+        minimum: smallest admissible value, or None.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    role: str
+    unit: str
+    description: str
+    minimum: float | None = None
+
+    @property
+    def size(self) -> int:
+        """How many numbers it holds."""
+        return prod(self.shape)
+
+    def scalar_names(self) -> Iterator[str]:
+        """Yield the names of its numbers as FMI 2 shows them, in row-major order; indices start at 1."""
+        inner = self.name.removeprefix("der(").removesuffix(")")
+        for index in product(*(range(1, size + 1) for size in self.shape)):
+            scalar = f"{inner}[{','.join(map(str, index))}]"
+            yield f"der({scalar})" if self.role == DERIVATIVE else scalar
+
+
+def arm_groups(n: int) -> tuple[Group, ...]:
+    """Return the groups of an arm with `n` joints, in the order of the flat vector.
+
+    The kinematic parameters come first and in the order in which the generated core takes them.
+    """
+    table = "transform after joint i"
+    return (
+        Group("base_position", (3,), PARAMETER, "m", "Axis of joint 1 in the base frame."),
+        Group("base_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of joint 1 in the base frame."),
+        Group("a", (n,), PARAMETER, "m", f"DH link length: x of the {table}."),
+        Group("y", (n,), PARAMETER, "m", f"Calibration column, 0 in DH: y of the {table}."),
+        Group("d", (n,), PARAMETER, "m", f"DH link offset: z of the {table}."),
+        Group("alpha", (n,), PARAMETER, "rad", f"DH link twist: roll of the {table}."),
+        Group("pitch", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: pitch of the {table}."),
+        Group("yaw", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: yaw of the {table}."),
+        Group("joint_offset", (n,), PARAMETER, "rad", "True joint angle at a reported position of zero."),
+        Group("gear_ratio", (n,), PARAMETER, "1", "True joint motion over reported joint motion."),
+        Group("tool", (3,), PARAMETER, "m", "Ball centre in the flange frame."),
+        Group("camera_position", (3,), PARAMETER, "m", "Camera in the base frame."),
+        Group("camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."),
+        Group("lag", (n,), PARAMETER, "s", "Time constant of the joint's velocity loop; 0 for none.", 0.0),
+        Group("max_speed", (n,), PARAMETER, "rad/s", "Commands beyond it, either way, are clipped.", 0.0),
+        Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
+        Group("joint_upper", (n,), PARAMETER, "rad", "The joint stops here."),
+        Group("home", (n,), PARAMETER, "rad", "Reported joint position at the start; read at initialisation."),
+        Group("joint_velocity_command", (n,), INPUT, "rad/s", "Joint velocity command, held over a step."),
+        Group("joint_position", (n,), STATE, "rad", "Reported joint position."),
+        Group("joint_velocity", (n,), STATE, "rad/s", "Reported joint velocity."),
+        Group("der(joint_position)", (n,), DERIVATIVE, "rad/s", "Derivative of the joint position."),
+        Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
+        Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
+        Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),
+    )
+
+
+KINEMATIC_PARAMETERS = 13  # of the groups above, from the first
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The groups and where each begins in the flat vector of values."""
+
+    groups: tuple[Group, ...]
+
+    @cached_property
+    def offsets(self) -> dict[str, int]:
+        """First index of each group; it is the value reference."""
+        offsets, offset = {}, 0
+        for group in self.groups:
+            offsets[group.name] = offset
+            offset += group.size
+        return offsets
+
+    @property
+    def size(self) -> int:
+        """How many numbers there are in all."""
+        return sum(group.size for group in self.groups)
+
+    def of_role(self, *roles: str) -> list[Group]:
+        """Return the groups of these roles, in order."""
+        return [group for group in self.groups if group.role in roles]
+
+
+@dataclass(frozen=True)
+class Actuation:
+    """Everything of the model that is not geometry.
+
+    Attributes:
+        lag: time constants of the velocity loops, s.
+        max_speed: rad/s.
+        joint_range: rad, each way.
+        home: (n,), rad, reported joint positions at the start.
+    """
+
+    lag: float
+    max_speed: float
+    joint_range: float
+    home: FloatArray
+
+
+def rpy_from_rotation(R: FloatArray) -> FloatArray:
+    """Return roll, pitch, yaw, (3,) rad, of a rotation matrix (3, 3); sound at a pitch of ±90° too.
+
+    The yaw is taken out before pitch and roll are read, so that no angle is read from two vanishing numbers.
+    """
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:
+    """Return the FMU's parameters, flat arrays by group, that describe `model` and `actuation`."""
+    arm, n = model.arm, model.arm.n
+    columns = {"a": 0, "y": 1, "d": 2}
+    angles = {"alpha": 0, "pitch": 1, "yaw": 2}
+    return {
+        "base_position": arm.translation[0],
+        "base_rpy": arm.rpy[0],
+        **{name: arm.translation[1:, column] for name, column in columns.items()},
+        **{name: arm.rpy[1:, column] for name, column in angles.items()},
+        "joint_offset": arm.joint_offset,
+        "gear_ratio": arm.gear_ratio,
+        "tool": arm.tool,
+        "camera_position": model.X_BC[:3, 3],
+        "camera_rpy": rpy_from_rotation(model.X_BC[:3, :3]),
+        "lag": np.full(n, actuation.lag),
+        "max_speed": np.full(n, actuation.max_speed),
+        "joint_lower": np.full(n, -actuation.joint_range),
+        "joint_upper": np.full(n, actuation.joint_range),
+        "home": as_vector("home", actuation.home, n),
+    }
+
+
+def model_of(parameters: Mapping[str, FloatArray], joint_names: tuple[str, ...]) -> HandEyeModel:
+    """Return the arm and camera that the FMU's parameters describe."""
+    p = parameters
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_rpy(p["camera_rpy"]), p["camera_position"]
+    translation = np.vstack([p["base_position"], np.column_stack([p["a"], p["y"], p["d"]])])
+    rpy = np.vstack([p["base_rpy"], np.column_stack([p["alpha"], p["pitch"], p["yaw"]])])
+    arm = SerialArm(joint_names, translation, rpy, p["joint_offset"], p["gear_ratio"], p["tool"])
+    return HandEyeModel(arm, pose)

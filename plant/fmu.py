@@ -1,0 +1,293 @@
+"""Any FMI 2 or FMI 3 co-simulation FMU as a plant.
+
+Which variables are commands, joints and features is told by an `FmuMapping`; names are looked up once, at construction.
+The FMU is stepped with its own period, which divides the control period; commands are held meanwhile. As in the
+kinematic plant, a command may take effect some periods late, and the feature may be noisy, late or lost.
+"""
+
+from __future__ import annotations
+
+import copy
+import ctypes
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+
+from plant.fmu_archive import FmuFolder
+from plant.fmu_mapping import FmuMapping, Names, mapping_spec, read_mapping
+from plant.fmu_slave import Call, FmuError, Port, Slave
+from plant.fmu_slave2 import Slave2
+from plant.fmu_slave3 import Slave3
+from plant.fmu_variables import FmuDescription, read_description
+from plant.plant import Plant, PlantEntry, PlantSetup, whole_steps
+from plant.seeds import named_generator
+from plant.sensing import FeatureChannel
+from plant.signals import Command, FloatArray, Observation, PlantSpec, Truth, as_vector, check_number
+
+
+@dataclass(frozen=True)
+class FmuConfig:
+    """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
+
+    command_delay_periods: int = 1  # periods between a command and its first effect
+    feature_noise: float = 0.001  # in the feature's unit (m), standard deviation an axis
+    latency_periods: int = 0  # periods between exposure and delivery of the feature
+    drop_probability: float = 0.0  # chance that a frame is lost
+
+    def __post_init__(self) -> None:
+        """Check the numbers that no part below checks."""
+        check_number("command_delay_periods", self.command_delay_periods, at_least=0)
+        check_number("feature_noise", self.feature_noise, at_least=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FmuPlantState:
+    """A saved state of an FMU plant: that of the FMU and that of everything around it.
+
+    Attributes:
+        fmu: as bytes, where the FMU can serialise; then any process with the same FMU can restore it. Else a handle of
+            the plant that saved it.
+        rest: step count, delayed commands, feature channel and random generator.
+    """
+
+    fmu: bytes | ctypes.c_void_p
+    rest: tuple[int, deque[FloatArray], FeatureChannel, np.random.Generator, FloatArray]
+
+
+class FmuPlant(Plant):
+    """y, q ← fmi…GetReal after fmi…DoStep under the held, clipped and delayed command; feature = y + noise."""
+
+    def __init__(self, config: FmuConfig, mapping: FmuMapping, start: FloatArray, period: float) -> None:
+        """Extract and load the FMU and look all names up.
+
+        Args:
+            config: delay, noise and latency.
+            mapping: which variables are what.
+            start: (n,), rad, joint positions at time 0; only used by an FMU with a home.
+            period: control period, s.
+
+        Raises:
+            ValueError: an FMU that cannot be used, a name or size that does not fit, or a setting out of its bounds.
+            FmuError: the FMU refused its parameters or its initialisation.
+        """
+        self._config = config
+        self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
+        self._substeps = whole_steps(period, mapping.period or period)
+        self._own_step, self._period = mapping.period or period, period
+        self._delays = config.command_delay_periods > 0
+        self._has_channel = config.latency_periods > 0 or config.drop_probability > 0.0
+        self._states: list[ctypes.c_void_p] = []
+        self._folder = FmuFolder(mapping.path)
+        try:
+            self.description = read_description(mapping.path, self._folder.root)
+            self._spec = mapping_spec(mapping, self.description, period)
+            self._start = as_vector("start", start, self._spec.n)
+            self._slave = open_slave(self.description, self._folder)
+            self._connect(mapping)
+            self._fresh = True
+            self.reset(0)
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self, mapping: FmuMapping) -> None:
+        """Make the ports; the parameters' and the truth's are used outside the loop only."""
+        find, slave = self.description.select, self._slave
+        self._has_joints, self._clips_itself = bool(mapping.joints), mapping.clips_itself
+        self._command = Port(find(mapping.inputs, "inputs"))
+        self._result = Port(find((*mapping.joints, *mapping.features), "joints and features"))
+        self._write, self._read = slave.raw_writer(self._command), slave.raw_reader(self._result)
+        self._advance = slave.stepper(self._own_step)
+        self._split, self._noise_scale = self._result.values.size - self._spec.m, self._config.feature_noise
+        self._lower, self._upper = -self._spec.joint_velocity_limit, self._spec.joint_velocity_limit
+        self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
+        if mapping.home is not None:
+            self._parameters.append(self._parameter(mapping.home, self._start))
+        self._true_feature = self._port(mapping.true_features or mapping.features)
+        self._true_jacobian = self._port(mapping.true_jacobian) if mapping.true_jacobian else None
+
+    def _parameter(self, name: str, values: FloatArray) -> Call:
+        port = Port(self.description.find(name, "parameters"))
+        if np.shape(values) not in ((), port.values.shape):
+            raise ValueError(f"parameter {name!r} must have {port.values.size} values, got {np.size(values)}")
+        port.values[:] = values
+        return self._slave.writer(port)
+
+    def _port(self, names: Names) -> tuple[Port, Call]:
+        port = Port(self.description.select(names, "truth"))
+        return port, self._slave.reader(port)
+
+    @property
+    def spec(self) -> PlantSpec:
+        """Sizes, names, limits and period."""
+        return self._spec
+
+    def reset(self, seed: int) -> Observation:
+        """Return to the start; feature noise and lost frames get streams of their own."""
+        if not self._fresh:
+            self._slave.reset()
+        self._fresh = False
+        for write in self._parameters:
+            write()
+        self._slave.start(0.0)
+        self._k = 0
+        self._noise = named_generator(seed, "feature_noise")
+        self._commands: deque[FloatArray] = deque([np.zeros(self._spec.n)] * self._config.command_delay_periods)
+        self._integrated = self._start
+        joints, feature = self._measure()
+        self._channel.reset(feature, named_generator(seed, "dropped_frames"))
+        return Observation(0.0, joints, feature)
+
+    def step(self, command: Command) -> Observation:
+        """Apply `command` for one period; see `Plant.step`.
+
+        Raises:
+            FmuError: the FMU failed, or a result is not finite.
+        """
+        wanted, buffer = command.joint_velocity, self._command.values
+        if wanted.shape != buffer.shape:
+            raise ValueError(f"joint_velocity must have shape {buffer.shape}, got {wanted.shape}")
+        if self._delays:
+            self._commands.append(wanted)
+            wanted = self._commands.popleft()
+        if self._clips_itself:
+            buffer[:] = wanted
+        else:
+            np.minimum(wanted, self._upper, out=buffer)
+            np.maximum(buffer, self._lower, out=buffer)
+        status = self._write()
+        if status:
+            self._slave.check("writing the command", status)
+        if self._substeps == 1:
+            self._advance(self._k * self._own_step)
+        else:
+            for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
+                self._advance(i * self._own_step)
+        self._k += 1
+        if not self._has_joints:
+            self._integrated = self._integrated + buffer * self._period
+            self._integrated.setflags(write=False)
+        joints, feature = self._measure()
+        feature, valid = self._channel.deliver(feature) if self._has_channel else (feature, True)
+        return trusted_observation(self._k * self._period, joints, feature, valid)
+
+    def truth(self) -> Truth:
+        """Return the FMU's own feature and, where the mapping names it, its Jacobian."""
+        port, read = self._true_feature
+        read()
+        jacobian = None
+        if self._true_jacobian is not None:
+            matrix, read_matrix = self._true_jacobian
+            read_matrix()
+            jacobian = matrix.values.reshape(self._spec.m, self._spec.n).copy()
+        return Truth(port.values.copy(), jacobian)
+
+    def save_state(self) -> FmuPlantState:
+        """Return the present state of the FMU and of everything around it.
+
+        Raises:
+            ValueError: the FMU cannot save its state.
+        """
+        if not self.description.can_save:
+            raise ValueError(f"{self.description.path.name} cannot save its state (canGetAndSetFMUstate is false)")
+        rest = (self._k, self._commands, self._channel, self._noise, self._integrated)
+        state = self._slave.save()
+        if not self.description.can_serialise:
+            self._states.append(state)
+            return FmuPlantState(state, copy.deepcopy(rest))
+        try:
+            return FmuPlantState(self._slave.to_bytes(state), copy.deepcopy(rest))
+        finally:
+            self._slave.free(state)
+
+    def restore_state(self, state: FmuPlantState) -> None:
+        """Return to a saved state; the run that follows has the same bits.
+
+        Raises:
+            FmuError: the FMU does not take it.
+        """
+        if isinstance(state.fmu, bytes):
+            handle = self._slave.from_bytes(state.fmu)
+            try:
+                self._slave.restore(handle)
+            finally:
+                self._slave.free(handle)
+        else:
+            self._slave.restore(state.fmu)
+        self._k, self._commands, self._channel, self._noise, self._integrated = copy.deepcopy(state.rest)
+
+    def close(self) -> None:
+        """Free the instance, unload the library and remove the extracted files."""
+        slave: Slave | None = self.__dict__.pop("_slave", None)
+        if slave is not None:
+            for state in self._states:
+                slave.free(state)
+            self._states.clear()
+            self._write = self._read = _closed
+            slave.close()
+        self._folder.close()
+
+    def _measure(self) -> tuple[FloatArray, FloatArray]:
+        """Read joints and feature, both read-only; the feature with noise."""
+        status = self._read()
+        if status:
+            self._slave.check("reading joints and features", status)
+        values = self._result.values.copy()
+        # Anything that is not finite leaves the sum so; a mask costs five times as much.
+        if not isfinite(sum(values.tolist())):
+            bad = [label for label, value in zip(self._result.labels, values, strict=True) if not np.isfinite(value)]
+            raise FmuError(f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}")
+        values.setflags(write=False)
+        feature = values[self._split :]
+        if self._noise_scale > 0.0:
+            feature = feature + self._noise.normal(scale=self._noise_scale, size=feature.size)
+            feature.setflags(write=False)
+        return (values[: self._split] if self._has_joints else self._integrated), feature
+
+
+def open_slave(description: FmuDescription, folder: FmuFolder) -> Slave:
+    """Return an instance of an extracted FMU; it has to be closed before its folder."""
+    kind: Callable[[FmuDescription, Path], Slave] = Slave2 if description.version == 2 else Slave3
+    return kind(description, folder.root)
+
+
+def trusted_observation(time: float, joints: FloatArray, feature: FloatArray, valid: bool) -> Observation:
+    """Return an observation of arrays that are known to be fresh, finite, float64 and read-only.
+
+    `Observation` checks and copies what it is given, which costs more than the FMU's step; here both arrays come out of
+    a buffer that has just been checked.
+    """
+    observation = _new(Observation)
+    _set_time(observation, time)
+    _set_joints(observation, joints)
+    _set_feature(observation, feature)
+    _set_valid(observation, valid)
+    return observation
+
+
+_new = object.__new__
+_set_time, _set_joints, _set_feature, _set_valid = (
+    getattr(Observation, name).__set__ for name in ("time", "joint_position", "feature", "feature_valid")
+)
+
+
+def _closed() -> int:
+    raise FmuError("the plant has been closed")
+
+
+def mapped_entry(path: Path) -> PlantEntry:
+    """Return the registry's entry of the plant `fmu:PATH`, the FMU that the mapping at `path` describes.
+
+    Raises:
+        ValueError: the mapping cannot be used.
+    """
+    mapping = read_mapping(path)
+
+    def build(config: FmuConfig, setup: PlantSetup) -> FmuPlant:
+        return FmuPlant(config, mapping, setup.start, setup.period)
+
+    return PlantEntry(f"fmu:{path}", f"the FMU {mapping.path.name}, as mapped by {path.name}", FmuConfig, build)

@@ -1,0 +1,165 @@
+"""Reads a model description and finds in it the variables that a mapping names.
+
+A name stands for a scalar, for an FMI 3 array, or for all scalars `name[1]`, `name[2]`, … of FMI 2 in that order, so
+that one mapping serves both versions of a model.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from math import prod
+from pathlib import Path
+from typing import Any
+
+REAL_TYPES = ("Real", "Float64")
+LISTED = 40  # names in an error message
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A real variable of an FMU.
+
+    Attributes:
+        name: as in the description.
+        reference: value reference.
+        size: how many numbers it holds.
+        causality: parameter, input, output, local or independent.
+    """
+
+    name: str
+    reference: int
+    size: int
+    causality: str
+
+    def labels(self) -> list[str]:
+        """Return a name for each of its numbers."""
+        return [self.name] if self.size == 1 else [f"{self.name}[{i + 1}]" for i in range(self.size)]
+
+
+@dataclass(frozen=True)
+class FmuDescription:
+    """What is used of a model description.
+
+    Attributes:
+        path: the .fmu file, for messages.
+        version: 2 or 3.
+        model_name: for people.
+        identifier: file name of the library.
+        token: GUID or instantiation token.
+        can_save: states can be saved and restored.
+        can_serialise: saved states can be turned into bytes.
+        variables: the real ones, in order.
+        other_types: type by name of all others.
+    """
+
+    path: Path
+    version: int
+    model_name: str
+    identifier: str
+    token: str
+    can_save: bool
+    can_serialise: bool
+    variables: tuple[Variable, ...]
+    other_types: Mapping[str, str]
+
+    @cached_property
+    def _by_name(self) -> dict[str, Variable]:
+        return {variable.name: variable for variable in self.variables}
+
+    @cached_property
+    def _families(self) -> dict[str, list[Variable]]:
+        families: dict[str, list[tuple[tuple[int, ...], Variable]]] = {}
+        for variable in self.variables:
+            match = re.fullmatch(r"(.+)\[([0-9, ]+)\](\)?)", variable.name)
+            if match is not None:
+                index = tuple(int(part) for part in match[2].split(","))
+                families.setdefault(match[1] + match[3], []).append((index, variable))
+        return {
+            name: [member for _, member in sorted(members, key=lambda pair: pair[0])]
+            for name, members in families.items()
+        }
+
+    def find(self, name: str, role: str) -> list[Variable]:
+        """Return the variables that `name` stands for.
+
+        Args:
+            name: of a scalar, of an array, or of a family of scalars.
+            role: what the mapping uses it for, for the message.
+
+        Raises:
+            ValueError: no such real variable; lists those there, with the nearest name.
+        """
+        if name in self._by_name:
+            return [self._by_name[name]]
+        if name in self._families:
+            return self._families[name]
+        if name in self.other_types:
+            raise ValueError(
+                f"{role} names {name!r}, which is of type {self.other_types[name]}; wanted a real variable"
+            )
+        known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
+        nearest = difflib.get_close_matches(name, [*known, *self._by_name], n=1)
+        hint = f"did you mean {nearest[0]!r}? " if nearest else ""
+        more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
+        listed = ", ".join(sorted(known)[:LISTED])
+        raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have; {hint}it has: {listed}{more}")
+
+    def select(self, names: Iterable[str], role: str) -> tuple[Variable, ...]:
+        """Return the variables that `names` stand for, in order."""
+        return tuple(variable for name in names for variable in self.find(name, role))
+
+
+def total_size(variables: Iterable[Variable]) -> int:
+    """Return how many numbers the variables hold together."""
+    return sum(variable.size for variable in variables)
+
+
+def read_description(path: Path, root: Path) -> FmuDescription:
+    """Read the model description below `root` of the FMU at `path`.
+
+    Raises:
+        ValueError: broken, of FMI 1, or without co-simulation.
+    """
+    from fmpy import read_model_description  # noqa: PLC0415 - takes a third of a second and loads libraries
+
+    try:
+        description = read_model_description(str(root), validate=False)
+    except Exception as error:  # fmpy raises bare ones of every kind
+        raise ValueError(
+            f"fmu file {path} has a broken modelDescription.xml: {' '.join(str(error).split())}"
+        ) from error
+    version = str(description.fmiVersion)
+    if not version.startswith(("2.", "3.")):
+        raise ValueError(f"fmu file {path} is of FMI {version}; wanted FMI 2 or 3")
+    interface = description.coSimulation
+    if interface is None:
+        offered = "model exchange" if description.modelExchange is not None else "scheduled execution"
+        raise ValueError(f"fmu file {path} offers {offered} only; wanted co-simulation")
+    reals = [each for each in description.modelVariables if each.type in REAL_TYPES]
+    return FmuDescription(
+        path=path,
+        version=int(version[0]),
+        model_name=str(description.modelName),
+        identifier=str(interface.modelIdentifier),
+        token=str(description.guid if version.startswith("2") else description.instantiationToken),
+        can_save=bool(interface.canGetAndSetFMUstate),
+        can_serialise=bool(interface.canSerializeFMUstate),
+        variables=tuple(Variable(v.name, v.valueReference, _size(v, path), v.causality or "local") for v in reals),
+        other_types={v.name: v.type for v in description.modelVariables if v.type not in REAL_TYPES},
+    )
+
+
+def _size(variable: Any, path: Path) -> int:  # noqa: ANN401 - fmpy's variables carry no usable types
+    sizes = []
+    for dimension in variable.dimensions or ():
+        start = dimension.start if dimension.start is not None else dimension.variable.start
+        if start is None:
+            raise ValueError(
+                f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value"
+            )
+        sizes.append(int(start))
+    return prod(sizes)

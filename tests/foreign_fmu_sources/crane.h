@@ -1,0 +1,41 @@
+/* A planar arm of two joints; it shares nothing with the exported FMUs. */
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdlib.h>
+
+enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION };
+
+typedef struct {
+    double time, wheel[2], push[2], place[2], arm[2], quirk;
+} Crane;
+
+static void place(Crane *c)
+{
+    c->place[0] = c->arm[0] * cos(c->wheel[0]) + c->arm[1] * cos(c->wheel[0] + c->wheel[1]);
+    c->place[1] = c->arm[0] * sin(c->wheel[0]) + c->arm[1] * sin(c->wheel[0] + c->wheel[1]);
+    if (c->quirk == RESULT_IS_NAN) c->place[1] = NAN;
+}
+
+static void init(Crane *c)
+{
+    c->wheel[0] = 0.3;
+    c->wheel[1] = 1.2;
+    c->arm[0] = 0.5;
+    c->arm[1] = 0.4;
+    c->quirk = 0;
+}
+
+static void move(Crane *c, double h)
+{
+    for (int i = 0; i < 2; i++) c->wheel[i] += h * c->push[i];
+    c->time += h;
+    place(c);
+}
+
+/* References: 10 and 11 wheel, 20 and 21 push, 30 and 31 place, 40 and 41 arm, 50 quirk. */
+static double *at(Crane *c, unsigned reference)
+{
+    double *groups[] = {c->wheel, c->push, c->place, c->arm, &c->quirk};
+    return groups[reference / 10 - 1] + reference % 10;
+}

@@ -1,0 +1,77 @@
+#include "crane.h"
+
+typedef void (*Log)(void *, int, const char *, const char *);
+
+static Log log_message;
+
+void *fmi3InstantiateCoSimulation(const char *name, const char *token, const char *resources, bool visible,
+                                  bool logging, bool event_mode, bool early, const unsigned *intermediate, size_t n,
+                                  void *environment, Log log, void *update)
+{
+    Crane *c = calloc(1, sizeof *c);
+    log_message = log;
+    init(c);
+    return c;
+}
+
+void fmi3FreeInstance(void *c) { free(c); }
+
+int fmi3EnterInitializationMode(void *c, bool a, double b, double start, bool d, double e)
+{
+    ((Crane *)c)->time = start;
+    return ((Crane *)c)->quirk == NO_START ? 3 : 0;
+}
+
+int fmi3ExitInitializationMode(void *c)
+{
+    place(c);
+    return 0;
+}
+
+int fmi3Reset(void *c)
+{
+    init(c);
+    return 0;
+}
+
+static int copy(Crane *c, const unsigned *references, size_t n, double *values, size_t n_values, bool out)
+{
+    size_t k = 0;
+    for (size_t i = 0; i < n; i++) {
+        for (unsigned j = 0; j < (references[i] == 50 ? 1 : 2); j++, k++) {
+            if (k == n_values) return 3;
+            if (out) values[k] = at(c, references[i])[j];
+            else at(c, references[i])[j] = values[k];
+        }
+    }
+    return k == n_values ? 0 : 3;
+}
+
+int fmi3SetFloat64(void *c, const unsigned *references, size_t n, const double *values, size_t n_values)
+{
+    return copy(c, references, n, (double *)values, n_values, false);
+}
+
+int fmi3GetFloat64(void *c, const unsigned *references, size_t n, double *values, size_t n_values)
+{
+    return copy(c, references, n, values, n_values, true);
+}
+
+int fmi3DoStep(void *component, double time, double h, bool unused, bool *event, bool *end, bool *early, double *last)
+{
+    Crane *c = component;
+    *event = *end = *early = false;
+    *last = time;
+    if (c->quirk == STEP_FAILS) {
+        log_message(0, 3, "error", "load 900 kg is too heavy at noon");
+        return 3;
+    }
+    if (c->quirk == NO_PROGRESS) *early = true;
+    else if (c->quirk == ENDS_SIMULATION) *end = true;
+    else if (c->quirk == ENDS_HALF_WAY && h > 0.02) {
+        move(c, h / 2);
+        *early = true;
+    } else move(c, h);
+    *last = c->time;
+    return 0;
+}

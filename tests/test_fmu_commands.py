@@ -1,0 +1,58 @@
+"""The commands `servobench fmu …`."""
+
+from __future__ import annotations
+
+import zipfile
+
+import pytest
+from typer.testing import CliRunner
+
+from fmus.ur5_plant import cached_fmu
+from harness.configuration import ConfigurationError
+from harness.fmu_commands import fmu_app
+
+
+def invoke(*arguments: object):
+    return CliRunner().invoke(fmu_app, [str(argument) for argument in arguments])
+
+
+def test_an_exported_fmu_validates_and_tells_about_itself(tmp_path):
+    path = tmp_path / "ur5.fmu"
+    exported = invoke("export", "-o", path, "--fmi", 3, "--mismatch", "moderate", "--seed", 5)
+    assert exported.exit_code == 0
+    assert "FMI 3" in exported.output
+    validated = invoke("validate", path)
+    assert validated.exit_code == 0
+    assert "no problem found" in validated.output
+    informed = invoke("info", path)
+    assert "FMI 3.0, co-simulation" in informed.output
+    assert "ball_position" in informed.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("export", "-o", "ur5.fmu", "--fmi", "1"), "fmi_version must be 2 or 3"),
+        (("export", "-o", "ur5.fmu", "--mismatch", "sever"), "sever"),
+        (("export", "-o", "ur5.fmu", "--platforms", "amiga"), "platforms holds 'amiga'"),
+        (("export", "-o", "missing/ur5.fmu"), "does not exist"),
+        (("validate", "missing.fmu"), "does not exist"),
+        (("info", "missing.fmu"), "does not exist"),
+    ],
+)
+def test_bad_input_is_one_configuration_error(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    result = invoke(*arguments)
+    assert isinstance(result.exception, ConfigurationError)
+    assert message in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_validation_of_a_bad_fmu_ends_with_exit_code_1(tmp_path):
+    path = tmp_path / "ur5.fmu"
+    with zipfile.ZipFile(cached_fmu(2)) as good, zipfile.ZipFile(path, "w") as bad:
+        for name in good.namelist():
+            bad.writestr(name, good.read(name).replace(b'guid="{', b'guid="{0'))
+    result = invoke("validate", path)
+    assert result.exit_code == 1
+    assert "the GUID is not that of this model" in result.output
