@@ -18,11 +18,11 @@ CODE = ("-std=c11", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared"
 COMPILERS = ("cc", "gcc", "clang")
 
 
-class CompilerMissing(RuntimeError):
+class CompilerMissing(ValueError):
     """There is no C compiler for what was asked; the message names the ways out."""
 
 
-class CompilationFailed(RuntimeError):
+class CompilationFailed(ValueError):
     """The compiler refused the sources; the message is the compiler's first error."""
 
 

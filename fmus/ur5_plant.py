@@ -69,8 +69,9 @@ def cached_fmu(fmi_version: int) -> Path:
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported UR5, with the true model of `setup` as its parameters."""
-    actuation = Actuation(config.lag, config.max_joint_speed, config.joint_range, setup.start)
-    parameters = parameters_of(setup.model, actuation)
+    model, start = setup.robot()
+    actuation = Actuation(config.lag, config.max_joint_speed, config.joint_range, start)
+    parameters = parameters_of(model, actuation)
     del parameters["home"]
     return FmuMapping(
         path=path,
@@ -84,7 +85,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         clips_itself=True,
         joint_lower=-config.joint_range,
         joint_upper=config.joint_range,
-        joint_names=setup.model.arm.joint_names,
+        joint_names=model.arm.joint_names,
         feature_names=FEATURE_NAMES,
     )
 

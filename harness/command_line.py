@@ -18,13 +18,14 @@ from rich.table import Table
 from controllers.composed import ESTIMATORS, LAWS
 from harness import results
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
-from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
+from harness.configuration import ConfigurationError, Settings, flatten, read_settings
 from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
+from harness.fmu_commands import fmu_app
 from harness.manifest import describe_batch
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.summary import summary_tables
-from harness.tasks import TASKS, find_task, task_names
+from harness.tasks import find_task, task_names
 from harness.training import cache_folder
 
 INTERRUPTED = 130
@@ -44,6 +45,9 @@ SetOption = Annotated[
 ]
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
 NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
+
+
+app.add_typer(fmu_app, name="fmu")
 
 
 @app.command()
@@ -104,9 +108,9 @@ def compare(
 ) -> None:
     """Run every combination and compare the controllers."""
     batch = Batch(
-        _names("plants", plants, plant_names()),
-        _names("controllers", controllers, controller_names()),
-        _names("tasks", tasks, list(TASKS)),
+        _names("plants", plants, plant_names(), find_plant),
+        _names("controllers", controllers, controller_names(), find_controller),
+        _names("tasks", tasks, task_names(), find_task),
         tuple(part.strip() for part in mismatch.split(",")),
         parse_seeds(seeds),
     )
@@ -203,15 +207,15 @@ def _progress() -> Progress:
     )
 
 
-def _names(kind: str, text: str, known: list[str]) -> tuple[str, ...]:
+def _names(kind: str, text: str, known: list[str], find: Callable[[str], Any]) -> tuple[str, ...]:
+    """Return the names in a list by comma, each of which `find` knows."""
     if text.strip() == "all":
         return tuple(known)
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
     if not names:
         raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:
-        if name not in known and "+" not in name:
-            raise ConfigurationError(f"unknown name {name!r} in --{kind}: {suggest(name, known)}")
+        find(name)
     return names
 
 

@@ -15,7 +15,8 @@ import joblib
 from controllers.training import Progress
 from harness import results
 from harness.configuration import ConfigurationError, Settings
-from harness.experiment import RunRequest, build_experiment, known_sections, run_experiment
+from harness.experiment import RunRequest, build_experiment, known_sections
+from harness.run import run_experiment
 
 PICTURES = "pictures"
 
@@ -74,7 +75,7 @@ def check_batch(batch: Batch, settings: Settings, progress: Progress | None = No
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used.
     """
-    settings.check_sections([*known_sections(), *batch.controllers])
+    settings.check_sections([*known_sections(), *batch.plants, *batch.controllers])
     first = RunRequest(batch.plants[0], batch.controllers[0], batch.tasks[0], batch.mismatches[0], batch.seeds[0])
     requests = dict.fromkeys(
         [

@@ -1,39 +1,30 @@
-"""One run: from names, a mismatch and a seed to a row of results and a table of steps."""
+"""A run made ready: from names, a mismatch and a seed to plant, controller and scenario."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
-from threadpoolctl import threadpool_limits
 
 from controllers.controller import Controller, RobotKnowledge
 from controllers.network_file import TrainedNetworks
 from controllers.training import Progress
 from controllers.training_config import TrainingConfig
 from harness.configuration import ConfigurationError, Settings
-from harness.log import StepLog
-from harness.loop import LoopSettings, run_loop
-from harness.metrics import Judgement, judge_run
 from harness.registry import controller_names, find_controller, find_plant, plant_names
-from harness.tasks import Scenario, find_task, task_names
+from harness.tasks import Scenario, TaskSetting, find_task, task_names
 from harness.training import network_source
-from plant.hand_eye import HandEyeModel, hand_eye_spec
+from plant.hand_eye import FEATURE_NAMES, HandEyeModel, hand_eye_spec
 from plant.kinematic import KinematicConfig
 from plant.mismatch import MismatchSample, parse_mismatch, sample_mismatch
-from plant.plant import ImageArray, Plant, PlantSetup
+from plant.plant import Plant, PlantEntry, PlantSetup
 from plant.seeds import named_seed
 from plant.signals import PlantSpec, RunFault, check_number
 from plant.symbolic import symbolic_feature
 from plant.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
-
-COMPLETED = "completed"
 
 
 @dataclass(frozen=True)
@@ -71,21 +62,6 @@ class RunRequest:
 
 
 @dataclass(frozen=True)
-class RunResult:
-    """What came of it.
-
-    Attributes:
-        row: one row for the table of runs.
-        steps: one row a period.
-        picture: what the camera saw last, or None.
-    """
-
-    row: dict[str, Any]
-    steps: pd.DataFrame
-    picture: ImageArray | None = field(default=None, repr=False)
-
-
-@dataclass(frozen=True)
 class Experiment:
     """A run made ready: all configuration resolved, the true robot drawn, plant and controller built."""
 
@@ -93,7 +69,7 @@ class Experiment:
     controller: Controller
     scenario: Scenario
     run: RunSettings
-    sample: MismatchSample
+    sample: MismatchSample | None
 
     @property
     def periods(self) -> int:
@@ -120,18 +96,19 @@ def build_experiment(
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
+    run = settings.resolve("run", RunSettings())
+    entry = find_plant(request.plant)
+    if entry.own_robot:
+        return _build_with_own_robot(request, settings, run, entry)
+    nominal = nominal_ur5()
     try:
-        run = settings.resolve("run", RunSettings())
-        nominal = nominal_ur5()
         mismatch = parse_mismatch(request.mismatch)
         true, sample = sample_mismatch(mismatch, nominal, named_seed(request.seed, "mismatch"))
-        task = find_task(request.task)
-        scenario = task.build(settings.resolve(request.task, task.default), true, named_seed(request.seed, "task"))
-        plant = _build_plant(request, settings, PlantSetup(true, scenario.start, run.period))
-    except ConfigurationError:
-        raise
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
+    setting = TaskSetting(true, true.arm.n, FEATURE_NAMES, named_seed(request.seed, "task"))
+    scenario = _build_scenario(request, settings, setting)
+    plant = _build_plant(request, settings, entry, PlantSetup(true, scenario.start, run.period))
     try:
         source = network_source(nominal.jacobian, plant.spec, keep, progress)
         knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
@@ -165,55 +142,6 @@ def train_networks(controller: str, settings: Settings, progress: Progress) -> T
     return trained[-1]
 
 
-def run_experiment(
-    request: RunRequest, settings: Settings, *, picture: bool = False, keep: Path | None = None
-) -> RunResult:
-    """Carry one run out; a fault on the way is told in the row's `status` and `reason`.
-
-    Args:
-        request: what to run.
-        settings: overrides of the defaults.
-        picture: also return what the camera saw last, where there is one.
-        keep: results folder in which trained networks are kept beside the runs.
-
-    Raises:
-        ConfigurationError: a name, setting, mismatch or seed that cannot be used.
-    """
-    experiment = build_experiment(request, settings, keep=keep)
-    plant, spec, scenario = experiment.plant, experiment.plant.spec, experiment.scenario
-    log = StepLog(spec, full_jacobian=experiment.run.full_jacobian)
-    loop = LoopSettings(experiment.periods, experiment.run.preview, experiment.run.lost_after_periods)
-    status, reason = COMPLETED, ""
-    try:
-        with threadpool_limits(1), np.errstate(divide="raise", over="raise", invalid="raise"):
-            run_loop(plant, experiment.controller, scenario.reference, loop, request.seed, log)
-    except RunFault as fault:
-        status, reason = fault.status, _one_line(fault)
-    except FloatingPointError as error:
-        status, reason = "numerical_error", _one_line(error)
-    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
-        status, reason = "crashed", f"{type(error).__name__}: {_one_line(error)}"
-    finally:
-        image = plant.picture() if picture and len(log) else None
-        plant.close()
-    steps = log.table(request.run_id)
-    judgement = Judgement(spec, scenario.point_to_point, scenario.evaluate_from)
-    row: dict[str, Any] = {
-        "run_id": request.run_id,
-        "plant": request.plant,
-        "controller": request.controller,
-        "task": request.task,
-        "seed": request.seed,
-        "mismatch": request.mismatch,
-        "status": status,
-        **(judge_run(steps, judgement) if len(steps) else {}),
-        "periods": len(steps),
-        "reason": reason,
-        "mismatch_values": json.dumps(experiment.sample.as_record()),
-    }
-    return RunResult(row, steps, image)
-
-
 def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     """Return what every controller may know."""
     return RobotKnowledge(
@@ -224,27 +152,49 @@ def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     )
 
 
-def _build_plant(request: RunRequest, settings: Settings, setup: PlantSetup) -> Plant:
-    entry = find_plant(request.plant)
+def _build_with_own_robot(request: RunRequest, settings: Settings, run: RunSettings, entry: PlantEntry) -> Experiment:
+    """Make a run ready on a plant of whose robot nothing is known."""
+    if request.mismatch != "none":
+        raise ConfigurationError(
+            f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
+        )
+    plant = _build_plant(request, settings, entry, PlantSetup(None, None, run.period))
+    try:
+        spec = plant.spec
+        setting = TaskSetting(None, spec.n, spec.feature_names, named_seed(request.seed, "task"))
+        scenario = _build_scenario(request, settings, setting)
+        controller = _build_controller(request, settings, RobotKnowledge(spec, run.preview), None)
+    except BaseException:
+        plant.close()
+        raise
+    return Experiment(plant, controller, scenario, run, None)
+
+
+def _build_scenario(request: RunRequest, settings: Settings, setting: TaskSetting) -> Scenario:
+    task = find_task(request.task)
+    config = settings.resolve(request.task, task.default)
+    try:
+        return task.build(config, setting)
+    except ValueError as error:
+        raise ConfigurationError(f"task {request.task}: {error}") from error
+
+
+def _build_plant(request: RunRequest, settings: Settings, entry: PlantEntry, setup: PlantSetup) -> Plant:
     config = settings.resolve(request.plant, entry.config())
     try:
         return entry.build(config, setup)
-    except ValueError as error:
+    except (ValueError, RunFault) as error:
         raise ConfigurationError(f"plant {request.plant}: {error}") from error
 
 
 def _build_controller(
-    request: RunRequest, settings: Settings, knowledge: RobotKnowledge, true: HandEyeModel
+    request: RunRequest, settings: Settings, knowledge: RobotKnowledge, true: HandEyeModel | None
 ) -> Controller:
     entry = find_controller(request.controller)
     config = settings.resolve(request.controller, entry.config())
-    if entry.needs_truth:
+    if entry.needs_truth and true is not None:
         knowledge = replace(knowledge, true_jacobian=true.jacobian, true_symbolic=symbolic_feature(true))
     try:
         return entry.build(config, knowledge)
     except ValueError as error:
         raise ConfigurationError(f"controller {request.controller}: {error}") from error
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

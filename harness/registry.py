@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 
 from controllers.composed import compose
 from controllers.controller import ControllerEntry
 from harness.configuration import ConfigurationError, suggest
+from plant.fmu import mapped_entry
 from plant.plant import PlantEntry
 
 PLANT_GROUP = "servobench.plants"
@@ -20,7 +22,9 @@ CONTROLLER_GROUP = "servobench.controllers"
 PLANTS = {
     "kinematic": "plant.kinematic:ENTRY",
     "bullet": "plant.bullet:ENTRY",
+    "fmu": "fmus.ur5_plant:ENTRY",
 }
+MAPPED = "fmu:"
 CONTROLLERS = {
     "rbfnn_mfac": "controllers.rbfnn_mfac:ENTRY",
     "ukf_mfac": "controllers.ukf_mfac:ENTRY",
@@ -47,11 +51,16 @@ def controller_names() -> list[str]:
 
 
 def find_plant(name: str) -> PlantEntry:
-    """Return the plant called `name`.
+    """Return the plant called `name`, or for a name like `fmu:PATH.toml` the FMU that this mapping describes.
 
     Raises:
-        ConfigurationError: no such plant, or a third party's that cannot be loaded.
+        ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
     """
+    if name.startswith(MAPPED):
+        try:
+            return mapped_entry(Path(name.removeprefix(MAPPED)).expanduser())
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from error
     entry = _load(PLANT_GROUP, "plant", name)
     if not isinstance(entry, PlantEntry):
         raise ConfigurationError(

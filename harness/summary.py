@@ -7,7 +7,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.table import Table
 
-from harness.experiment import COMPLETED
+from harness.run import COMPLETED
 
 KEYS = ["plant", "mismatch", "task", "controller"]
 

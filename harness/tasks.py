@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.configuration import ConfigurationError, suggest
 from harness.references import Circle, FixedPoint, Lemniscate, Reference, line, read_waypoints
-from plant.hand_eye import FEATURE_NAMES, HandEyeModel
+from plant.hand_eye import HandEyeModel
 from plant.seeds import named_generator
 from plant.signals import FloatArray, as_vector, check_number
 from plant.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
@@ -29,14 +29,14 @@ class Scenario:
     """A task made concrete for one true robot.
 
     Attributes:
-        start: (n,), rad, joint positions at time 0.
+        start: (n,), rad, joint positions at time 0; None for a plant that brings its own.
         reference: the desired feature over time.
         duration: s.
         evaluate_from: s, where the evaluated part begins.
         point_to_point: the reference is a fixed target.
     """
 
-    start: FloatArray
+    start: FloatArray | None
     reference: Reference
     duration: float
     evaluate_from: float
@@ -108,6 +108,56 @@ class WaypointTask:
 
 
 @dataclass(frozen=True)
+class TargetTask:
+    """A move from rest to a fixed target that is given as a feature."""
+
+    start: Vector = HOME  # rad
+    target: Vector = (0.1, -0.1, 1.2)  # m, camera frame
+    duration: float = 10.0  # s
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("duration", self.duration, above=0.0)
+
+
+@dataclass(frozen=True)
+class TaskSetting:
+    """Where a task is to be done.
+
+    Attributes:
+        model: the true robot, or None for a plant that brings its own.
+        n: number of joints.
+        feature_names: m names.
+        seed: for tasks that draw random numbers.
+    """
+
+    model: HandEyeModel | None
+    n: int
+    feature_names: tuple[str, ...]
+    seed: int
+
+    @property
+    def m(self) -> int:
+        """Number of features."""
+        return len(self.feature_names)
+
+    def taught_on(self) -> HandEyeModel:
+        """Return the true robot, for a target that is taught on it.
+
+        Raises:
+            ValueError: the plant brings a robot of its own.
+        """
+        if self.model is None:
+            raise ValueError("it is taught on the UR5, and this plant brings a robot of its own; use one of "
+                             f"{', '.join(name for name in TASKS if TASKS[name].any_robot)}")  # fmt: skip
+        return self.model
+
+    def start(self, joint_position: Vector) -> FloatArray | None:
+        """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
+        return None if self.model is None else as_vector("start", joint_position, self.n)
+
+
+@dataclass(frozen=True)
 class TaskEntry:
     """A task as the command line knows it.
 
@@ -115,70 +165,75 @@ class TaskEntry:
         name: the word on the command line.
         summary: one line for `servobench tasks`.
         default: its settings.
-        build: makes a scenario from settings, the true robot and a seed.
+        build: makes a scenario from settings and the setting of the run.
+        any_robot: it needs no UR5: start and target are not given as its joint positions.
     """
 
     name: str
     summary: str
     default: Any
-    build: Callable[[Any, HandEyeModel, int], Scenario]
+    build: Callable[[Any, TaskSetting], Scenario]
+    any_robot: bool = False
 
 
-def _build_point(config: PointTask, true: HandEyeModel, _: int) -> Scenario:
-    n = true.arm.n
-    target = as_vector("target", config.target, n)
-    check_number("duration", config.duration, above=0.0)
-    return Scenario(
-        start=as_vector("start", config.start, n),
-        reference=FixedPoint(true.feature(target)),
-        duration=config.duration,
-        evaluate_from=0.75 * config.duration,
-        point_to_point=True,
-    )
+def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
+    target = as_vector("target", config.target, setting.n)
+    return _move(config.start, FixedPoint(setting.taught_on().feature(target)), config.duration, setting)
 
 
-def _build_random(config: RandomTask, true: HandEyeModel, seed: int) -> Scenario:
-    n = true.arm.n
+def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
+    target = as_vector("target", config.target, setting.m)
+    return _move(config.start, FixedPoint(target), config.duration, setting)
+
+
+def _move(start: Vector, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
+    check_number("duration", duration, above=0.0)
+    return Scenario(setting.start(start), reference, duration, 0.75 * duration, point_to_point=True)
+
+
+def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
+    n, nominal = setting.taught_on().arm.n, nominal_ur5()
     lower, upper = as_vector("lower", config.lower, n), as_vector("upper", config.upper, n)
     if not (lower < upper).all():
-        raise ConfigurationError("random: lower must be below upper for every joint")
-    generator, nominal = named_generator(seed, "start_and_target"), nominal_ur5()
+        raise ValueError("lower must be below upper for every joint")
+    generator = named_generator(setting.seed, "start_and_target")
     for _ in range(1000):
         pair = generator.uniform(lower, upper, (2, n))
         balls = nominal.arm.ball_position(pair)
         if np.linalg.norm(balls[1] - balls[0]) >= config.shortest and (balls[:, 2] >= config.lowest).all():
-            return _build_point(PointTask(tuple(pair[0]), tuple(pair[1]), config.duration), true, seed)
-    raise ConfigurationError("random: no start and target in the box are far enough apart and above the table")
+            return _build_point(PointTask(tuple(pair[0]), tuple(pair[1]), config.duration), setting)
+    raise ValueError("no start and target in the box are far enough apart and above the table")
 
 
-def _build_circle(config: CircleTask, true: HandEyeModel, _: int) -> Scenario:
-    reference = Circle(as_vector("centre", config.centre, 3), config.radius, config.lap_time)
-    return _lap_scenario(config, reference, true)
+def _build_circle(config: CircleTask, setting: TaskSetting) -> Scenario:
+    reference = Circle(as_vector("centre", config.centre, setting.m), config.radius, config.lap_time)
+    return _lap_scenario(config, reference, setting)
 
 
-def _build_lemniscate(config: LemniscateTask, true: HandEyeModel, _: int) -> Scenario:
-    reference = Lemniscate(as_vector("centre", config.centre, 3), config.radius, config.lap_time)
-    return _lap_scenario(config, reference, true)
+def _build_lemniscate(config: LemniscateTask, setting: TaskSetting) -> Scenario:
+    reference = Lemniscate(as_vector("centre", config.centre, setting.m), config.radius, config.lap_time)
+    return _lap_scenario(config, reference, setting)
 
 
-def _lap_scenario(config: CircleTask, reference: Reference, true: HandEyeModel) -> Scenario:
-    start = as_vector("start", config.start, true.arm.n)
-    return Scenario(start, reference, config.laps * config.lap_time, (config.laps - 1) * config.lap_time)
+def _lap_scenario(config: CircleTask, reference: Reference, setting: TaskSetting) -> Scenario:
+    laps, lap_time = config.laps, config.lap_time
+    return Scenario(setting.start(config.start), reference, laps * lap_time, (laps - 1) * lap_time)
 
 
-def _build_line(config: LineTask, true: HandEyeModel, _: int) -> Scenario:
-    reference = line(as_vector("begin", config.begin, 3), as_vector("end", config.end, 3), config.moving)
-    start = as_vector("start", config.start, true.arm.n)
-    return Scenario(start, reference, config.duration, 0.5 * config.duration)
+def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
+    m = setting.m
+    reference = line(as_vector("begin", config.begin, m), as_vector("end", config.end, m), config.moving)
+    check_number("duration", config.duration, above=0.0)
+    return Scenario(setting.start(config.start), reference, config.duration, 0.5 * config.duration)
 
 
-def _build_waypoints(config: WaypointTask, true: HandEyeModel, _: int) -> Scenario:
+def _build_waypoints(config: WaypointTask, setting: TaskSetting) -> Scenario:
     if not config.file:
-        raise ConfigurationError("waypoints needs a CSV file: --set waypoints.file=PATH")
-    reference = read_waypoints(Path(config.file).expanduser(), FEATURE_NAMES)
+        raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
+    reference = read_waypoints(Path(config.file).expanduser(), setting.feature_names)
     duration = float(reference.times[-1]) + config.settle
     check_number("last waypoint's time plus settle", duration, above=0.0)
-    return Scenario(as_vector("start", config.start, true.arm.n), reference, duration, 0.5 * duration)
+    return Scenario(setting.start(config.start), reference, duration, 0.5 * duration)
 
 
 # Start and target as joint positions, and beside them the ball on the nominal robot in the base frame.
@@ -204,11 +259,14 @@ _ENTRIES = (
     TaskEntry("exp2", "a move inside the training region, forward and down", EXP2, _build_point),
     TaskEntry("exp3", "a move inside the training region, across and up", EXP3, _build_point),
     TaskEntry("exp4", "a move that starts outside the training region", EXP4, _build_point),
-    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle),
-    TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line),
-    TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(radius=0.25), _build_lemniscate),
+    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle, any_robot=True),
+    TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line, any_robot=True),
+    TaskEntry(
+        "lemniscate", "two laps on a figure of eight", LemniscateTask(radius=0.25), _build_lemniscate, any_robot=True
+    ),
     TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
-    TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints),
+    TaskEntry("target", "a move to a given feature (target.target)", TargetTask(), _build_target, any_robot=True),
+    TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),
 )
 TASKS = {entry.name: entry for entry in _ENTRIES}
 

@@ -142,18 +142,19 @@ class BulletPlant(Plant):
         """
         from plant.scene import Scene, view_of  # noqa: PLC0415 - PyBullet prints a banner when it is imported
 
-        self._config, self._model = config, setup.model
-        self._spec = hand_eye_spec(setup.model, setup.period, config.max_joint_speed, config.joint_range)
-        self._start = as_vector("start", setup.start, self._spec.n)
+        model, start = setup.robot()
+        self._config, self._model = config, model
+        self._spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
+        self._start = as_vector("start", start, self._spec.n)
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
-        if not setup.model.arm.gear_ratio.all():
-            raise ValueError(f"gear_ratio must not be zero, got {setup.model.arm.gear_ratio.tolist()}")
+        if not model.arm.gear_ratio.all():
+            raise ValueError(f"gear_ratio must not be zero, got {model.arm.gear_ratio.tolist()}")
         self._decay = math.exp(-PHYSICS_STEP / config.lag) if config.lag > 0.0 else 0.0
         self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self._camera, self._depth_noise = config.camera(), config.noise()
-        self._view = view_of(self._camera, setup.model.X_BC)
+        self._view = view_of(self._camera, model.X_BC)
         self._scene: Scene = Scene(
-            setup.model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view
+            model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view
         )
 
     @property

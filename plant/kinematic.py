@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from plant.hand_eye import HandEyeModel, hand_eye_spec
+from plant.hand_eye import hand_eye_spec
 from plant.plant import Plant, PlantDiverged, PlantEntry, PlantSetup
 from plant.seeds import named_generator
 from plant.sensing import FeatureChannel
@@ -82,9 +82,9 @@ class KinematicPlant(Plant):
             ValueError: a setting out of its bounds, or a start of the wrong size.
         """
         self._config = config
-        self._model: HandEyeModel = setup.model
-        self._spec = hand_eye_spec(setup.model, setup.period, config.max_joint_speed, config.joint_range)
-        self._start = as_vector("start", setup.start, self._spec.n)
+        self._model, start = setup.robot()
+        self._spec = hand_eye_spec(self._model, setup.period, config.max_joint_speed, config.joint_range)
+        self._start = as_vector("start", start, self._spec.n)
         self._A, self._B = discretise_lag(config.lag, setup.period)
         self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self.reset(0)

@@ -90,14 +90,24 @@ class PlantSetup:
     """What the harness hands to a plant's builder.
 
     Attributes:
-        model: the true arm and camera, mismatch included.
-        start: (n,), rad, reported joint positions at time 0.
+        model: the true arm and camera, mismatch included; None for a plant that brings a robot of its own.
+        start: (n,), rad, reported joint positions at time 0; None for a plant that brings its own start.
         period: control period, s.
     """
 
-    model: HandEyeModel
-    start: FloatArray
+    model: HandEyeModel | None
+    start: FloatArray | None
     period: float
+
+    def robot(self) -> tuple[HandEyeModel, FloatArray]:
+        """Return model and start, for a plant that needs them.
+
+        Raises:
+            ValueError: there are none.
+        """
+        if self.model is None or self.start is None:
+            raise ValueError("model and start must be given for this plant, got None")
+        return self.model, self.start
 
 
 @dataclass(frozen=True)
@@ -109,12 +119,15 @@ class PlantEntry:
         summary: one line for `servobench plants`.
         config: frozen dataclass with a default for every field.
         build: makes the plant from its configuration and the setup.
+        own_robot: it brings a robot and a start of its own: tasks taught on the UR5 and mismatches do not apply, and
+            no nominal model is known.
     """
 
     name: str
     summary: str
     config: type[Any]
     build: Callable[[Any, PlantSetup], Plant]
+    own_robot: bool = False
 
 
 def whole_steps(period: float, own_step: float) -> int:
