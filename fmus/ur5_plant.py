@@ -11,10 +11,11 @@ from typing import Literal
 import numpy as np
 import platformdirs
 
-from fmus.compile import this_platform
+from fmus.compile import CompilationFailed, CompilerMissing, this_platform
 from fmus.export import ExportOptions, export_fmu, source_files
 from fmus.variables import Actuation, parameters_of
 from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu_entry import build_plant
 from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
 from plant.plant import PlantEntry, PlantSetup
@@ -54,6 +55,7 @@ def cached_fmu(fmi_version: int) -> Path:
 
     Raises:
         CompilerMissing: it has to be built and there is no compiler.
+        CompilationFailed: it has to be built and the compiler refused it.
     """
     options = ExportOptions(fmi_version)
     digest = hashlib.sha256(this_platform().name.encode())
@@ -94,11 +96,13 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> FmuPlant:
     """Return the exported UR5 as a plant.
 
     Raises:
-        ValueError: a setting out of its bounds, or a start of the wrong size.
-        CompilerMissing: the FMU has to be built and there is no compiler.
+        ValueError: a setting out of its bounds, a start of the wrong size, or no compiler when the FMU has to be built.
     """
-    path = cached_fmu(config.fmi_version)
-    return FmuPlant(config.around(), ur5_mapping(path, config, setup), setup.start, setup.period)
+    try:
+        path = cached_fmu(config.fmi_version)
+    except (CompilerMissing, CompilationFailed) as error:
+        raise ValueError(f"the FMU cannot be built: {error}") from error
+    return build_plant(config.around(), ur5_mapping(path, config, setup), setup)
 
 
 ENTRY = PlantEntry(

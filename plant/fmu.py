@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from plant.fmu_archive import FmuFolder
-from plant.fmu_mapping import FmuMapping, Names, mapping_spec, read_mapping
+from plant.fmu_mapping import FmuMapping, Names, mapping_spec
 from plant.fmu_slave import Call, FmuError, Port, Slave
 from plant.fmu_slave2 import Slave2
 from plant.fmu_slave3 import Slave3
 from plant.fmu_variables import FmuDescription, read_description
-from plant.plant import Plant, PlantEntry, PlantSetup, whole_steps
+from plant.plant import Plant, whole_steps
 from plant.seeds import named_generator
 from plant.sensing import FeatureChannel
 from plant.signals import Command, FloatArray, Observation, PlantSpec, Truth, as_vector, check_number
@@ -277,17 +277,3 @@ _set_time, _set_joints, _set_feature, _set_valid = (
 
 def _closed() -> int:
     raise FmuError("the plant has been closed")
-
-
-def mapped_entry(path: Path) -> PlantEntry:
-    """Return the registry's entry of the plant `fmu:PATH`, the FMU that the mapping at `path` describes.
-
-    Raises:
-        ValueError: the mapping cannot be used.
-    """
-    mapping = read_mapping(path)
-
-    def build(config: FmuConfig, setup: PlantSetup) -> FmuPlant:
-        return FmuPlant(config, mapping, setup.start, setup.period)
-
-    return PlantEntry(f"fmu:{path}", f"the FMU {mapping.path.name}, as mapped by {path.name}", FmuConfig, build)

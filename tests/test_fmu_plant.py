@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from foreign_fmu import build_crane, describe
 
-from plant.fmu import FmuConfig, FmuPlant, mapped_entry
+from plant.fmu import FmuConfig, FmuPlant
 from plant.fmu_archive import PREFIX, FmuFolder, sweep_stale_folders
+from plant.fmu_entry import mapped_entry
 from plant.fmu_mapping import FmuMapping
 from plant.fmu_slave import FmuError
 from plant.plant import PlantSetup
@@ -202,6 +203,13 @@ def test_misbehaviour_at_run_time_is_an_fmu_error(tmp_path, version, quirk, mess
 def test_a_mapping_that_does_not_fit_is_one_clear_error(tmp_path, changes, message):
     with pytest.raises(ValueError, match=message):
         crane(tmp_path, 2, **changes)
+
+
+def test_an_fmu_that_refuses_its_start_is_a_value_error_to_the_registry(tmp_path):
+    build_crane(tmp_path / "crane.fmu", 2)
+    (tmp_path / "crane.toml").write_text(TOML[2].replace("[parameters]", "[parameters]\nquirk = 5"))
+    with pytest.raises(ValueError, match="fmi2EnterInitializationMode returned error"):
+        mapped_entry(tmp_path / "crane.toml").build(QUIET, PlantSetup(nominal_ur5(), START, PERIOD))
 
 
 def test_a_command_of_the_wrong_size_is_refused(tmp_path):

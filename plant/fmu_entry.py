@@ -1,0 +1,36 @@
+"""FMU plants for the registry: any FMU by the mapping in a TOML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu_mapping import FmuMapping, read_mapping
+from plant.fmu_slave import FmuError
+from plant.plant import PlantEntry, PlantSetup
+
+
+def build_plant(config: FmuConfig, mapping: FmuMapping, setup: PlantSetup) -> FmuPlant:
+    """Return the plant of an FMU, for a registry.
+
+    Raises:
+        ValueError: an FMU, mapping or setting that cannot be used; also where the FMU itself says so.
+    """
+    try:
+        return FmuPlant(config, mapping, setup.start, setup.period)
+    except FmuError as error:
+        raise ValueError(str(error)) from error
+
+
+def mapped_entry(path: Path) -> PlantEntry:
+    """Return the registry's entry of the plant `fmu:PATH`, the FMU that the mapping at `path` describes.
+
+    Raises:
+        ValueError: the mapping cannot be used.
+    """
+    mapping = read_mapping(path)
+
+    def build(config: FmuConfig, setup: PlantSetup) -> FmuPlant:
+        return build_plant(config, mapping, setup)
+
+    return PlantEntry(f"fmu:{path}", f"the FMU {mapping.path.name}, as mapped by {path.name}", FmuConfig, build)
