@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: run test lint format benchmark lock clean
 
 run: $(VENV)/ready
-	$(BIN)/servobench compare --plants bullet --mismatch moderate \
+	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
 	  --controllers rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
 test: lint

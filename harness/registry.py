@@ -13,7 +13,7 @@ from pathlib import Path
 from controllers.composed import compose
 from controllers.controller import ControllerEntry
 from harness.configuration import ConfigurationError, suggest
-from plant.fmu import mapped_entry
+from plant.fmu_entry import mapped_entry
 from plant.plant import PlantEntry
 
 PLANT_GROUP = "servobench.plants"

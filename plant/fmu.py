@@ -61,13 +61,14 @@ class FmuPlantState:
 class FmuPlant(Plant):
     """y, q ← fmi…GetReal after fmi…DoStep under the held, clipped and delayed command; feature = y + noise."""
 
-    def __init__(self, config: FmuConfig, mapping: FmuMapping, start: FloatArray, period: float) -> None:
+    def __init__(self, config: FmuConfig, mapping: FmuMapping, start: FloatArray | None, period: float) -> None:
         """Extract and load the FMU and look all names up.
 
         Args:
             config: delay, noise and latency.
             mapping: which variables are what.
-            start: (n,), rad, joint positions at time 0; only used by an FMU with a home.
+            start: (n,), rad, joint positions at time 0, for an FMU with a home or without joints; None: the FMU's own
+                home, or 0.
             period: control period, s.
 
         Raises:
@@ -85,7 +86,8 @@ class FmuPlant(Plant):
         try:
             self.description = read_description(mapping.path, self._folder.root)
             self._spec = mapping_spec(mapping, self.description, period)
-            self._start = as_vector("start", start, self._spec.n)
+            self._has_start = start is not None
+            self._start = as_vector("start", np.zeros(self._spec.n) if start is None else start, self._spec.n)
             self._slave = open_slave(self.description, self._folder)
             self._connect(mapping)
             self._fresh = True
@@ -105,7 +107,7 @@ class FmuPlant(Plant):
         self._split, self._noise_scale = self._result.values.size - self._spec.m, self._config.feature_noise
         self._lower, self._upper = -self._spec.joint_velocity_limit, self._spec.joint_velocity_limit
         self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
-        if mapping.home is not None:
+        if mapping.home is not None and self._has_start:
             self._parameters.append(self._parameter(mapping.home, self._start))
         self._true_feature = self._port(mapping.true_features or mapping.features)
         self._true_jacobian = self._port(mapping.true_jacobian) if mapping.true_jacobian else None

@@ -17,7 +17,8 @@ def build_plant(config: FmuConfig, mapping: FmuMapping, setup: PlantSetup) -> Fm
         ValueError: an FMU, mapping or setting that cannot be used; also where the FMU itself says so.
     """
     try:
-        return FmuPlant(config, mapping, setup.start, setup.period)
+        start = mapping.start if setup.start is None else setup.start
+        return FmuPlant(config, mapping, start, setup.period)
     except FmuError as error:
         raise ValueError(str(error)) from error
 
@@ -33,4 +34,5 @@ def mapped_entry(path: Path) -> PlantEntry:
     def build(config: FmuConfig, setup: PlantSetup) -> FmuPlant:
         return build_plant(config, mapping, setup)
 
-    return PlantEntry(f"fmu:{path}", f"the FMU {mapping.path.name}, as mapped by {path.name}", FmuConfig, build)
+    summary = f"the FMU {mapping.path.name}, as mapped by {path.name}"
+    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True)

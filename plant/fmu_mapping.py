@@ -5,6 +5,7 @@ inputs = ["v[1]", "v[2]"]          # joint velocity commands, rad/s
 features = ["hook"]                # an array, or all of hook[1], hook[2], ...
 joints = ["q"]                     # optional; without them commands are integrated
 home = "q0"                        # optional: the parameter that takes the joint positions at the start
+start = [0.3, 1.2]                 # optional: these joint positions, rad; needs a home, or that there are no joints
 period = 0.01                      # optional: the FMU's own step, s
 
 [parameters]
@@ -57,6 +58,7 @@ class FmuMapping:
         true_features: the features without any noise of the FMU's own; without them, the features.
         true_jacobian: ∂feature/∂joint, row-major (m, n); without it, the plant cannot tell.
         home: a parameter that takes the joint positions at the start, if there is one.
+        start: (n,), rad, joint positions at the start; None for the FMU's own.
         parameters: values by name, set before every run.
         period: the FMU's step, s; None for the control period.
         max_joint_speed: rad/s; commands are clipped to it.
@@ -75,6 +77,7 @@ class FmuMapping:
     true_features: Names = ()
     true_jacobian: Names = ()
     home: str | None = None
+    start: FloatArray | None = None
     parameters: Mapping[str, FloatArray] = field(default_factory=dict)
     period: float | None = None
     max_joint_speed: float = 1.0
@@ -179,6 +182,7 @@ _KEYS: dict[str, tuple[str, Callable[[str, object], Any]]] = {
     "features": ("features", _names),
     "joints": ("joints", _names),
     "home": ("home", _text),
+    "start": ("start", _numbers),
     "period": ("period", _number),
     "truth.features": ("true_features", _names),
     "truth.jacobian": ("true_jacobian", _names),
