@@ -19,7 +19,7 @@ from plant.fmu_entry import build_plant
 from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
 from plant.plant import PlantEntry, PlantSetup
-from plant.signals import check_number
+from plant.signals import as_vector, check_number
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,7 @@ def cached_fmu(fmi_version: int) -> Path:
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported UR5, with the true model of `setup` as its parameters."""
     model, start = setup.robot()
+    start = as_vector("start", start, model.arm.n)
     actuation = Actuation(config.lag, config.max_joint_speed, config.joint_range, start)
     parameters = parameters_of(model, actuation)
     del parameters["home"]
