@@ -58,6 +58,7 @@ class FmuMapping:
         true_features: the features without any noise of the FMU's own; without them, the features.
         true_jacobian: ∂feature/∂joint, row-major (m, n); without it, the plant cannot tell.
         home: a parameter that takes the joint positions at the start, if there is one.
+        camera: two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame.
         start: (n,), rad, joint positions at the start; None for the FMU's own.
         parameters: values by name, set before every run.
         period: the FMU's step, s; None for the control period.
@@ -77,6 +78,7 @@ class FmuMapping:
     true_features: Names = ()
     true_jacobian: Names = ()
     home: str | None = None
+    camera: tuple[str, str] | None = None
     start: FloatArray | None = None
     parameters: Mapping[str, FloatArray] = field(default_factory=dict)
     period: float | None = None

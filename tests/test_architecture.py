@@ -20,6 +20,7 @@ OWNERS = {
     "casadi": ("plant/symbolic", "controllers/laws/mpc", "controllers/nmpc", "fmus/"),
     "fmpy": ("plant/fmu", "fmus/"),
     "dask": ("harness/cluster",),
+    "distributed": ("harness/cluster",),
 }
 
 
