@@ -59,7 +59,7 @@ class FmuMapping:
         true_jacobian: ∂feature/∂joint, row-major (m, n); without it, the plant cannot tell.
         home: a parameter that takes the joint positions at the start, if there is one.
         camera: two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame.
-        start: (n,), rad, joint positions at the start; None for the FMU's own.
+        start: (n,), rad, at time 0, for an FMU with a home or without joints; None for the FMU's own.
         parameters: values by name, set before every run.
         period: the FMU's step, s; None for the control period.
         max_joint_speed: rad/s; commands are clipped to it.
@@ -98,6 +98,8 @@ class FmuMapping:
         check_number("max_joint_speed", self.max_joint_speed, above=0.0)
         if self.clips_itself and not self.joints:
             raise ValueError("clips_itself needs joints: commands cannot be integrated if the FMU changes them")
+        if self.start is not None and self.joints and self.home is None:
+            raise ValueError("start needs home, the parameter that takes it: the FMU tells its joints itself")
         if self.period is not None:
             check_number("period", self.period, above=0.0)
 

@@ -62,6 +62,7 @@ def test_every_key_arrives(tmp_path):
         ("joint_lower", "joint_low", "unknown key 'limits.joint_low'; did you mean 'limits.joint_lower'"),
         ('home = "q0"', "home = 3", "home must be text, got 3"),
         ('joints = ["q"]', "joints = [1]", r"joints must be a name or a list of names, got \[1\]"),
+        ('home = "q0"', "start = [0.1, 0.2]", "start needs home, the parameter that takes it"),
         ("period = 0.01", 'period = "short"', "period must be a number, got 'short'"),
         ("period = 0.01", "period = 0.0", "period must be above 0, got 0.0"),
         ("mass = 12", 'mass = "heavy"', "mass must be a number, got 'heavy'"),
