@@ -7,6 +7,7 @@ nested with dots. Nothing else is read from the files, and an unknown section or
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -97,7 +98,8 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - 
 
 def _assign(sections: dict[str, Any], assignment: str) -> None:
     key, equals, text = assignment.partition("=")
-    path = key.strip().split(".")
+    mapped = re.fullmatch(r"\s*(.+?\.toml)\.(.+)", key)  # a plant's name may be that of a file, fmu:crane.toml
+    path = [mapped[1], *mapped[2].strip().split(".")] if mapped else key.strip().split(".")
     if not equals or len(path) < 2 or not all(path):
         raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
     try:

@@ -11,7 +11,6 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-import casadi
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu as validate_by_fmpy
@@ -19,7 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmus import compile as compiling
-from fmus.casadi_import import FmuModel
 from fmus.compile import (
     PLATFORMS,
     CompilationFailed,
@@ -57,26 +55,6 @@ def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
     found = validate_fmu(cached_fmu(version))
     assert found.problems == ()
     assert found.deviation < 1e-12
-
-
-def test_casadi_reads_the_equations_back():
-    parameters = parameters_of(mismatched("severe"), default_actuation())
-    model = FmuModel(cached_fmu(2), parameters=parameters)
-    q = np.random.default_rng(0).uniform(-3.0, 3.0, (10, 6))
-    np.testing.assert_allclose(model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(model.feature(q[0]), mismatched("severe").feature(q[0]), rtol=0, atol=1e-9)
-    symbol = casadi.MX.sym("q", 6)
-    squared = casadi.Function("squared", [symbol], [casadi.gradient(casadi.sumsqr(model.symbolic(symbol)), symbol)])
-    wanted = 2.0 * mismatched("severe").jacobian(q[1]).T @ mismatched("severe").feature(q[1])
-    np.testing.assert_allclose(np.asarray(squared(q[1])).ravel(), wanted, rtol=0, atol=1e-9)
-    model.close()
-
-
-def test_what_casadi_cannot_read_is_one_clear_error():
-    with pytest.raises(ValueError, match="cannot be read by CasADi"):
-        FmuModel(cached_fmu(3))
-    with pytest.raises(ValueError, match="joints names 'elbow', which the FMU does not have; it has: joint_position"):
-        FmuModel(cached_fmu(2), joints=("elbow",))
 
 
 @settings(max_examples=50, deadline=None)
