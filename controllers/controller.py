@@ -52,8 +52,8 @@ class RobotKnowledge:
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
         true_jacobian: the same of the true robot; only handed to a controller whose entry asks for the truth.
-        true_symbolic: a CasADi expression q, (n, 1) rad -> the expression of the true robot's feature, (m, 1); under
-            the same condition. None where the plant has no closed form.
+        true_symbolic: a CasADi expression (MX) q, (n, 1) rad -> the expression of the true robot's feature, (m, 1);
+            under the same condition.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: returns trained networks, from a cache where it has them; None: networks are trained on the spot.

@@ -228,11 +228,17 @@ def _linearisation(symbolic: Any, n: int, m: int) -> casadi.Function:  # noqa: A
     Raises:
         ValueError: an expression of another size than (m, 1).
     """
-    q = casadi.SX.sym("joint_position", n)
+    create: Any = casadi.Function  # its annotations do not know MX
+    q = casadi.MX.sym("joint_position", n)
     feature = symbolic(q)
     if feature.shape != (m, 1):
         raise ValueError(f"true_symbolic must give an expression of shape ({m}, 1), got {feature.shape}")
-    return casadi.Function("linearisation", [q], [feature, casadi.jacobian(feature, q)])
+    function: casadi.Function = create("linearisation", [q], [feature, casadi.jacobian(feature, q)])
+    try:
+        expanded: casadi.Function = function.expand()
+    except RuntimeError:  # foreign code, such as an FMU's, has no scalar operations; expanding only saves time
+        return function
+    return expanded
 
 
 ENTRY = ControllerEntry(

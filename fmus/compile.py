@@ -49,14 +49,16 @@ class Platform:
 
 
 _LINUX = ("-fPIC", "-Wl,--build-id=none", "-s")
+# The library's own name and the map of its object files would be paths of the machine that compiles.
+_DARWIN = ("-fPIC", "-Wl,-install_name,@rpath/fmu.dylib", "-s")
 PLATFORMS = {
     platform.name: platform
     for platform in (
         # glibc 2.17 is what the oldest supported distributions have.
         Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17", _LINUX),
         Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17", _LINUX),
-        Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos", ("-fPIC",)),
-        Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos", ("-fPIC",)),
+        Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos", _DARWIN),
+        Platform("aarch64-darwin", "aarch64-darwin", ".dylib", "aarch64-macos", _DARWIN),
         Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu", ("-s",)),
     )
 }
@@ -131,5 +133,5 @@ def _compiler(target: Platform) -> list[str]:
         return [sys.executable, "-m", "ziglang", "cc", "-target", target.zig_target]
     wanted = "no C compiler was found" if target == this_platform() else "only zig compiles for another machine"
     raise CompilerMissing(
-        f"{target.name}: {wanted}; install gcc or clang (for this machine), or zig with pip install 'servobench[zig]'"
+        f"{target.name}: {wanted}; install gcc or clang (for this machine), or zig with pip install 'servobench[cross]'"
     )

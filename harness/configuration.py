@@ -98,8 +98,8 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - 
 
 def _assign(sections: dict[str, Any], assignment: str) -> None:
     key, equals, text = assignment.partition("=")
-    named = re.fullmatch(r"(.+\.toml)\.(.+)", key.strip())  # a section such as fmu:crane.toml keeps its dots
-    path = [named[1], *named[2].split(".")] if named else key.strip().split(".")
+    mapped = re.fullmatch(r"\s*(.+?\.toml)\.(.+)", key)  # a plant's name may be that of a file, fmu:crane.toml
+    path = [mapped[1], *mapped[2].strip().split(".")] if mapped else key.strip().split(".")
     if not equals or len(path) < 2 or not all(path):
         raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
     try:

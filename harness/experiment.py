@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from harness.training import network_source
 from plant.hand_eye import FEATURE_NAMES, HandEyeModel, hand_eye_spec
 from plant.kinematic import KinematicConfig
 from plant.mismatch import MismatchSample, parse_mismatch, sample_mismatch
-from plant.plant import Plant, PlantEntry, PlantSetup
+from plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from plant.seeds import named_seed
 from plant.signals import PlantSpec, RunFault, check_number
 from plant.symbolic import symbolic_feature
@@ -144,7 +145,7 @@ def build_experiment(
     try:
         source = network_source(nominal.jacobian, plant.spec, keep, progress)
         knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
-        controller = _build_controller(request, settings, knowledge, true)
+        controller = _build_controller(request, settings, knowledge, lambda: _equations(true))
     except BaseException:
         plant.close()
         raise
@@ -168,7 +169,9 @@ def train_networks(controller: str, settings: Settings, progress: Progress) -> T
         trained.append(source(config))
         return trained[-1]
 
-    _build_controller(RunRequest("", controller, "", "", 0), settings, replace(knowledge, train=obtain), nominal)
+    _build_controller(
+        RunRequest("", controller, "", "", 0), settings, replace(knowledge, train=obtain), lambda: _equations(nominal)
+    )
     if not trained:
         raise ConfigurationError(f"controller {controller} has no networks to train")
     return trained[-1]
@@ -185,7 +188,7 @@ def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
 
 
 def _build_with_own_robot(request: RunRequest, settings: Settings, run: RunSettings, entry: PlantEntry) -> Experiment:
-    """Make a run ready on a plant of whose robot nothing is known."""
+    """Make a run ready on a plant of whose robot only the plant itself knows anything."""
     if request.mismatch != "none":
         raise ConfigurationError(
             f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
@@ -195,11 +198,16 @@ def _build_with_own_robot(request: RunRequest, settings: Settings, run: RunSetti
         spec = plant.spec
         setting = TaskSetting(None, spec.n, spec.feature_names, named_seed(request.seed, "task"))
         scenario = _build_scenario(request, settings, setting)
-        controller = _build_controller(request, settings, RobotKnowledge(spec, run.preview), None)
+        knowledge = RobotKnowledge(spec, run.preview, plant.nominal_jacobian())
+        controller = _build_controller(request, settings, knowledge, plant.true_model)
     except BaseException:
         plant.close()
         raise
     return Experiment(plant, controller, scenario, run, None)
+
+
+def _equations(model: HandEyeModel) -> TrueModel:
+    return TrueModel(model.jacobian, symbolic_feature(model))
 
 
 def _build_scenario(request: RunRequest, settings: Settings, setting: TaskSetting) -> Scenario:
@@ -222,13 +230,18 @@ def _build_plant(request: RunRequest, settings: Settings, entry: PlantEntry, set
 
 
 def _build_controller(
-    request: RunRequest, settings: Settings, knowledge: RobotKnowledge, true: HandEyeModel | None
+    request: RunRequest, settings: Settings, knowledge: RobotKnowledge, tell: Callable[[], TrueModel]
 ) -> Controller:
+    """Build a controller; only one that asks for the truth has it told. Where no model is nominal, the truth is."""
     entry = find_controller(request.controller)
     config = settings.resolve(request.controller, entry.config())
-    if entry.needs_truth and true is not None:
-        knowledge = replace(knowledge, true_jacobian=true.jacobian, true_symbolic=symbolic_feature(true))
     try:
+        if entry.needs_truth:
+            true = tell()
+            nominal = knowledge.nominal_jacobian or true.jacobian
+            knowledge = replace(
+                knowledge, nominal_jacobian=nominal, true_jacobian=true.jacobian, true_symbolic=true.symbolic
+            )
         return entry.build(config, knowledge)
     except ValueError as error:
         raise ConfigurationError(f"controller {request.controller}: {error}") from error

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import ctypes
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -22,12 +22,22 @@ from plant.fmu_mapping import FmuMapping, Names, mapping_spec
 from plant.fmu_slave import Call, FmuError, Port, Slave
 from plant.fmu_slave2 import Slave2
 from plant.fmu_slave3 import Slave3
+from plant.fmu_symbolic import FmuModel, mapped_model
 from plant.fmu_variables import FmuDescription, read_description
 from plant.kinematics import rpy_from_rotation
-from plant.plant import Plant, whole_steps
+from plant.plant import Plant, TrueModel, whole_steps
 from plant.seeds import named_generator
 from plant.sensing import FeatureChannel
-from plant.signals import Command, FloatArray, Observation, PlantSpec, Truth, as_vector, check_number
+from plant.signals import (
+    Command,
+    FloatArray,
+    Observation,
+    PlantSpec,
+    Truth,
+    as_vector,
+    check_number,
+    trusted_observation,
+)
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,7 @@ class FmuPlant(Plant):
         self._delays = config.command_delay_periods > 0
         self._has_channel = config.latency_periods > 0 or config.drop_probability > 0.0
         self._states: list[ctypes.c_void_p] = []
+        self._mapping, self._models = mapping, list[FmuModel]()
         self._folder = FmuFolder(mapping.path)
         try:
             self.description = read_description(mapping.path, self._folder.root)
@@ -119,6 +130,14 @@ class FmuPlant(Plant):
         self._camera = mapping.camera
         self._true_feature = self._port(mapping.true_features or mapping.features)
         self._true_jacobian = self._port(mapping.true_jacobian) if mapping.true_jacobian else None
+        self._true = self._model({}) if mapping.true_states else None
+        self._nominal = None if mapping.nominal is None else self._model(mapping.nominal)
+
+    def _model(self, parameters: Mapping[str, FloatArray]) -> FmuModel:
+        """Return the equations of the FMU, by its model-exchange side; they are closed with the plant."""
+        model = mapped_model(self._mapping, self.description, parameters)
+        self._models.append(model)
+        return model
 
     def _parameter(self, name: str, values: FloatArray) -> Call:
         port = Port(self.description.find(name, "parameters"))
@@ -198,7 +217,7 @@ class FmuPlant(Plant):
             self._parameter(name, values)()
 
     def truth(self) -> Truth:
-        """Return the FMU's own feature and, where the mapping names it, its Jacobian."""
+        """Return the FMU's own feature and, where the mapping names it or its states, the Jacobian."""
         port, read = self._true_feature
         read()
         jacobian = None
@@ -206,7 +225,23 @@ class FmuPlant(Plant):
             matrix, read_matrix = self._true_jacobian
             read_matrix()
             jacobian = matrix.values.reshape(self._spec.m, self._spec.n).copy()
+        elif self._true is not None and self._has_joints:
+            jacobian = self._true.jacobian(self._result.values[: self._split])
         return Truth(port.values.copy(), jacobian)
+
+    def true_model(self) -> TrueModel:
+        """Return the FMU's own kinematics, by the directional derivatives of its model-exchange side.
+
+        Raises:
+            ValueError: it has no such side, or the joints and features are not states and outputs of it.
+        """
+        if self._true is None:
+            self._true = self._model({})
+        return TrueModel(self._true.jacobian, self._true.symbolic)
+
+    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+        """Return the FMU's Jacobian with the mapping's nominal parameters, or None where it has none."""
+        return None if self._nominal is None else self._nominal.jacobian
 
     def save_state(self) -> FmuPlantState:
         """Return the present state of the FMU and of everything around it.
@@ -251,6 +286,8 @@ class FmuPlant(Plant):
             self._states.clear()
             self._write = self._read = _closed
             slave.close()
+        for model in self._models:
+            model.close()
         self._folder.close()
 
     def _measure(self) -> tuple[FloatArray, FloatArray]:
@@ -275,26 +312,6 @@ def open_slave(description: FmuDescription, folder: FmuFolder) -> Slave:
     """Return an instance of an extracted FMU; it has to be closed before its folder."""
     kind: Callable[[FmuDescription, Path], Slave] = Slave2 if description.version == 2 else Slave3
     return kind(description, folder.root)
-
-
-def trusted_observation(time: float, joints: FloatArray, feature: FloatArray, valid: bool) -> Observation:
-    """Return an observation of arrays that are known to be fresh, finite, float64 and read-only.
-
-    `Observation` checks and copies what it is given, which costs more than the FMU's step; here both arrays come out of
-    a buffer that has just been checked.
-    """
-    observation = _new(Observation)
-    _set_time(observation, time)
-    _set_joints(observation, joints)
-    _set_feature(observation, feature)
-    _set_valid(observation, valid)
-    return observation
-
-
-_new = object.__new__
-_set_time, _set_joints, _set_feature, _set_valid = (
-    getattr(Observation, name).__set__ for name in ("time", "joint_position", "feature", "feature_valid")
-)
 
 
 def _closed() -> int:

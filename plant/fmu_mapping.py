@@ -12,9 +12,13 @@ period = 0.01                      # optional: the FMU's own step, s
 mass = 12.5
 gains = [1.0, 2.0]
 
-[truth]                            # optional, for the log only
+[nominal]                          # optional: values that controllers believe where they differ from [parameters];
+mass = 10.0                        # needs model exchange with directional derivatives
+
+[truth]                            # optional, for the log and upper bounds only
 features = ["hook"]
 jacobian = ["J"]                   # row-major
+states = ["q"]                     # of the model-exchange side: those that are the joint positions
 
 [limits]                           # optional
 max_joint_speed = 1.0              # rad/s
@@ -56,11 +60,14 @@ class FmuMapping:
         features: what is measured; they give m.
         joints: joint positions, rad; without them commands are integrated from the start.
         true_features: the features without any noise of the FMU's own; without them, the features.
-        true_jacobian: ∂feature/∂joint, row-major (m, n); without it, the plant cannot tell.
+        true_jacobian: ∂feature/∂joint, row-major (m, n); without it, the plant asks the model-exchange side if
+            `true_states` are named, and cannot tell otherwise.
+        true_states: states of the model-exchange side that are the joint positions; without them, the joints.
         home: a parameter that takes the joint positions at the start, if there is one.
         camera: two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame.
         start: (n,), rad, at time 0, for an FMU with a home or without joints; None for the FMU's own.
         parameters: values by name, set before every run.
+        nominal: the values that controllers believe, where they differ; None: there is no nominal model.
         period: the FMU's step, s; None for the control period.
         max_joint_speed: rad/s; commands are clipped to it.
         clips_itself: the FMU does the clipping.
@@ -77,10 +84,12 @@ class FmuMapping:
     joints: Names = ()
     true_features: Names = ()
     true_jacobian: Names = ()
+    true_states: Names = ()
     home: str | None = None
     camera: tuple[str, str] | None = None
     start: FloatArray | None = None
     parameters: Mapping[str, FloatArray] = field(default_factory=dict)
+    nominal: Mapping[str, FloatArray] | None = None
     period: float | None = None
     max_joint_speed: float = 1.0
     clips_itself: bool = False
@@ -126,15 +135,18 @@ def read_mapping(path: Path) -> FmuMapping:
 
 def _arguments(table: dict[str, Any]) -> dict[str, Any]:
     """Return the arguments of `FmuMapping` that a TOML table holds."""
-    parameters = table.pop("parameters", {})
-    if not isinstance(parameters, dict):
-        raise ValueError("parameters must be a section, [parameters]")  # noqa: TRY004 - of a file, not of a call
-    arguments: dict[str, Any] = {"parameters": {name: _numbers(name, value) for name, value in parameters.items()}}
+    arguments: dict[str, Any] = {}
+    for section in _SECTIONS:
+        if section in table:
+            values = table.pop(section)
+            if not isinstance(values, dict):
+                raise ValueError(f"{section} must be a section, [{section}]")
+            arguments[section] = {name: _numbers(name, value) for name, value in values.items()}
     for key, value in _flatten(table):
         if key not in _KEYS:
             nearest = difflib.get_close_matches(key, _KEYS, n=1)
             hint = f"did you mean {nearest[0]!r}? " if nearest else ""
-            raise ValueError(f"unknown key {key!r}; {hint}valid: {', '.join(_KEYS)}, [parameters]")
+            raise ValueError(f"unknown key {key!r}; {hint}valid: {', '.join(_KEYS)}, [parameters], [nominal]")
         argument, convert = _KEYS[key]
         arguments[argument] = convert(key, value)
     for key in ("file", "inputs", "features"):
@@ -180,6 +192,7 @@ def _numbers(key: str, value: object) -> FloatArray:
     return np.array(_number(key, value))
 
 
+_SECTIONS = ("parameters", "nominal")  # in which any name may stand
 _KEYS: dict[str, tuple[str, Callable[[str, object], Any]]] = {
     "file": ("path", _path),
     "inputs": ("inputs", _names),
@@ -190,6 +203,7 @@ _KEYS: dict[str, tuple[str, Callable[[str, object], Any]]] = {
     "period": ("period", _number),
     "truth.features": ("true_features", _names),
     "truth.jacobian": ("true_jacobian", _names),
+    "truth.states": ("true_states", _names),
     "limits.max_joint_speed": ("max_joint_speed", _number),
     "limits.joint_lower": ("joint_lower", _number),
     "limits.joint_upper": ("joint_upper", _number),
@@ -210,7 +224,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         if variable.causality != "input":
             raise ValueError(f"inputs names {variable.name!r}, which is of causality {variable.causality}")
     n, m = total_size(inputs), total_size(features)
-    wanted = {"joints": n, "true_features": m, "true_jacobian": n * m}
+    wanted = {"joints": n, "true_features": m, "true_jacobian": n * m, "true_states": n}
     for name, size in wanted.items():
         names: Names = getattr(mapping, name)
         came = total_size(description.select(names, name))

@@ -124,14 +124,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
     Raises:
         ValueError: broken, of FMI 1, or without co-simulation.
     """
-    from fmpy import read_model_description  # noqa: PLC0415 - takes a third of a second and loads libraries
-
-    try:
-        description = read_model_description(str(root), validate=False)
-    except Exception as error:  # fmpy raises bare ones of every kind
-        raise ValueError(
-            f"fmu file {path} has a broken modelDescription.xml: {' '.join(str(error).split())}"
-        ) from error
+    description = _read(path, root)
     version = str(description.fmiVersion)
     if not version.startswith(("2.", "3.")):
         raise ValueError(f"fmu file {path} is of FMI {version}; wanted FMI 2 or 3")
@@ -151,6 +144,38 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         variables=tuple(Variable(v.name, v.valueReference, _size(v, path), v.causality or "local") for v in reals),
         other_types={v.name: v.type for v in description.modelVariables if v.type not in REAL_TYPES},
     )
+
+
+def read_exchange(path: Path, root: Path) -> None:
+    """Check that the FMU at `path`, extracted to `root`, tells its own derivatives in model exchange.
+
+    Raises:
+        ValueError: broken, not of FMI 2, without model exchange or without directional derivatives.
+    """
+    description = _read(path, root)
+    version, exchange = str(description.fmiVersion), description.modelExchange
+    wanted = "wanted FMI 2 with model exchange and directional derivatives"
+    if not version.startswith("2."):
+        raise ValueError(f"fmu file {path} is of FMI {version}, so its Jacobian cannot be read; {wanted}")
+    if exchange is None:
+        raise ValueError(f"fmu file {path} offers no model exchange, so its Jacobian cannot be read; {wanted}")
+    if not exchange.providesDirectionalDerivative:
+        raise ValueError(f"fmu file {path} has no directional derivatives, so its Jacobian cannot be read; {wanted}")
+    if exchange.canBeInstantiatedOnlyOncePerProcess:
+        raise ValueError(
+            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read beside a run"
+        )
+
+
+def _read(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's classes carry no usable types
+    from fmpy import read_model_description  # noqa: PLC0415 - takes a third of a second and loads libraries
+
+    try:
+        return read_model_description(str(root), validate=False)
+    except Exception as error:  # fmpy raises bare ones of every kind
+        raise ValueError(
+            f"fmu file {path} has a broken modelDescription.xml: {' '.join(str(error).split())}"
+        ) from error
 
 
 def _size(variable: Any, path: Path) -> int:  # noqa: ANN401 - fmpy's variables carry no usable types

@@ -32,6 +32,19 @@ class FeatureLost(RunFault):
     status: ClassVar[str] = "feature_lost"
 
 
+@dataclass(frozen=True, eq=False)
+class TrueModel:
+    """The kinematics of the true robot; for upper bounds only.
+
+    Attributes:
+        jacobian: (..., n) rad -> (..., m, n), unit of the feature per rad.
+        symbolic: from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1).
+    """
+
+    jacobian: Callable[[FloatArray], FloatArray]
+    symbolic: Callable[[Any], Any]
+
+
 class Plant(ABC):
     """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
 
@@ -72,6 +85,20 @@ class Plant(ABC):
     @abstractmethod
     def truth(self) -> Truth:
         """Return the present true feature and Jacobian; for evaluation only."""
+
+    def true_model(self) -> TrueModel:
+        """Return the kinematics of a robot that the plant brings itself; for upper bounds only.
+
+        It lives as long as the plant.
+
+        Raises:
+            ValueError: the plant cannot tell; says why.
+        """
+        raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
+
+    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+        """Return what everybody may know of a robot that the plant brings itself, (..., n) -> (..., m, n); or None."""
+        return None
 
     def picture(self) -> ImageArray | None:
         """Return what the camera sees now, (h, w, 3) RGB with the detection drawn in; None without a camera.

@@ -8,7 +8,6 @@ function (or generated C code) whose geometry stays a parameter.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
@@ -102,10 +101,11 @@ def symbolic_model(model: HandEyeModel) -> casadi.Function:
     return casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
 
 
-def symbolic_feature(model: HandEyeModel) -> Callable[[SX], SX]:
-    """Return the function from the expression of q, (n, 1) rad, to that of the feature, (3, 1) m."""
-    geometry = geometry_of(model)
-    return lambda joint_position: feature_and_jacobian(joint_position, geometry)[0]
+def symbolic_feature(model: HandEyeModel) -> casadi.Function:
+    """Return q -> feature, (n,) rad -> (3,) m, with the numbers of `model` bound."""
+    q = casadi.SX.sym("joint_position", model.arm.n)
+    feature = feature_and_jacobian(q, geometry_of(model))[0]
+    return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 
 def _rotation(rpy: SX) -> SX:

@@ -1,9 +1,22 @@
-"""Numpy's floating-point errors raise in every test."""
+"""Numpy's floating-point errors raise in every test, and no test writes to the user's cache folder."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import tempfile
+
 import numpy as np
 import pytest
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep networks and FMUs that tests make in a folder of the session, which all workers and subprocesses share."""
+    if hasattr(config, "workerinput"):
+        return
+    folder = tempfile.mkdtemp(prefix="servobench-tests-")
+    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    os.environ["XDG_CACHE_HOME"] = folder
 
 
 @pytest.fixture(autouse=True)

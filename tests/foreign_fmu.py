@@ -16,7 +16,32 @@ from pathlib import Path
 from fmus.compile import this_platform
 
 SOURCES = Path(__file__).parent / "foreign_fmu_sources"
+STARTS = {"push": (0.0, 0.0), "arm": (0.5, 0.4)}
 SCALARS = [("wheel", 10, "output"), ("push", 20, "input"), ("place", 30, "output"), ("arm", 40, "parameter")]
+
+
+def describe_exchange(derivatives: bool = True) -> str:
+    """Return the model description of FMI 2 with a model-exchange side, whose states are the joints."""
+    text = describe(2)
+    names = ("wheel.slew", "wheel.luff")
+    rates = "".join(
+        f'<ScalarVariable name="der({name})" valueReference="{60 + i}"><Real derivative="{i + 1}"/></ScalarVariable>'
+        for i, name in enumerate(names)
+    )
+    first = text.count("<ScalarVariable") + 1
+    outputs, rows = "".join(map(_unknown, (1, 2, 5, 6))), "".join(map(_unknown, (first, first + 1)))
+    sections = {"Outputs": outputs, "Derivatives": rows, "InitialUnknowns": outputs + rows}
+    structure = "".join(f"<{name}>{unknowns}</{name}>" for name, unknowns in sections.items())
+    provides = f'providesDirectionalDerivative="{str(derivatives).lower()}"'
+    exchange = f'<ModelExchange modelIdentifier="crane" {provides}/>'
+    text = text.replace("<CoSimulation", f"{exchange}<CoSimulation").replace(
+        "</ModelVariables>", f"{rates}</ModelVariables>"
+    )
+    return text.replace("<ModelStructure/>", f"<ModelStructure>{structure}</ModelStructure>")
+
+
+def _unknown(index: int) -> str:
+    return f'<Unknown index="{index}"/>'
 
 
 def describe(version: int) -> str:
@@ -25,15 +50,16 @@ def describe(version: int) -> str:
     rows = []
     for name, reference, causality in SCALARS:
         common = f'causality="{causality}" variability="{variability[causality]}"'
-        start = "" if causality == "output" else 'start="{}"'
+        starts = STARTS.get(name)
         if version == 3:
             inner = '<Dimension valueReference="60"/>'
-            head = f'<Float64 name="{name}" valueReference="{reference}" {common} {start.format("0.5 0.4")}>'
+            start = f'start="{starts[0]} {starts[1]}"' if starts else ""
+            head = f'<Float64 name="{name}" valueReference="{reference}" {common} {start}>'
             rows.append(f"{head}{inner}</Float64>")
         else:
             rows += [
                 f'<ScalarVariable name="{name}.{part}" valueReference="{reference + i}" {common}>'
-                f"<Real {start.format(0.5)}/></ScalarVariable>"
+                + (f'<Real start="{starts[i]}"/></ScalarVariable>' if starts else "<Real/></ScalarVariable>")
                 for i, part in enumerate(("slew", "luff"))
             ]
     if version == 3:

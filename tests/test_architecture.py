@@ -17,7 +17,7 @@ MAY_IMPORT = {
 }
 OWNERS = {
     "pybullet": ("plant/scene",),
-    "casadi": ("plant/symbolic", "controllers/laws/mpc", "controllers/nmpc", "fmus/"),
+    "casadi": ("plant/symbolic", "plant/fmu_symbolic", "controllers/laws/mpc", "controllers/nmpc", "fmus/"),
     "fmpy": ("plant/fmu", "fmus/"),
     "dask": ("harness/cluster",),
     "distributed": ("harness/cluster",),

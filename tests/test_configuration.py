@@ -38,6 +38,11 @@ def test_assignments_reach_nested_fields_and_leave_the_rest():
     assert got == Outer(on=True, name="b c", point=(1.0, 2.5), inner=Inner(2.0, "two"))
 
 
+def test_a_section_may_have_the_name_of_a_mapping_file():
+    got = read_settings(None, ["fmu:../my.cranes/a.toml.count=4", "fmu:../my.cranes/a.toml.inner.gain=3"])
+    assert got.resolve("fmu:../my.cranes/a.toml", Outer()) == Outer(count=4, inner=Inner(3.0))
+
+
 def test_assignments_win_over_the_file(tmp_path):
     file = tmp_path / "settings.toml"
     file.write_text("[outer]\ncount = 5\n[outer.inner]\ngain = 4.0\n")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import shutil
 import subprocess
+import sys
+import tempfile
 import zipfile
 from pathlib import Path
 
-import casadi
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu as validate_by_fmpy
@@ -15,8 +18,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmus import compile as compiling
-from fmus.casadi_import import FmuModel
-from fmus.compile import CompilationFailed, CompilerMissing, compile_library, parse_platforms, this_platform
+from fmus.compile import (
+    PLATFORMS,
+    CompilationFailed,
+    CompilerMissing,
+    compile_library,
+    parse_platforms,
+    this_platform,
+)
 from fmus.export import ExportOptions, arm_layout, default_actuation, export_fmu
 from fmus.information import read_information
 from fmus.reference import OUTPUT_FILE, reference_run
@@ -48,26 +57,6 @@ def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
     assert found.deviation < 1e-12
 
 
-def test_casadi_reads_the_equations_back():
-    parameters = parameters_of(mismatched("severe"), default_actuation())
-    model = FmuModel(cached_fmu(2), parameters=parameters)
-    q = np.random.default_rng(0).uniform(-3.0, 3.0, (10, 6))
-    np.testing.assert_allclose(model.jacobian(q), mismatched("severe").jacobian(q), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(model.feature(q[0]), mismatched("severe").feature(q[0]), rtol=0, atol=1e-9)
-    symbol = casadi.MX.sym("q", 6)
-    squared = casadi.Function("squared", [symbol], [casadi.gradient(casadi.sumsqr(model.symbolic(symbol)), symbol)])
-    wanted = 2.0 * mismatched("severe").jacobian(q[1]).T @ mismatched("severe").feature(q[1])
-    np.testing.assert_allclose(np.asarray(squared(q[1])).ravel(), wanted, rtol=0, atol=1e-9)
-    model.close()
-
-
-def test_what_casadi_cannot_read_is_one_clear_error():
-    with pytest.raises(ValueError, match="cannot be read by CasADi"):
-        FmuModel(cached_fmu(3))
-    with pytest.raises(ValueError, match="joints names 'elbow', which the FMU does not have; it has: joint_position"):
-        FmuModel(cached_fmu(2), joints=("elbow",))
-
-
 @settings(max_examples=50, deadline=None)
 @given(st.tuples(*[st.integers(-314, 314).map(lambda k: k / 100)] * 3), st.sampled_from([None, np.pi / 2, -np.pi / 2]))
 def test_camera_and_arm_survive_the_way_through_the_parameters(rpy, pitch):
@@ -84,19 +73,73 @@ def test_a_model_comes_back_from_its_parameters(mismatch):
     np.testing.assert_allclose(back.feature(q), model.feature(q), rtol=0, atol=1e-12)
 
 
-def test_start_values_are_those_of_the_sampled_mismatch_and_equal_inputs_give_equal_files(tmp_path):
-    options = ExportOptions(2, mismatched("severe"), mismatch="severe, seed 3")
-    first, second = (export_fmu(tmp_path / name, options) for name in ("first.fmu", "second.fmu"))
-    assert first.read_bytes() == second.read_bytes()
-    starts = {variable.name: variable.start for variable in read_information(first).variables}
+def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
+    path = export_fmu(tmp_path / "severe.fmu", ExportOptions(2, mismatched("severe"), mismatch="severe, seed 3"))
+    starts = {variable.name: variable.start for variable in read_information(path).variables}
     wanted = parameters_of(mismatched("severe"), default_actuation())
     for group in arm_layout(6).of_role("parameter"):
         assert [float(starts[name]) for name in group.scalar_names()] == wanted[group.name].tolist()
-    assert validate_fmu(first).problems == ()
-    with zipfile.ZipFile(first) as archive:
+    assert validate_fmu(path).problems == ()
+    with zipfile.ZipFile(path) as archive:
         assert "severe, seed 3" in archive.read("documentation/index.html").decode()
-        assert str(Path.cwd()).encode() not in b"".join(archive.read(name) for name in archive.namelist())
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["first.fmu", "second.fmu"]
+    assert [item.name for item in tmp_path.iterdir()] == ["severe.fmu"]
+
+
+EXPORT = """
+import sys
+from pathlib import Path
+from fmus.compile import parse_platforms
+from fmus.export import ExportOptions, export_fmu
+export_fmu(Path("again.fmu"), ExportOptions(int(sys.argv[1]), platforms=parse_platforms(sys.argv[2])))
+"""
+WITH_ZIG = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed")
+
+
+@pytest.mark.parametrize("platforms", [this_platform().name, pytest.param("all", marks=WITH_ZIG)])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_equal_inputs_give_equal_files_in_another_process_folder_and_time(version, platforms, tmp_path):
+    first = export_fmu(tmp_path / "first.fmu", ExportOptions(version, platforms=parse_platforms(platforms)))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    changed = {"TMPDIR": str(elsewhere), "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "PYTHONPATH": path_of_packages()}
+    subprocess.run(
+        [sys.executable, "-c", EXPORT, str(version), platforms], cwd=elsewhere, env=os.environ | changed, check=True
+    )
+    assert first.read_bytes() == (elsewhere / "again.fmu").read_bytes()
+    assert [item.name for item in elsewhere.iterdir()] == ["again.fmu"]
+    with zipfile.ZipFile(first) as archive:
+        content = b"".join(archive.read(name) for name in archive.namelist())
+    for path in (tempfile.gettempdir(), str(Path.home()), str(Path.cwd())):
+        assert path.encode() not in content
+
+
+def path_of_packages() -> str:
+    return os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
+
+
+MAGIC = {
+    "x86_64-linux": (b"\x7fELF", b"\x3e\x00", 18),
+    "aarch64-linux": (b"\x7fELF", b"\xb7\x00", 18),
+    "x86_64-darwin": (b"\xcf\xfa\xed\xfe", b"\x07\x00\x00\x01", 4),
+    "aarch64-darwin": (b"\xcf\xfa\xed\xfe", b"\x0c\x00\x00\x01", 4),
+    "x86_64-windows": (b"MZ", b"", 0),
+}
+
+
+@WITH_ZIG
+@pytest.mark.parametrize("version", VERSIONS)
+def test_zig_puts_libraries_for_five_platforms_into_one_fmu(version, tmp_path):
+    path = export_fmu(tmp_path / "all.fmu", ExportOptions(version, platforms=parse_platforms("all")))
+    assert set(MAGIC) == set(PLATFORMS)
+    with zipfile.ZipFile(path) as archive:
+        for name, (magic, machine, offset) in MAGIC.items():
+            target = PLATFORMS[name]
+            inside = f"binaries/{target.folder(version)}/ur5_mismatched{target.suffix}"
+            content = archive.read(inside)
+            assert content.startswith(magic), name
+            assert content[offset:].startswith(machine), name
+            assert f"fmi{version}DoStep".encode() in content or name.endswith("darwin")  # whose names share prefixes
+    assert validate_fmu(path).problems == ()
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -170,7 +213,7 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
         Ur5FmuConfig(fmi_version=4)
     monkeypatch.setattr(compiling.shutil, "which", lambda _: None)
     monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(CompilerMissing, match=r"install gcc or clang.*zig with pip install 'servobench\[zig\]'"):
+    with pytest.raises(CompilerMissing, match=r"install gcc or clang.*zig with pip install 'servobench\[cross\]'"):
         export_fmu(tmp_path / "ur5.fmu", ExportOptions(2))
     assert list(tmp_path.iterdir()) == []
     cached_fmu.cache_clear()

@@ -7,7 +7,7 @@
 enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION };
 
 typedef struct {
-    double time, wheel[2], push[2], place[2], arm[2], quirk;
+    double time, wheel[2], push[2], place[2], arm[2], quirk, rate[2];
 } Crane;
 
 static void place(Crane *c)
@@ -33,9 +33,9 @@ static void move(Crane *c, double h)
     place(c);
 }
 
-/* References: 10 and 11 wheel, 20 and 21 push, 30 and 31 place, 40 and 41 arm, 50 quirk. */
+/* References: 10 and 11 wheel, 20 and 21 push, 30 and 31 place, 40 and 41 arm, 50 quirk, 60 and 61 rate. */
 static double *at(Crane *c, unsigned reference)
 {
-    double *groups[] = {c->wheel, c->push, c->place, c->arm, &c->quirk};
+    double *groups[] = {c->wheel, c->push, c->place, c->arm, &c->quirk, c->rate};
     return groups[reference / 10 - 1] + reference % 10;
 }

@@ -44,8 +44,11 @@ int fmi2SetReal(void *c, const unsigned *references, size_t n, const double *val
     return 0;
 }
 
-int fmi2GetReal(void *c, const unsigned *references, size_t n, double *values)
+int fmi2GetReal(void *component, const unsigned *references, size_t n, double *values)
 {
+    Crane *c = component;
+    place(c);
+    for (int i = 0; i < 2; i++) c->rate[i] = c->push[i];
     for (size_t i = 0; i < n; i++) values[i] = *at(c, references[i]);
     return 0;
 }
@@ -71,3 +74,79 @@ int fmi2DoStep(void *component, double time, double h, int unused)
     move(c, h);
     return 0;
 }
+
+/* Model exchange: d(wheel)/dt = rate = push. */
+
+typedef struct {
+    int repeat, terminate, nominals, values, has_next;
+    double next;
+} EventInfo;
+
+int fmi2EnterEventMode(void *c) { return 0; }
+
+int fmi2NewDiscreteStates(void *c, EventInfo *info)
+{
+    *info = (EventInfo){0};
+    return 0;
+}
+
+int fmi2EnterContinuousTimeMode(void *c) { return 0; }
+
+int fmi2CompletedIntegratorStep(void *c, int no_set_state, int *event, int *terminate)
+{
+    *event = *terminate = 0;
+    return 0;
+}
+
+int fmi2SetTime(void *c, double time)
+{
+    ((Crane *)c)->time = time;
+    return 0;
+}
+
+int fmi2SetContinuousStates(void *c, const double *states, size_t n)
+{
+    for (size_t i = 0; i < n; i++) ((Crane *)c)->wheel[i] = states[i];
+    return 0;
+}
+
+int fmi2GetContinuousStates(void *c, double *states, size_t n)
+{
+    for (size_t i = 0; i < n; i++) states[i] = ((Crane *)c)->wheel[i];
+    return 0;
+}
+
+int fmi2GetDerivatives(void *c, double *rates, size_t n)
+{
+    for (size_t i = 0; i < n; i++) rates[i] = ((Crane *)c)->push[i];
+    return 0;
+}
+
+int fmi2GetDirectionalDerivative(void *component, const unsigned *unknowns, size_t n_unknowns, const unsigned *knowns,
+                                 size_t n_knowns, const double *seed, double *sensitivity)
+{
+    const Crane *c = component;
+    Crane along = {0};
+    for (size_t i = 0; i < n_knowns; i++) *at(&along, knowns[i]) = seed[i];
+    double angle = 0, turn = 0;
+    for (int i = 0; i < 2; i++) {
+        angle += c->wheel[i];
+        turn += along.wheel[i];
+        along.place[0] += along.arm[i] * cos(angle) - c->arm[i] * sin(angle) * turn;
+        along.place[1] += along.arm[i] * sin(angle) + c->arm[i] * cos(angle) * turn;
+        along.rate[i] = along.push[i];
+    }
+    for (size_t i = 0; i < n_unknowns; i++) sensitivity[i] = *at(&along, unknowns[i]);
+    return 0;
+}
+
+/* What an importer may ask for besides; of these variables the crane has only the gear. */
+#define UNUSED(name, type)                                                                \
+    int name(void *c, const unsigned *references, size_t n, type values) { return 0; }
+
+UNUSED(fmi2GetInteger, int *)
+UNUSED(fmi2GetBoolean, int *)
+UNUSED(fmi2GetString, const char **)
+UNUSED(fmi2SetInteger, const int *)
+UNUSED(fmi2SetBoolean, const int *)
+UNUSED(fmi2SetString, const char *const *)
