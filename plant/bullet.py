@@ -165,6 +165,7 @@ class BulletPlant(Plant):
         self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self._camera, self._depth_noise = config.camera(), config.noise()
         self._X_BC, self._view_of = model.X_BC, view_of
+        self.move_camera(model.X_BC)
         self._scene: Scene = Scene(
             model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view
         )
