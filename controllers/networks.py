@@ -1,6 +1,6 @@
 """The two radial-basis networks of the proposed method, as pure functions and frozen records.
 
-Jacobian network (eqs. 29, 30, 40, 41), one network for each joint column i:
+Jacobian network (eqs. 28–30, 40, 41), one network for each joint column i:
 
     Ĵ_i(q) = W_i θ_i(q),   θ_il = exp(−(‖q − c_il‖ / δ_il)²)
 
