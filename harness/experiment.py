@@ -14,6 +14,7 @@ from controllers.network_file import TrainedNetworks
 from controllers.training import Progress
 from controllers.training_config import TrainingConfig
 from harness.configuration import ConfigurationError, Settings
+from harness.defaults import default_config
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.tasks import Scenario, TaskSetting, find_task, task_names
 from harness.training import network_source
@@ -191,7 +192,7 @@ def _build_controller(
     request: RunRequest, settings: Settings, knowledge: RobotKnowledge, true: HandEyeModel | None
 ) -> Controller:
     entry = find_controller(request.controller)
-    config = settings.resolve(request.controller, entry.config())
+    config = settings.resolve(request.controller, default_config(entry))
     if entry.needs_truth and true is not None:
         knowledge = replace(knowledge, true_jacobian=true.jacobian, true_symbolic=symbolic_feature(true))
     try:

@@ -20,6 +20,8 @@ OWNERS = {
     "casadi": ("plant/symbolic", "controllers/laws/mpc", "controllers/nmpc", "fmus/"),
     "fmpy": ("plant/fmu", "fmus/"),
     "dask": ("harness/cluster",),
+    "optuna": ("harness/tuning/",),
+    "statsmodels": ("harness/statistics",),
 }
 
 
