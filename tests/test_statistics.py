@@ -150,6 +150,16 @@ def test_the_signed_rank_test_enumerates_all_signs():
     assert signed_rank_p_value(difference) == pytest.approx(min(1.0, share))
 
 
+def test_zeros_keep_their_ranks_as_pratt_has_it():
+    """Normal approximation by hand: zeros are ranked, then left out of the sum and of its variance."""
+    difference = np.round(np.random.default_rng(0).normal(0.05, 0.1, 60) / 0.05) * 0.05
+    ranks = stats.rankdata(np.round(np.abs(difference), 9))
+    moved = np.abs(difference) > 1e-9
+    assert 5 < np.sum(~moved) < 20
+    distance = abs(ranks[difference > 1e-9].sum() - ranks[moved].sum() / 2) / np.sqrt(np.sum(ranks[moved] ** 2) / 4)
+    assert signed_rank_p_value(difference) == pytest.approx(2 * stats.norm.sf(distance), rel=1e-9)
+
+
 def test_equal_pairs_are_no_evidence_and_rounding_makes_no_ranks():
     assert signed_rank_p_value(np.zeros(5)) == 1.0
     exact = np.array([1, 1, 1, 0, 0, -1, 1, 1, 2, 1]) / 20

@@ -279,9 +279,10 @@ def test_a_study_in_use_by_another_call_is_refused(made_up, tmp_path):
 
 
 def test_a_file_that_is_no_study_is_refused(tmp_path):
-    (tmp_path / "rls.journal").write_text("hello\nworld\n")
+    (tmp_path / "rls.journal").write_text("hello\nworld")
     with pytest.raises(ConfigurationError, match="rls.journal cannot be opened"):
         open_studies(tmp_path, TuningPlan(("rls",), 1, SMALL))
+    assert (tmp_path / "rls.journal").read_text().startswith("hello\nworld")
 
 
 def test_costs_without_a_trial_are_refused(tmp_path):

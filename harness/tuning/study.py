@@ -205,7 +205,7 @@ def mend_journal(path: Path) -> None:
     if path.is_file():
         data = path.read_bytes()
         whole = data.rfind(b"\n") + 1
-        if whole < len(data):
+        if data.startswith(b"{") and whole < len(data):
             with path.open("r+b") as file:
                 file.truncate(whole)
 
