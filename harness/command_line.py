@@ -17,6 +17,7 @@ from controllers.composed import ESTIMATORS, LAWS
 from harness import results
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings
+from harness.defaults import default_config
 from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
 from harness.fmu_commands import fmu_app
@@ -28,6 +29,7 @@ from harness.summary import summary_tables
 from harness.sweep_command import sweep
 from harness.tasks import find_task, task_names
 from harness.training import cache_folder
+from harness.tune_command import tune
 
 INTERRUPTED = 130
 
@@ -45,6 +47,7 @@ NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of t
 
 app.add_typer(fmu_app, name="fmu")
 app.command()(sweep)
+app.command()(tune)
 
 
 @app.command()
@@ -56,7 +59,7 @@ def plants(name: NameArgument = None) -> None:
 @app.command()
 def controllers(name: NameArgument = None) -> None:
     """List the controllers, or show the settings of one."""
-    _list_or_show("controllers", name, controller_names(), find_controller, lambda entry: entry.config())
+    _list_or_show("controllers", name, controller_names(), find_controller, default_config)
 
 
 @app.command()

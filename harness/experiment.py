@@ -16,6 +16,7 @@ from controllers.network_file import TrainedNetworks
 from controllers.training import Progress
 from controllers.training_config import TrainingConfig
 from harness.configuration import ConfigurationError, Settings
+from harness.defaults import default_config
 from harness.loop import CameraMove, LoopSettings
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.tasks import Scenario, TaskSetting, find_task, task_names
@@ -234,7 +235,7 @@ def _build_controller(
 ) -> Controller:
     """Build a controller; only one that asks for the truth has it told. Where no model is nominal, the truth is."""
     entry = find_controller(request.controller)
-    config = settings.resolve(request.controller, entry.config())
+    config = settings.resolve(request.controller, default_config(entry))
     try:
         if entry.needs_truth:
             true = tell()

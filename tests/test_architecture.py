@@ -21,6 +21,8 @@ OWNERS = {
     "fmpy": ("plant/fmu", "fmus/"),
     "dask": ("harness/cluster",),
     "distributed": ("harness/cluster",),
+    "optuna": ("harness/tuning/",),
+    "statsmodels": ("harness/statistics",),
 }
 
 
