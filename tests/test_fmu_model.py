@@ -310,7 +310,7 @@ def test_memory_stays_flat_over_two_thousand_instances(version):
                 slave.free(state)
                 slave.close()
 
-        live(50)
+        live(1000)  # until the allocator has what it needs
         before = resident()
         live(2000)
         assert resident() - before < 1e6  # one lost state an instance would be 2.5e6
