@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fmpy import read_model_description
-
 from plant.fmu_archive import FmuFolder
+from plant.fmu_variables import parse_description
 
 
 @dataclass(frozen=True)
@@ -61,12 +60,7 @@ def read_information(path: Path) -> FmuInformation:
     folder = FmuFolder(path)
     try:
         root = folder.root
-        try:
-            description = read_model_description(str(root), validate=False)
-        except Exception as error:  # fmpy raises bare ones of every kind
-            raise ValueError(
-                f"fmu file {path} has a broken modelDescription.xml: {' '.join(str(error).split())}"
-            ) from error
+        description = parse_description(path, root)
         offered = {
             "co-simulation": description.coSimulation,
             "model exchange": description.modelExchange,

@@ -39,8 +39,8 @@ def validate_fmu(path: Path) -> Validation:
     """
     folder = FmuFolder(path)
     try:
-        problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
         description = read_description(path, folder.root)
+        problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
         deviation = None
         if (folder.root / INPUT_FILE).is_file() and (folder.root / OUTPUT_FILE).is_file():
             try:

@@ -190,7 +190,7 @@ class FmuPlant(Plant):
             np.maximum(buffer, self._lower, out=buffer)
         status = self._write()
         if status:
-            self._slave.check("writing the command", status)
+            self._slave.check(f"writing {self._command.summary}", status)
         if self._substeps == 1:
             self._advance(self._k * self._own_step)
         else:
@@ -294,7 +294,7 @@ class FmuPlant(Plant):
         """Read joints and feature, both read-only; the feature with noise."""
         status = self._read()
         if status:
-            self._slave.check("reading joints and features", status)
+            self._slave.check(f"reading {self._result.summary}", status)
         values = self._result.values.copy()
         # Anything that is not finite leaves the sum so; a mask costs five times as much.
         if not isfinite(sum(values.tolist())):

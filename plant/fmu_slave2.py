@@ -98,19 +98,21 @@ class Slave2(Slave):
         return advance
 
     def _recover(self, status: int, time: float, step: float) -> None:
-        """Take a step up where it ended, if it was only cut short.
+        """Take a step that was cut short up where it ended, as often as needed.
 
         Raises:
             FmuError: the step failed, or made no progress.
         """
-        if status != DISCARD:
-            self.check("fmi2DoStep", status)
-            return
-        reached = self._last_successful_time()
-        if not reached > time + LEAST_PROGRESS * step:
-            raise self.log.failure("fmi2DoStep", status)
-        if reached < time + step:
-            self.stepper(time + step - reached)(reached)
+        do_step, end, least = self.function("fmi2DoStep"), time + step, LEAST_PROGRESS * step
+        while status == DISCARD:
+            reached = self._last_successful_time()
+            if not reached > time + least:
+                raise self.log.failure("fmi2DoStep", status)
+            if reached > end - least:
+                return
+            time = reached
+            status = do_step(self._component, ctypes.c_double(time), ctypes.c_double(end - time), _YES)
+        self.check("fmi2DoStep", status)
 
     def _last_successful_time(self) -> float:
         reached = ctypes.c_double()

@@ -71,34 +71,52 @@ class Slave3(Slave):
 
     def stepper(self, step: float) -> Callable[[float], None]:
         """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+        take = self._taker(ctypes.c_double(step))
+
+        def advance(time: float) -> None:
+            reached = take(time)
+            if reached is not None:
+                self._resume(reached, time, step)
+
+        return advance
+
+    def _taker(self, step: ctypes.c_double) -> Callable[[float], float | None]:
+        """Return a function that takes one step from the time it is given and tells where it ended if it ended early.
+
+        It reads the size of the step from `step` at every call.
+        """
         now, reached = ctypes.c_double(), ctypes.c_double()
         event, end, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
         results = [ctypes.byref(result) for result in (event, end, early, reached)]
-        do_step = self.function("fmi3DoStep")
-        call = partial(do_step, self._component, now, ctypes.c_double(step), ctypes.c_bool(True), *results)
+        call = partial(self.function("fmi3DoStep"), self._component, now, step, ctypes.c_bool(True), *results)
 
-        def advance(time: float) -> None:
+        def take(time: float) -> float | None:
             now.value = time
             status = call()
             if status:
                 self.check("fmi3DoStep", status)
             if end.value:
                 raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
-            if early.value:
-                self._resume(reached.value, time, step)
+            return reached.value if early.value else None
 
-        return advance
+        return take
 
-    def _resume(self, reached: float, time: float, step: float) -> None:
-        """Take a step that returned early up where it ended.
+    def _resume(self, reached: float | None, time: float, step: float) -> None:
+        """Take a step that returned early up where it ended, as often as needed.
 
         Raises:
             FmuError: it made no progress.
         """
-        if not reached > time + LEAST_PROGRESS * step:
-            raise FmuError(f"{self.description.path.name}: fmi3DoStep returned early at {reached:.6g} s, no further")
-        if reached < time + step:
-            self.stepper(time + step - reached)(reached)
+        end, least, rest = time + step, LEAST_PROGRESS * step, ctypes.c_double()
+        take = self._taker(rest)
+        while reached is not None:
+            if not reached > time + least:
+                name = self.description.path.name
+                raise FmuError(f"{name}: fmi3DoStep returned early at {reached:.6g} s, no further")
+            if reached > end - least:
+                return
+            time, rest.value = reached, end - reached
+            reached = take(time)
 
     def save(self) -> ctypes.c_void_p:
         """Return the present state; it has to be given to `free`."""

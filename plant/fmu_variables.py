@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -124,10 +125,8 @@ def read_description(path: Path, root: Path) -> FmuDescription:
     Raises:
         ValueError: broken, of FMI 1, or without co-simulation.
     """
-    description = _read(path, root)
+    description = parse_description(path, root)
     version = str(description.fmiVersion)
-    if not version.startswith(("2.", "3.")):
-        raise ValueError(f"fmu file {path} is of FMI {version}; wanted FMI 2 or 3")
     interface = description.coSimulation
     if interface is None:
         offered = "model exchange" if description.modelExchange is not None else "scheduled execution"
@@ -152,7 +151,7 @@ def read_exchange(path: Path, root: Path) -> None:
     Raises:
         ValueError: broken, not of FMI 2, without model exchange or without directional derivatives.
     """
-    description = _read(path, root)
+    description = parse_description(path, root)
     version, exchange = str(description.fmiVersion), description.modelExchange
     wanted = "wanted FMI 2 with model exchange and directional derivatives"
     if not version.startswith("2."):
@@ -167,9 +166,20 @@ def read_exchange(path: Path, root: Path) -> None:
         )
 
 
-def _read(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's classes carry no usable types
+def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's classes carry no usable types
+    """Return fmpy's model description of the FMU at `path`, extracted to `root`.
+
+    Raises:
+        ValueError: broken, or of another version than FMI 2 and 3.
+    """
     from fmpy import read_model_description  # noqa: PLC0415 - takes a third of a second and loads libraries
 
+    try:
+        version = ET.parse(root / "modelDescription.xml").getroot().get("fmiVersion", "none")
+    except ET.ParseError as error:
+        raise ValueError(f"fmu file {path} has a broken modelDescription.xml: {error}") from error
+    if not version.startswith(("2.", "3.")):
+        raise ValueError(f"fmu file {path} is of FMI {version}; wanted FMI 2 or 3")
     try:
         return read_model_description(str(root), validate=False)
     except Exception as error:  # fmpy raises bare ones of every kind

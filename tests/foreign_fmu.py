@@ -1,7 +1,8 @@
 """A foreign FMU for tests: a planar arm of two joints with other names and sizes, from C that shares nothing with ours.
 
 Its parameter `quirk` makes it misbehave: 1 step fails, 2 result is NaN, 3 every step ends half way, 4 a step makes no
-progress, 5 initialisation fails, 6 it asks to end the simulation (FMI 3).
+progress, 5 initialisation fails, 6 it asks to end the simulation (FMI 3), 7 result becomes NaN,
+8 every step ends after 10 µs.
 """
 
 from __future__ import annotations

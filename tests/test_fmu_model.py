@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import subprocess
 import sys
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -281,3 +283,35 @@ def test_the_fmu_refuses_what_makes_no_sense(version):
         opened.set("joint_lower", 10.0)
         with pytest.raises(FmuError, match="joint_lower is not below joint_upper"):
             opened.slave.start(0.0)
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's memory accounting")
+@pytest.mark.parametrize("version", VERSIONS)
+def test_memory_stays_flat_over_two_thousand_instances(version):
+    """Load, instantiate, run, save, restore, serialise, free and unload; whole plants live in test_fmu_plant."""
+    with Opened(version) as opened:
+        files = len(list(Path("/proc/self/fd").iterdir()))
+
+        def live(count: int) -> None:
+            for _ in range(count):
+                slave = open_slave(opened.description, opened.folder)
+                slave.start(0.0)
+                advance = slave.stepper(0.05)
+                advance(0.0)
+                state = slave.save()
+                again = slave.from_bytes(slave.to_bytes(state))
+                advance(0.05)
+                slave.restore(again)
+                slave.free(again)
+                slave.free(state)
+                slave.close()
+
+        live(1000)  # until the allocator has what it needs
+        before = resident()
+        live(2000)
+        assert resident() - before < 1e6  # one lost state an instance would be 2.5e6
+        assert len(list(Path("/proc/self/fd").iterdir())) == files

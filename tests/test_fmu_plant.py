@@ -9,12 +9,14 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from foreign_fmu import build_crane, describe
 
+from fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from plant.fmu import FmuConfig, FmuPlant
 from plant.fmu_archive import PREFIX, FmuFolder, sweep_stale_folders
 from plant.fmu_entry import mapped_entry
@@ -22,7 +24,7 @@ from plant.fmu_mapping import FmuMapping
 from plant.fmu_slave import FmuError
 from plant.plant import PlantSetup
 from plant.signals import Command
-from plant.ur5 import nominal_ur5
+from plant.ur5 import HOME, nominal_ur5
 
 QUIET = FmuConfig(command_delay_periods=0, feature_noise=0.0)
 START = np.array([0.3, 1.2])
@@ -146,11 +148,13 @@ def test_feature_noise_has_the_configured_size_and_the_same_seed_gives_the_same_
     plant.close()
 
 
+@pytest.mark.parametrize("quirk", [3.0, 8.0])
 @pytest.mark.parametrize("version", [2, 3])
-def test_a_step_that_ends_early_is_taken_up_where_it_ended(tmp_path, version):
-    plant = crane(tmp_path, version, parameters={"quirk": np.array(3.0)})
-    observation = plant.step(Command([1.0, 0.5]))
-    np.testing.assert_allclose(observation.joint_position, START + PERIOD * np.array([1.0, 0.5]), atol=1e-14)
+def test_a_step_that_ends_early_is_taken_up_where_it_ended_however_often(tmp_path, version, quirk):
+    plant = crane(tmp_path, version, parameters={"quirk": np.array(quirk)})
+    for k in (1, 2):
+        observation = plant.step(Command([1.0, 0.5]))
+        np.testing.assert_allclose(observation.joint_position, START + k * PERIOD * np.array([1.0, 0.5]), atol=1e-12)
     plant.close()
 
 
@@ -216,6 +220,20 @@ def test_a_command_of_the_wrong_size_is_refused(tmp_path):
     plant = crane(tmp_path, 2)
     with pytest.raises(ValueError, match=r"joint_velocity must have shape \(2,\), got \(3,\)"):
         plant.step(Command([0.0, 0.0, 0.0]))
+    plant.close()
+
+
+def test_a_state_that_cannot_be_serialised_is_kept_by_the_plant_that_saved_it():
+    plant = build_ur5(Ur5FmuConfig(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
+    plant.description = replace(plant.description, can_serialise=False)
+    plant.step(Command(np.full(6, 0.3)))
+    state = plant.save_state()
+    runs = []
+    for _ in range(2):
+        plant.restore_state(state)
+        runs.append([plant.step(Command(np.full(6, -0.5))).feature.tobytes() for _ in range(5)])
+    assert runs[0] == runs[1]
+    assert not isinstance(state.fmu, bytes)
     plant.close()
 
 

@@ -4,7 +4,7 @@
 #include <stddef.h>
 #include <stdlib.h>
 
-enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION };
+enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION, BECOMES_NAN, CREEPS };
 
 typedef struct {
     double time, wheel[2], push[2], place[2], arm[2], quirk, rate[2];
@@ -14,7 +14,7 @@ static void place(Crane *c)
 {
     c->place[0] = c->arm[0] * cos(c->wheel[0]) + c->arm[1] * cos(c->wheel[0] + c->wheel[1]);
     c->place[1] = c->arm[0] * sin(c->wheel[0]) + c->arm[1] * sin(c->wheel[0] + c->wheel[1]);
-    if (c->quirk == RESULT_IS_NAN) c->place[1] = NAN;
+    if (c->quirk == RESULT_IS_NAN || (c->quirk == BECOMES_NAN && c->time > 0.2)) c->place[1] = NAN;
 }
 
 static void init(Crane *c)

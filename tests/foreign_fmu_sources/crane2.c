@@ -71,6 +71,10 @@ int fmi2DoStep(void *component, double time, double h, int unused)
         move(c, h / 2);
         return 2;
     }
+    if (c->quirk == CREEPS && h > 1e-5) {
+        move(c, 1e-5);
+        return 2;
+    }
     move(c, h);
     return 0;
 }

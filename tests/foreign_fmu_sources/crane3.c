@@ -71,6 +71,9 @@ int fmi3DoStep(void *component, double time, double h, bool unused, bool *event,
     else if (c->quirk == ENDS_HALF_WAY && h > 0.02) {
         move(c, h / 2);
         *early = true;
+    } else if (c->quirk == CREEPS && h > 1e-5) {
+        move(c, 1e-5);
+        *early = true;
     } else move(c, h);
     *last = c->time;
     return 0;
