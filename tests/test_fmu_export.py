@@ -173,7 +173,11 @@ def test_information_tells_version_platform_and_variables(version):
     assert information.fmi_version == f"{version}.0"
     assert information.platforms == (this_platform().folder(version),)
     assert information.has_sources
-    assert "canSerializeFMUstate" in information.capabilities
+    offered = ["co-simulation", "model exchange"] if version == 2 else ["co-simulation"]
+    assert list(information.interfaces) == offered
+    for capabilities in information.interfaces.values():
+        assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
+        assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
     assert len(information.variables) == (144 if version == 2 else 26)
     assert all(variable.unit and variable.description for variable in information.variables) or version == 2
 
