@@ -15,7 +15,7 @@ class CfdlMfacConfig:
     """Settings of `cfdl_mfac`."""
 
     estimator: CfdlConfig = field(default_factory=CfdlConfig)  # pseudo-Jacobian matrix
-    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 44
+    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 45
     initial: InitialConfig = field(default_factory=InitialConfig)  # where the first Jacobian comes from
 
 

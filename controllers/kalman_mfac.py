@@ -15,7 +15,7 @@ class KalmanMfacConfig:
     """Settings of `kalman_mfac`."""
 
     estimator: KalmanConfig = field(default_factory=KalmanConfig)  # Jacobian filter
-    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 44
+    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 45
     initial: InitialConfig = field(default_factory=InitialConfig)  # where the first Jacobian comes from
 
 

@@ -1,6 +1,6 @@
 """The two radial-basis networks of the proposed method, as pure functions and frozen records.
 
-Jacobian network (eqs. 29, 30, 40, 41), one network for each joint column i:
+Jacobian network (eqs. 28–30, 40, 41), one network for each joint column i:
 
     Ĵ_i(q) = W_i θ_i(q),   θ_il = exp(−(‖q − c_il‖ / δ_il)²)
 
@@ -15,7 +15,8 @@ the paper: exponents are cut at 60, so that a unit far away is 1e-26 instead of 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from functools import cached_property
+from typing import Literal, final, get_args
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from plant.signals import FloatArray
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
 LARGEST_EXPONENT = 60.0
+LOWEST_EXPONENT = np.array(-LARGEST_EXPONENT)
 
 
 def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) -> FloatArray:
@@ -31,7 +33,7 @@ def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) ->
 
     Args:
         q: (..., n), rad.
-        centres: c, (n, L, n), rad.
+        centres: c, (n, L, n), or (1, L, n) where the columns share them, rad.
         widths: δ, (n, L), rad.
 
     Returns:
@@ -77,9 +79,9 @@ def controller_output(weights: FloatArray, xi: FloatArray, h: FloatArray) -> Flo
     Returns:
         (..., n), rad.
     """
-    product = xi[..., :, None] * h[..., None, :]
-    flat = product.reshape(*product.shape[:-2], -1)
-    return np.asarray(flat @ weights.reshape(weights.shape[0], -1).T)
+    n, p, hidden = weights.shape
+    psi = (h @ weights.reshape(n * p, hidden).T).reshape(*h.shape[:-1], n, p)
+    return np.asarray(np.matmul(psi, xi[..., None])[..., 0])
 
 
 def information_vector(errors: FloatArray, positions: FloatArray) -> FloatArray:
@@ -134,9 +136,42 @@ class JacobianNetwork:
         """Number of features."""
         return int(self.weights.shape[1])
 
+    def features(self, q: FloatArray) -> FloatArray:
+        """Return θ, (..., n, L), at joint positions (..., n), rad: the numbers of `jacobian_features`, sooner."""
+        centres, ones, decay = self._prepared
+        offset = q[..., None, None, :] - centres
+        offset *= offset
+        theta: FloatArray = offset.dot(ones) * decay
+        np.maximum(theta, LOWEST_EXPONENT, out=theta)
+        return np.exp(theta, out=theta)
+
     def jacobian(self, q: FloatArray) -> FloatArray:
         """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad."""
-        return jacobian_output(self.weights, jacobian_features(q, self.centres, self.widths))
+        return jacobian_output(self.weights, self.features(q))
+
+    @cached_property
+    def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Centres, (1, L, n) where all columns share them as after training, ones (n,), and −1/δ², (n, L)."""
+        shared = bool((self.centres == self.centres[0]).all())
+        return self.centres[: 1 if shared else None], np.ones(self.n), -1.0 / self.widths**2
+
+
+@final
+class LatestFeatures:
+    """θ at the joint position that was asked for last: an estimator is asked several times for the same one."""
+
+    def __init__(self, network: JacobianNetwork) -> None:
+        """Take the network; nothing is known yet."""
+        self._network = network
+        self._key = b""
+        self._theta: FloatArray | None = None
+
+    def at(self, q: FloatArray) -> FloatArray:
+        """Return θ, (n, L), at q, (n,), rad."""
+        key = q.tobytes()
+        if self._theta is None or key != self._key:
+            self._key, self._theta = key, self._network.features(q)
+        return self._theta
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,12 +223,25 @@ class ControllerNetwork:
         return int(self.weights.shape[1] - self.n * self.position_history) // self.error_history
 
     def features(self, xi: FloatArray) -> FloatArray:
-        """Return h, (..., N_h), at ξ (..., p)."""
-        return hidden_features(xi, self.centres, self.widths, self.kernel)
+        """Return h, (..., N_h), at ξ (..., p): the numbers of `hidden_features`, sooner."""
+        ones, decay = self._prepared
+        offset = xi[..., None, :] - self.centres
+        offset *= offset
+        h: FloatArray = offset.dot(ones)
+        if self.kernel == "exponential":
+            np.sqrt(h, out=h)
+        h *= decay
+        np.maximum(h, LOWEST_EXPONENT, out=h)
+        return np.exp(h, out=h)
 
     def command(self, xi: FloatArray) -> FloatArray:
         """Return q_cmd = ψ(ξ) ξ, (..., n), rad, with the weights as they were trained."""
         return controller_output(self.weights, xi, self.features(xi))
+
+    @cached_property
+    def _prepared(self) -> tuple[FloatArray, FloatArray]:
+        """Ones, (p,), and −1/γ², (N_h,)."""
+        return np.ones(self.centres.shape[1]), -1.0 / self.widths**2
 
 
 def _freeze(network: object, names: tuple[str, ...]) -> None:

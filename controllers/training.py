@@ -224,7 +224,7 @@ def _controller_weights(
 
 
 def ideal_controller_matrix(gain: FloatArray, error_history: int, position_history: int) -> FloatArray:
-    """Return ψ* = [K_p dt J⁺, 0, I, 0], (S, n, m L_e + n L_c), from K_p dt J⁺ (S, n, m)."""
+    """Return ψ* = [K_p dt J⁺, 0, I, 0] (eq. 10), (S, n, m L_e + n L_c), from K_p dt J⁺ (S, n, m)."""
     count, n, m = gain.shape
     psi = np.zeros((count, n, m * error_history + n * position_history))
     psi[:, :, :m] = gain

@@ -1,4 +1,4 @@
-"""Method 2 of the paper: unscented Kalman filter for the Jacobian, model-free adaptive control (eq. 44)."""
+"""Method 2 of the paper: unscented Kalman filter for the Jacobian, model-free adaptive control (eq. 45)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class UkfMfacConfig:
     """Settings of `ukf_mfac`."""
 
     estimator: UkfConfig = field(default_factory=UkfConfig)  # Jacobian filter
-    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 44
+    law: MfacConfig = field(default_factory=MfacConfig)  # eq. 45
     initial: InitialConfig = field(default_factory=InitialConfig)  # where the first Jacobian comes from
 
 
 ENTRY = servo_entry(
     "ukf_mfac",
-    "unscented Kalman filter with model-free adaptive control (eq. 44)",
+    "unscented Kalman filter with model-free adaptive control (eq. 45)",
     UkfMfacConfig,
     law="mfac",
     estimator="ukf",

@@ -1,4 +1,4 @@
-"""Method 3 of the paper: unscented Kalman filter for the Jacobian, model predictive control (eq. 45)."""
+"""Method 3 of the paper: unscented Kalman filter for the Jacobian, model predictive control (eq. 46)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class UkfMpcConfig:
     """Settings of `ukf_mpc`."""
 
     estimator: UkfConfig = field(default_factory=UkfConfig)  # Jacobian filter
-    law: MpcConfig = field(default_factory=MpcConfig)  # eq. 45 with limits and preview
+    law: MpcConfig = field(default_factory=MpcConfig)  # eq. 46 with limits and preview
     initial: InitialConfig = field(default_factory=InitialConfig)  # where the first Jacobian comes from
 
 
 ENTRY = servo_entry(
     "ukf_mpc",
-    "unscented Kalman filter with model predictive control (eq. 45)",
+    "unscented Kalman filter with model predictive control (eq. 46)",
     UkfMpcConfig,
     law="mpc",
     estimator="ukf",

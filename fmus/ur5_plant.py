@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -48,6 +48,12 @@ class Ur5FmuConfig:
         return FmuConfig(self.command_delay_periods, self.feature_noise, self.latency_periods, self.drop_probability)
 
 
+def vary_sensing(config: Ur5FmuConfig, noise_factor: float, latency_periods: int | None) -> Ur5FmuConfig:
+    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
+    latency = config.latency_periods if latency_periods is None else latency_periods
+    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)
+
+
 @cache
 def cached_fmu(fmi_version: int) -> Path:
     """Return the nominal UR5 as FMU, from the user's cache folder; it is built there if anything in it has changed.
@@ -79,6 +85,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         features=("ball_position",),
         true_jacobian=("jacobian",),
         home="home",
+        camera=("camera_position", "camera_rpy"),
         parameters=parameters,
         max_joint_speed=config.max_joint_speed,
         clips_itself=True,
@@ -108,4 +115,5 @@ ENTRY = PlantEntry(
     summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
     config=Ur5FmuConfig,
     build=build_ur5,
+    sense=vary_sensing,
 )

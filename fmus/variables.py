@@ -15,7 +15,7 @@ from math import prod
 import numpy as np
 
 from plant.hand_eye import HandEyeModel
-from plant.kinematics import SerialArm, rotation_from_rpy
+from plant.kinematics import SerialArm, rotation_from_rpy, rpy_from_rotation
 from plant.signals import FloatArray, as_vector
 
 PARAMETER, INPUT, STATE, DERIVATIVE, OUTPUT = "parameter", "input", "state", "derivative", "output"
@@ -132,18 +132,6 @@ class Actuation:
     max_speed: float
     joint_range: float
     home: FloatArray
-
-
-def rpy_from_rotation(R: FloatArray) -> FloatArray:
-    """Return roll, pitch, yaw, (3,) rad, of a rotation matrix (3, 3); sound at a pitch of ±90° too.
-
-    The yaw is taken out before pitch and roll are read, so that no angle is read from two vanishing numbers.
-    """
-    yaw = np.arctan2(R[1, 0], R[0, 0])
-    c, s = np.cos(yaw), np.sin(yaw)
-    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
-    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
-    return np.array([roll, pitch, yaw])
 
 
 def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -12,24 +11,27 @@ from typing import Annotated, Any
 import pandas as pd
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from controllers.composed import ESTIMATORS, LAWS
 from harness import results
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings
+from harness.defaults import default_config
 from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
 from harness.fmu_commands import fmu_app
 from harness.manifest import describe_batch
+from harness.options import ConfigOption, SetOption, default_workers, split_names
+from harness.progress import run_progress
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.summary import summary_tables
+from harness.sweep_command import sweep
 from harness.tasks import find_task, task_names
 from harness.training import cache_folder
+from harness.tune_command import tune
 
 INTERRUPTED = 130
-MAX_DEFAULT_WORKERS = 8
 
 app = typer.Typer(
     help="The bench on which uncalibrated visual-servoing controllers are compared.",
@@ -39,15 +41,13 @@ app = typer.Typer(
 )
 console = Console()
 
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting, such as kinematic.lag=0.1.")
-]
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
 NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
 
 
 app.add_typer(fmu_app, name="fmu")
+app.command()(sweep)
+app.command()(tune)
 
 
 @app.command()
@@ -59,7 +59,7 @@ def plants(name: NameArgument = None) -> None:
 @app.command()
 def controllers(name: NameArgument = None) -> None:
     """List the controllers, or show the settings of one."""
-    _list_or_show("controllers", name, controller_names(), find_controller, lambda entry: entry.config())
+    _list_or_show("controllers", name, controller_names(), find_controller, default_config)
 
 
 @app.command()
@@ -108,13 +108,13 @@ def compare(
 ) -> None:
     """Run every combination and compare the controllers."""
     batch = Batch(
-        _names("plants", plants, plant_names(), find_plant),
-        _names("controllers", controllers, controller_names(), find_controller),
-        _names("tasks", tasks, task_names(), find_task),
+        split_names("plants", plants, plant_names(), find_plant),
+        split_names("controllers", controllers, controller_names(), find_controller),
+        split_names("tasks", tasks, task_names(), find_task),
         tuple(part.strip() for part in mismatch.split(",")),
         parse_seeds(seeds),
     )
-    count = workers or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
+    count = workers or default_workers()
     _carry_out(batch, read_settings(config, set_ or []), count, out)
 
 
@@ -127,7 +127,7 @@ def train(
     """Train the networks of a controller on the nominal model, or find them trained, and tell their held-out error."""
     settings = read_settings(config, set_ or [])
     settings.check_sections([*known_sections(), controller])
-    with _progress() as progress:
+    with run_progress(console) as progress:
         bar = progress.add_task("training", total=1.0)
         trained = train_networks(
             controller, settings, lambda share, what: progress.update(bar, completed=share, description=what)
@@ -169,7 +169,7 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None)
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     results.create_folder(folder, describe_batch(requests, settings))
     interrupted = False
-    with _progress() as progress:
+    with run_progress(console) as progress:
         bar = progress.add_task("running", total=len(requests))
         try:
             for row in run_batch(requests, settings, folder, min(workers, len(requests))):
@@ -193,30 +193,6 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None)
 def _print_faults(runs: pd.DataFrame) -> None:
     for row in runs[runs["reason"] != ""].to_dict("records"):
         console.print(f"{row['run_id']}: {row['status']}: {row['reason']}", soft_wrap=True, markup=False)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-    )
-
-
-def _names(kind: str, text: str, known: list[str], find: Callable[[str], Any]) -> tuple[str, ...]:
-    """Return the names in a list by comma, each of which `find` knows."""
-    if text.strip() == "all":
-        return tuple(known)
-    names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
-    if not names:
-        raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
-    for name in names:
-        find(name)
-    return names
 
 
 def _list_or_show(

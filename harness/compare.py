@@ -31,6 +31,12 @@ class Batch:
     mismatches: tuple[str, ...]
     seeds: tuple[int, ...]
 
+    @classmethod
+    def around(cls, requests: Sequence[RunRequest]) -> Batch:
+        """Return the smallest batch that holds all of `requests`."""
+        names = ("plant", "controller", "task", "mismatch", "seed")
+        return cls(*(tuple(dict.fromkeys(getattr(request, name) for request in requests)) for name in names))
+
     def requests(self) -> list[RunRequest]:
         """Return the runs, seeds varying fastest."""
         order = product(self.plants, self.tasks, self.mismatches, self.controllers, self.seeds)
@@ -62,7 +68,13 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(seeds))
 
 
-def check_batch(batch: Batch, settings: Settings, progress: Progress | None = None) -> None:
+def check_batch(
+    batch: Batch,
+    settings: Settings,
+    progress: Progress | None = None,
+    noise_factor: float = 1.0,
+    latency_periods: int | None = None,
+) -> None:
     """Build every plant, controller, task and mismatch once, so that a bad one is refused before anything is written.
 
     Networks that controllers need are trained on the way.
@@ -71,12 +83,15 @@ def check_batch(batch: Batch, settings: Settings, progress: Progress | None = No
         batch: what will be run.
         settings: overrides of the defaults.
         progress: told how far a training of networks is.
+        noise_factor: on the plants' sensor noise.
+        latency_periods: of the camera; None for what a plant is configured with.
 
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used.
     """
     settings.check_sections([*known_sections(), *batch.plants, *batch.controllers])
-    first = RunRequest(batch.plants[0], batch.controllers[0], batch.tasks[0], batch.mismatches[0], batch.seeds[0])
+    names = (batch.plants[0], batch.controllers[0], batch.tasks[0], batch.mismatches[0])
+    first = RunRequest(*names, batch.seeds[0], noise_factor, latency_periods)
     requests = dict.fromkeys(
         [
             *(replace(first, plant=plant, mismatch=name) for plant, name in product(batch.plants, batch.mismatches)),

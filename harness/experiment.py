@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from controllers.network_file import TrainedNetworks
 from controllers.training import Progress
 from controllers.training_config import TrainingConfig
 from harness.configuration import ConfigurationError, Settings
+from harness.defaults import default_config
+from harness.loop import CameraMove, LoopSettings
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.tasks import Scenario, TaskSetting, find_task, task_names
 from harness.training import network_source
@@ -35,6 +38,7 @@ class RunSettings:
     period: float = 0.05  # s, control period
     preview: int = 10  # future rows of the reference that every controller is offered
     lost_after_periods: int = 20  # so many periods in a row without a valid feature end a run
+    camera_moves_at: float = 0.5  # share of the run after which a mismatch's `camera_move` happens
     full_jacobian: bool = False  # log every entry of the estimated and the true Jacobian
 
     def __post_init__(self) -> None:
@@ -42,24 +46,43 @@ class RunSettings:
         check_number("period", self.period, above=0.0)
         check_number("preview", self.preview, at_least=0)
         check_number("lost_after_periods", self.lost_after_periods, at_least=1)
+        check_number("camera_moves_at", self.camera_moves_at, at_least=0.0, below=1.0)
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What is asked for: one cell of a comparison."""
+    """What is asked for: one cell of a comparison.
+
+    Attributes:
+        plant: its name.
+        controller: its name.
+        task: its name.
+        mismatch: as `plant.mismatch` reads it.
+        seed: of everything random in the run.
+        noise_factor: on the sensor noise that the plant is configured with.
+        latency_periods: of the camera; None for what the plant is configured with.
+    """
 
     plant: str
     controller: str
     task: str
     mismatch: str
     seed: int
+    noise_factor: float = 1.0
+    latency_periods: int | None = None
 
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
         mismatch = re.sub(r"[^A-Za-z0-9.=+_-]", "_", self.mismatch)
         plant = re.sub(r"[^A-Za-z0-9.=+_-]", "_", self.plant)
-        return f"{plant}-{self.controller}-{self.task}-{mismatch}-{self.seed}"
+        noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
+        latency = "" if self.latency_periods is None else f"-latency{self.latency_periods}"
+        return f"{plant}-{self.controller}-{self.task}-{mismatch}{noise}{latency}-{self.seed}"
+
+    def as_row(self) -> dict[str, Any]:
+        """Return the columns by which a run is found in the table of runs."""
+        return {"run_id": self.run_id, **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -71,6 +94,15 @@ class Experiment:
     scenario: Scenario
     run: RunSettings
     sample: MismatchSample | None
+    moved: HandEyeModel | None = None
+
+    @property
+    def loop(self) -> LoopSettings:
+        """What the loop has to know."""
+        move = None
+        if self.moved is not None:
+            move = CameraMove(int(self.run.camera_moves_at * self.periods), self.moved.X_BC)
+        return LoopSettings(self.periods, self.run.preview, self.run.lost_after_periods, move)
 
     @property
     def periods(self) -> int:
@@ -107,7 +139,8 @@ def build_experiment(
         true, sample = sample_mismatch(mismatch, nominal, named_seed(request.seed, "mismatch"))
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
-    setting = TaskSetting(true, true.arm.n, FEATURE_NAMES, named_seed(request.seed, "task"))
+    moved = sample.moved(true)
+    setting = TaskSetting(true, true.arm.n, FEATURE_NAMES, named_seed(request.seed, "task"), moved)
     scenario = _build_scenario(request, settings, setting)
     plant = _build_plant(request, settings, entry, PlantSetup(true, scenario.start, run.period))
     try:
@@ -117,7 +150,7 @@ def build_experiment(
     except BaseException:
         plant.close()
         raise
-    return Experiment(plant, controller, scenario, run, sample)
+    return Experiment(plant, controller, scenario, run, sample, moved)
 
 
 def train_networks(controller: str, settings: Settings, progress: Progress) -> TrainedNetworks:
@@ -190,6 +223,8 @@ def _build_scenario(request: RunRequest, settings: Settings, setting: TaskSettin
 def _build_plant(request: RunRequest, settings: Settings, entry: PlantEntry, setup: PlantSetup) -> Plant:
     config = settings.resolve(request.plant, entry.config())
     try:
+        if request.noise_factor != 1.0 or request.latency_periods is not None:
+            config = entry.vary_sensing(config, request.noise_factor, request.latency_periods)
         return entry.build(config, setup)
     except (ValueError, RunFault) as error:
         raise ConfigurationError(f"plant {request.plant}: {error}") from error
@@ -200,7 +235,7 @@ def _build_controller(
 ) -> Controller:
     """Build a controller; only one that asks for the truth has it told. Where no model is nominal, the truth is."""
     entry = find_controller(request.controller)
-    config = settings.resolve(request.controller, entry.config())
+    config = settings.resolve(request.controller, default_config(entry))
     try:
         if entry.needs_truth:
             true = tell()

@@ -16,6 +16,7 @@ from fmus.validate import validate_fmu
 from harness.configuration import ConfigurationError
 from plant.fmu_slave import FmuError
 from plant.mismatch import parse_mismatch, sample_mismatch
+from plant.seeds import named_seed
 from plant.ur5 import nominal_ur5
 
 console = Console()
@@ -29,14 +30,14 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The .fmu file to write.")],
     fmi: Annotated[int, typer.Option(help="2 (co-simulation and model exchange) or 3 (co-simulation).")] = 2,
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
-    seed: Annotated[int, typer.Option(help="Seed from which the mismatch is drawn.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
     platforms: Annotated[
         str | None, typer.Option(help="By comma, such as x86_64-linux,aarch64-darwin, or all; default: this machine.")
     ] = None,
 ) -> None:
     """Export the UR5 with a mismatch as start values."""
     try:
-        model, _ = sample_mismatch(parse_mismatch(mismatch), nominal_ur5(), seed)
+        model, _ = sample_mismatch(parse_mismatch(mismatch), nominal_ur5(), named_seed(seed, "mismatch"))
         words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
         options = ExportOptions(fmi, model, platforms=parse_platforms(platforms), mismatch=words)
         export_fmu(output, options)

@@ -18,6 +18,15 @@ from harness.log import StepLog
 from harness.references import Reference
 from plant.plant import FeatureLost, Plant
 from plant.seeds import named_seed
+from plant.signals import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMove:
+    """A change of the camera's pose during a run, of which the controller is not told."""
+
+    period: int  # from this period on
+    X_BC: FloatArray  # (4, 4), the new pose in the base frame
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,7 @@ class LoopSettings:
     periods: int  # control periods in the run
     preview: int  # future rows of the reference that a controller sees
     lost_after_periods: int  # that many periods in a row without a valid feature end the run
+    camera_move: CameraMove | None = None  # somebody knocks against the camera
 
 
 def run_loop(
@@ -47,6 +57,8 @@ def run_loop(
         command = controller.step(observation, desired)
         decided = perf_counter_ns()
         truth = plant.truth()
+        if settings.camera_move is not None and k == settings.camera_move.period:
+            plant.move_camera(settings.camera_move.X_BC)
         released = perf_counter_ns()
         following = plant.step(command)
         arrived = perf_counter_ns()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.configuration import Settings, flatten
+from harness.defaults import default_config
 from harness.experiment import RunRequest, RunSettings
 from harness.registry import find_controller, find_plant
 from harness.tasks import find_task
@@ -42,7 +43,7 @@ def describe_batch(requests: list[RunRequest], settings: Settings) -> dict[str, 
     for name in _unique(request.plant for request in requests):
         configuration[name] = flatten(settings.resolve(name, find_plant(name).config()))
     for name in _unique(request.controller for request in requests):
-        configuration[name] = flatten(settings.resolve(name, find_controller(name).config()))
+        configuration[name] = flatten(settings.resolve(name, default_config(find_controller(name))))
     for name in _unique(request.task for request in requests):
         configuration[name] = flatten(settings.resolve(name, find_task(name).default))
     return {

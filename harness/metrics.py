@@ -7,7 +7,7 @@
 | overshoot | how far the feature passes a fixed target, as a share of the initial error; NaN when tracking |
 | steady_state_error_m | mean error of the last second |
 | rms_error_m, max_error_m | over the whole run |
-| rms_error_evaluated_m | over the evaluated part: the last lap, or the last quarter of a point-to-point move |
+| rms_error_evaluated_m | over the evaluated part: the last lap, the last quarter of a move, the last half of a path |
 | path_length_ratio | true path over the straight line (point to point) or over the reference's path (tracking) |
 | control_effort_rad | Σ |u| dt over joints and periods |
 | saturation_fraction | share of periods in which a joint is commanded at its speed limit |

@@ -57,8 +57,24 @@ def write_part(folder: Path, index: int, row: dict[str, Any], steps: pd.DataFram
     _write_table(pa.Table.from_pylist([row]), folder / PARTS / f"{stem}.{RUNS}")
 
 
+def write_rows(folder: Path, index: int, rows: list[dict[str, Any]]) -> None:
+    """Write several finished runs without their steps as one part.
+
+    Args:
+        folder: a results folder.
+        index: of the first of them among all runs.
+        rows: rows of the table of runs, in order.
+    """
+    _write_table(pa.Table.from_pandas(pd.DataFrame(rows), preserve_index=False), folder / PARTS / f"{index:08d}.{RUNS}")
+
+
+def finished_parts(folder: Path) -> set[int]:
+    """Return the indices of the parts that are there."""
+    return {int(path.name.split(".")[0]) for path in _part_files(folder, RUNS)}
+
+
 def collect(folder: Path) -> int:
-    """Put the parts together into the two tables and remove them.
+    """Put the parts together into the two tables and, unless runs of a sweep are missing, remove them.
 
     Returns:
         Number of runs.
@@ -66,17 +82,22 @@ def collect(folder: Path) -> int:
     Raises:
         ConfigurationError: there are no parts and no tables.
     """
-    if (folder / RUNS).is_file():  # the tables are whole, at most the clean-up is left
-        shutil.rmtree(folder / PARTS, ignore_errors=True)
-        return int(pq.read_metadata(folder / RUNS).num_rows)
+    wanted = read_manifest(folder).get("run_count", 0)
+    if (folder / RUNS).is_file():
+        count = int(pq.read_metadata(folder / RUNS).num_rows)
+        if count >= wanted:  # the tables are whole, at most the clean-up is left
+            shutil.rmtree(folder / PARTS, ignore_errors=True)
+            return count
     row_files = _part_files(folder, RUNS)
     if not row_files:
         raise ConfigurationError(f"{folder} holds no finished run")
     step_files = [path for path in (_steps_of(path) for path in row_files) if path.is_file()]
     _concatenate(step_files, folder / STEPS)
     _concatenate(row_files, folder / RUNS)
-    shutil.rmtree(folder / PARTS)
-    return len(row_files)
+    count = int(pq.read_metadata(folder / RUNS).num_rows)
+    if count >= wanted:
+        shutil.rmtree(folder / PARTS)
+    return count
 
 
 def load_runs(folder: Path) -> pd.DataFrame:
@@ -109,6 +130,17 @@ def check_folder(folder: Path) -> None:
     Raises:
         ConfigurationError: says what is missing or different.
     """
+    read_manifest(folder)
+    if not (folder / RUNS).is_file() and not _part_files(folder, RUNS):
+        raise ConfigurationError(f"{folder} holds no finished run")
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Return the manifest of a results folder.
+
+    Raises:
+        ConfigurationError: not a results folder, or one of another schema.
+    """
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -118,8 +150,7 @@ def check_folder(folder: Path) -> None:
         raise ConfigurationError(
             f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
         )
-    if not (folder / RUNS).is_file() and not _part_files(folder, RUNS):
-        raise ConfigurationError(f"{folder} holds no finished run")
+    return dict(manifest)
 
 
 def point_latest(folder: Path) -> None:

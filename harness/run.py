@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from harness.configuration import Settings
 from harness.experiment import RunRequest, build_experiment
 from harness.log import StepLog
-from harness.loop import LoopSettings, run_loop
+from harness.loop import run_loop
 from harness.metrics import Judgement, judge_run
 from plant.plant import ImageArray
 from plant.signals import RunFault
@@ -54,11 +54,10 @@ def run_experiment(
     experiment = build_experiment(request, settings, keep=keep)
     plant, spec, scenario = experiment.plant, experiment.plant.spec, experiment.scenario
     log = StepLog(spec, full_jacobian=experiment.run.full_jacobian)
-    loop = LoopSettings(experiment.periods, experiment.run.preview, experiment.run.lost_after_periods)
     status, reason = COMPLETED, ""
     try:
         with threadpool_limits(1), np.errstate(divide="raise", over="raise", invalid="raise"):
-            run_loop(plant, experiment.controller, scenario.reference, loop, request.seed, log)
+            run_loop(plant, experiment.controller, scenario.reference, experiment.loop, request.seed, log)
     except RunFault as fault:
         status, reason = fault.status, _one_line(fault)
     except FloatingPointError as error:
@@ -71,12 +70,7 @@ def run_experiment(
     steps = log.table(request.run_id)
     judgement = Judgement(spec, scenario.point_to_point, scenario.evaluate_from)
     row: dict[str, Any] = {
-        "run_id": request.run_id,
-        "plant": request.plant,
-        "controller": request.controller,
-        "task": request.task,
-        "seed": request.seed,
-        "mismatch": request.mismatch,
+        **request.as_row(),
         "status": status,
         **(judge_run(steps, judgement) if len(steps) else {}),
         "periods": len(steps),
@@ -84,6 +78,11 @@ def run_experiment(
         "mismatch_values": json.dumps(experiment.sample.as_record() if experiment.sample else {}),
     }
     return RunResult(row, steps, image)
+
+
+def crashed_row(request: RunRequest, reason: str) -> dict[str, Any]:
+    """Return the row of a run of which nothing is left but why it failed."""
+    return {**request.as_row(), "status": "crashed", "periods": 0, "reason": reason, "mismatch_values": "{}"}
 
 
 def _one_line(error: BaseException) -> str:

@@ -23,6 +23,9 @@ from plant.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 
 Vector = tuple[float, ...]
 
+SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
+REACH = (0.35, 0.75)  # m, from the shoulder to the ball: some way from the arm's own column and from the stretched arm
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -54,7 +57,10 @@ class PointTask:
 
 @dataclass(frozen=True)
 class RandomTask:
-    """A move whose start and target are drawn by the run's seed from a box of joint positions."""
+    """A move whose start and target are drawn by the run's seed from a box of joint positions.
+
+    Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
+    """
 
     lower: Vector = TRAINING_LOWER  # rad
     upper: Vector = TRAINING_UPPER  # rad
@@ -129,12 +135,14 @@ class TaskSetting:
         n: number of joints.
         feature_names: m names.
         seed: for tasks that draw random numbers.
+        moved: the true robot after its camera was moved in the middle of the run; None if it is not.
     """
 
     model: HandEyeModel | None
     n: int
     feature_names: tuple[str, ...]
     seed: int
+    moved: HandEyeModel | None = None
 
     @property
     def m(self) -> int:
@@ -200,9 +208,18 @@ def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
     for _ in range(1000):
         pair = generator.uniform(lower, upper, (2, n))
         balls = nominal.arm.ball_position(pair)
-        if np.linalg.norm(balls[1] - balls[0]) >= config.shortest and (balls[:, 2] >= config.lowest).all():
+        apart = np.linalg.norm(balls[1] - balls[0]) >= config.shortest
+        if apart and (balls[:, 2] >= config.lowest).all() and _stays_in_reach(pair[1], config.lowest, setting):
             return _build_point(PointTask(tuple(pair[0]), tuple(pair[1]), config.duration), setting)
     raise ValueError("no start and target in the box are far enough apart and above the table")
+
+
+def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting) -> bool:
+    """Return whether a target (n,), rad, that was taught before the camera's move is in easy reach after it."""
+    if setting.moved is None:
+        return True
+    point = setting.moved.to_base(setting.taught_on().feature(target))
+    return bool(point[2] >= lowest and REACH[0] <= np.linalg.norm(point - SHOULDER) <= REACH[1])
 
 
 def _build_circle(config: CircleTask, setting: TaskSetting) -> Scenario:

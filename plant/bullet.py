@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,6 +51,7 @@ class BulletConfig:
     depth_baseline: float = 0.05  # m, between the two imagers, RealSense D435
     native_width: int = 848  # px, width at which the depth sensor matches, RealSense D435's optimum
     depth_quantisation: float = 0.001  # m, depth unit of the sensor; 0 = none
+    depth_noise_factor: float = 1.0  # on the depth noise, for a study of it
     latency_periods: int = 1  # periods between exposure and delivery of the feature
     drop_probability: float = 0.002  # chance that a frame is lost
     scenery: bool = True  # draw the table and the floor; without them a frame costs a fifth
@@ -73,7 +74,12 @@ class BulletConfig:
     def noise(self) -> DepthNoise:
         """Return the depth sensor's noise."""
         return DepthNoise(
-            self.depth_noise, self.depth_subpixel, self.depth_baseline, self.native_width, self.depth_quantisation
+            self.depth_noise,
+            self.depth_subpixel,
+            self.depth_baseline,
+            self.native_width,
+            self.depth_quantisation,
+            self.depth_noise_factor,
         )
 
 
@@ -90,6 +96,12 @@ class Frame:
     rgb: ByteArray
     depth: FloatArray
     detection: Detection | None
+
+
+def vary_sensing(config: BulletConfig, noise_factor: float, latency_periods: int | None) -> BulletConfig:
+    """Return `config` with its depth noise multiplied and its latency set; see `PlantEntry.sense`."""
+    latency = config.latency_periods if latency_periods is None else latency_periods
+    return replace(config, depth_noise_factor=noise_factor * config.depth_noise_factor, latency_periods=latency)
 
 
 def ur5_body() -> ArmBody:
@@ -152,7 +164,8 @@ class BulletPlant(Plant):
         self._decay = math.exp(-PHYSICS_STEP / config.lag) if config.lag > 0.0 else 0.0
         self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self._camera, self._depth_noise = config.camera(), config.noise()
-        self._view = view_of(self._camera, model.X_BC)
+        self._X_BC, self._view_of = model.X_BC, view_of
+        self.move_camera(model.X_BC)
         self._scene: Scene = Scene(
             model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view
         )
@@ -165,6 +178,7 @@ class BulletPlant(Plant):
     def reset(self, seed: int) -> Observation:
         """Return to the start at rest; depth noise and lost frames get streams of their own. See `Plant.reset`."""
         self._noise = named_generator(seed, "depth_noise")
+        self.move_camera(self._X_BC)
         self._v = np.zeros(self._spec.n)
         self._commands: deque[FloatArray] = deque([np.zeros(self._spec.n)] * self._config.command_delay_periods)
         self._k = 0
@@ -200,6 +214,11 @@ class BulletPlant(Plant):
         if self._config.view:
             self._keep_pace()
         return Observation(self._k * self._spec.period, q, feature, valid)
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """See `Plant.move_camera`."""
+        self._model = replace(self._model, X_BC=X_BC)
+        self._view = self._view_of(self._camera, X_BC)
 
     def truth(self) -> Truth:
         """Return the feature by the simulator's own ball, and the Jacobian of the true model at the present joints."""
@@ -251,4 +270,5 @@ ENTRY = PlantEntry(
     summary="PyBullet arm with dynamics; the ball is found in the rendered images of a depth camera",
     config=BulletConfig,
     build=BulletPlant,
+    sense=vary_sensing,
 )

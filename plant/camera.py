@@ -97,16 +97,18 @@ def view_matrix(X_BC: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """What a depth sensor adds to the true depth: z_measured = quantise(z + σ(z) N(0, 1))."""
+    """What a depth sensor adds to the true depth: z_measured = quantise(z + factor σ(z) N(0, 1))."""
 
     depth_noise: str = "stereo"  # one of NOISE_MODELS
     depth_subpixel: float = 0.08  # px, RMS disparity error of a stereo match, vendor's white paper
     depth_baseline: float = 0.05  # m, between the two imagers, RealSense D435
     native_width: int = 848  # px, width at which the sensor matches, RealSense D435's optimum
     depth_quantisation: float = 0.001  # m, depth unit of the sensor; 0 = none
+    depth_noise_factor: float = 1.0  # on σ
 
     def __post_init__(self) -> None:
         """Check the name and the numbers."""
+        check_number("depth_noise_factor", self.depth_noise_factor, at_least=0.0)
         if self.depth_noise not in NOISE_MODELS:
             raise ValueError(f"depth_noise must be one of {', '.join(NOISE_MODELS)}, got {self.depth_noise!r}")
         check_number("depth_subpixel", self.depth_subpixel, at_least=0.0)
@@ -128,7 +130,7 @@ class DepthNoise:
         """Return measured depths, m, for true depths of any shape, m; without noise nothing is drawn."""
         z = np.asarray(depth, dtype=np.float64)
         if self.depth_noise != "none":
-            z = z + self.sigma(z, camera) * generator.standard_normal(z.shape)
+            z = z + self.depth_noise_factor * self.sigma(z, camera) * generator.standard_normal(z.shape)
         if self.depth_quantisation > 0.0:
             z = np.round(z / self.depth_quantisation) * self.depth_quantisation
         return z

@@ -11,7 +11,7 @@ import copy
 import ctypes
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from plant.fmu_slave2 import Slave2
 from plant.fmu_slave3 import Slave3
 from plant.fmu_symbolic import FmuModel, mapped_model
 from plant.fmu_variables import FmuDescription, read_description
+from plant.kinematics import rpy_from_rotation
 from plant.plant import Plant, TrueModel, whole_steps
 from plant.seeds import named_generator
 from plant.sensing import FeatureChannel
@@ -52,6 +53,12 @@ class FmuConfig:
         """Check the numbers that no part below checks."""
         check_number("command_delay_periods", self.command_delay_periods, at_least=0)
         check_number("feature_noise", self.feature_noise, at_least=0.0)
+
+
+def vary_sensing(config: FmuConfig, noise_factor: float, latency_periods: int | None) -> FmuConfig:
+    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
+    latency = config.latency_periods if latency_periods is None else latency_periods
+    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +128,7 @@ class FmuPlant(Plant):
         self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
         if mapping.home is not None and self._has_start:
             self._parameters.append(self._parameter(mapping.home, self._start))
+        self._camera = mapping.camera
         self._true_feature = self._port(mapping.true_features or mapping.features)
         self._true_jacobian = self._port(mapping.true_jacobian) if mapping.true_jacobian else None
         self._true = self._model({}) if mapping.true_states else None
@@ -196,6 +204,18 @@ class FmuPlant(Plant):
         joints, feature = self._measure()
         feature, valid = self._channel.deliver(feature) if self._has_channel else (feature, True)
         return trusted_observation(self._k * self._period, joints, feature, valid)
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """Set the parameters of the camera's pose; see `Plant.move_camera`.
+
+        Raises:
+            ValueError: the mapping names none.
+        """
+        if self._camera is None:
+            super().move_camera(X_BC)
+            return
+        for name, values in zip(self._camera, (X_BC[:3, 3], rpy_from_rotation(X_BC[:3, :3])), strict=True):
+            self._parameter(name, values)()
 
     def truth(self) -> Truth:
         """Return the FMU's own feature and, where the mapping names it or its states, the Jacobian."""

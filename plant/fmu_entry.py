@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu import FmuConfig, FmuPlant, vary_sensing
 from plant.fmu_mapping import FmuMapping, read_mapping
 from plant.fmu_slave import FmuError
 from plant.plant import PlantEntry, PlantSetup
@@ -35,4 +35,4 @@ def mapped_entry(path: Path) -> PlantEntry:
         return build_plant(config, mapping, setup)
 
     summary = f"the FMU {mapping.path.name}, as mapped by {path.name}"
-    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True)
+    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, sense=vary_sensing, own_robot=True)

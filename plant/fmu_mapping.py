@@ -64,7 +64,8 @@ class FmuMapping:
             `true_states` are named, and cannot tell otherwise.
         true_states: states of the model-exchange side that are the joint positions; without them, the joints.
         home: a parameter that takes the joint positions at the start, if there is one.
-        start: (n,), rad, joint positions at the start; None for the FMU's own.
+        camera: two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame.
+        start: (n,), rad, at time 0, for an FMU with a home or without joints; None for the FMU's own.
         parameters: values by name, set before every run.
         nominal: the values that controllers believe, where they differ; None: there is no nominal model.
         period: the FMU's step, s; None for the control period.
@@ -85,6 +86,7 @@ class FmuMapping:
     true_jacobian: Names = ()
     true_states: Names = ()
     home: str | None = None
+    camera: tuple[str, str] | None = None
     start: FloatArray | None = None
     parameters: Mapping[str, FloatArray] = field(default_factory=dict)
     nominal: Mapping[str, FloatArray] | None = None
@@ -105,6 +107,8 @@ class FmuMapping:
         check_number("max_joint_speed", self.max_joint_speed, above=0.0)
         if self.clips_itself and not self.joints:
             raise ValueError("clips_itself needs joints: commands cannot be integrated if the FMU changes them")
+        if self.start is not None and self.joints and self.home is None:
+            raise ValueError("start needs home, the parameter that takes it: the FMU tells its joints itself")
         if self.period is not None:
             check_number("period", self.period, above=0.0)
 

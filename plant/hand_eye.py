@@ -1,6 +1,6 @@
-"""Arm and eye-to-hand camera together: the feature is the ball centre in the camera frame.
+"""Arm and eye-to-hand camera together: the feature is the ball centre in the camera frame (eqs. 1, 8, 27 of the paper).
 
-y = R_BCᵀ (p_B(q) − p_BC),          J = ∂y/∂q = R_BCᵀ ∂p_B/∂q
+y = R_BCᵀ (p_B(q) − p_BC),          ẏ = J q̇,          J = ∂y/∂q = R_BCᵀ ∂p_B/∂q
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -50,6 +50,12 @@ class KinematicConfig:
         check_number("feature_noise", self.feature_noise, at_least=0.0)
 
 
+def vary_sensing(config: KinematicConfig, noise_factor: float, latency_periods: int | None) -> KinematicConfig:
+    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
+    latency = config.latency_periods if latency_periods is None else latency_periods
+    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)
+
+
 @lru_cache(maxsize=64)
 def discretise_lag(lag: float, period: float) -> tuple[FloatArray, FloatArray]:
     """Return the exact zero-order-hold discretisation of (q̇, v̇) = (v, (u − v)/lag).
@@ -83,6 +89,7 @@ class KinematicPlant(Plant):
         """
         self._config = config
         self._model, start = setup.robot()
+        self._X_BC = self._model.X_BC
         self._spec = hand_eye_spec(self._model, setup.period, config.max_joint_speed, config.joint_range)
         self._start = as_vector("start", start, self._spec.n)
         self._A, self._B = discretise_lag(config.lag, setup.period)
@@ -97,6 +104,7 @@ class KinematicPlant(Plant):
     def reset(self, seed: int) -> Observation:
         """Return to the start at rest; feature noise and lost frames get streams of their own."""
         self._noise = named_generator(seed, "feature_noise")
+        self.move_camera(self._X_BC)
         self._q = self._start.copy()
         self._v = np.zeros(self._spec.n)
         self._commands: deque[FloatArray] = deque([np.zeros(self._spec.n)] * self._config.command_delay_periods)
@@ -121,6 +129,10 @@ class KinematicPlant(Plant):
         feature, valid = self._channel.deliver(self._measure())
         return Observation(self._k * self._spec.period, self._q, feature, valid)
 
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """See `Plant.move_camera`."""
+        self._model = replace(self._model, X_BC=X_BC)
+
     def truth(self) -> Truth:
         """Return the noise-free feature and the Jacobian of the true model."""
         return Truth(self._model.feature(self._q), self._model.jacobian(self._q))
@@ -138,4 +150,5 @@ ENTRY = PlantEntry(
     summary="numpy arm with joint lag, command delay and feature noise: exact and fast",
     config=KinematicConfig,
     build=KinematicPlant,
+    sense=vary_sensing,
 )

@@ -37,6 +37,18 @@ def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rpy_from_rotation(R: FloatArray) -> FloatArray:
+    """Return roll, pitch, yaw, (3,) rad, of a rotation matrix (3, 3); sound at a pitch of ±90° too.
+
+    The yaw is taken out before pitch and roll are read, so that no angle is read from two vanishing numbers.
+    """
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
 @dataclass(frozen=True, eq=False)
 class SerialArm:
     """A serial arm with n revolute joints and a ball on its flange.

@@ -107,6 +107,17 @@ class Plant(ABC):
         """
         return None
 
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """Put the camera elsewhere from the next measurement on, until `reset`: somebody has knocked against it.
+
+        Args:
+            X_BC: (4, 4), the camera's new pose in the base frame.
+
+        Raises:
+            ValueError: a plant without a camera that could be moved.
+        """
+        raise ValueError("the plant has no camera that could be moved")
+
     @abstractmethod
     def close(self) -> None:
         """Free what the plant holds; calling it twice is allowed."""
@@ -146,6 +157,8 @@ class PlantEntry:
         summary: one line for `servobench plants`.
         config: frozen dataclass with a default for every field.
         build: makes the plant from its configuration and the setup.
+        sense: returns a configuration with its sensor noise multiplied by a factor and, unless None, its latency set to
+            a number of periods; None for a plant whose sensing cannot be varied.
         own_robot: it brings a robot and a start of its own: tasks taught on the UR5 and mismatches do not apply, and
             no nominal model is known.
     """
@@ -154,7 +167,18 @@ class PlantEntry:
     summary: str
     config: type[Any]
     build: Callable[[Any, PlantSetup], Plant]
+    sense: Callable[[Any, float, int | None], Any] | None = None
     own_robot: bool = False
+
+    def vary_sensing(self, config: Any, noise_factor: float, latency_periods: int | None) -> Any:  # noqa: ANN401
+        """Return `config` with other noise and latency; see `sense`.
+
+        Raises:
+            ValueError: the plant does not offer that, or a number out of its bounds.
+        """
+        if self.sense is None:
+            raise ValueError("its noise and latency cannot be varied")
+        return self.sense(config, noise_factor, latency_periods)
 
 
 def whole_steps(period: float, own_step: float) -> int:

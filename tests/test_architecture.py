@@ -20,6 +20,9 @@ OWNERS = {
     "casadi": ("plant/symbolic", "plant/fmu_symbolic", "controllers/laws/mpc", "controllers/nmpc", "fmus/"),
     "fmpy": ("plant/fmu", "fmus/"),
     "dask": ("harness/cluster",),
+    "distributed": ("harness/cluster",),
+    "optuna": ("harness/tuning/",),
+    "statsmodels": ("harness/statistics",),
 }
 
 

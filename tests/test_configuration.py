@@ -50,6 +50,11 @@ def test_assignments_win_over_the_file(tmp_path):
     assert got == Outer(count=6, inner=Inner(4.0))
 
 
+def test_a_section_that_names_a_file_keeps_its_dots():
+    settings = read_settings(None, ["fmu:some.where/outer.toml.inner.gain=2.0"])
+    assert settings.resolve("fmu:some.where/outer.toml", Outer()) == Outer(inner=Inner(2.0))
+
+
 def test_a_default_that_differs_from_the_class_is_kept():
     assert Settings({"outer": {"on": True}}).resolve("outer", Outer(count=9)) == Outer(count=9, on=True)
 

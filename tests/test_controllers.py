@@ -14,6 +14,7 @@ from controllers.initial import InitialConfig
 from controllers.servo import ServoController
 from controllers.training import train
 from controllers.training_config import ControllerTraining, JacobianTraining
+from harness.defaults import default_config
 from plant.signals import Observation, PlantSpec
 
 MODULES = (broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rbf_pid, rbfnn_mfac, rls, ukf_mfac)
@@ -71,7 +72,7 @@ def random_run(controller, spec, seed, scale, steps=12):
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-3, 6))
 def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n, m, seed, exponent):
     knowledge = robot(n, m, seed)
-    controller = entry.build(entry.config(), knowledge)
+    controller = entry.build(default_config(entry), knowledge)
     for u, J, diagnostics in random_run(controller, knowledge.spec, seed, 10.0**exponent):
         assert u.shape == (n,)
         assert (np.abs(u) <= knowledge.spec.joint_velocity_limit * (1 + 1e-12)).all()
@@ -84,7 +85,7 @@ def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n,
 def test_reset_forgets_everything(entry, source):
     knowledge = robot(5, 3, 7)
     initial = InitialConfig(source=source, probe_step=1e-3, settle_periods=1, average_periods=1)
-    controller = entry.build(dataclasses.replace(entry.config(), initial=initial), knowledge)
+    controller = entry.build(dataclasses.replace(default_config(entry), initial=initial), knowledge)
     steps = 40 if source == "probe" else 12
     first = random_run(controller, knowledge.spec, 1, 0.5, steps)
     random_run(controller, knowledge.spec, 2, 0.5, steps // 2)
@@ -94,7 +95,7 @@ def test_reset_forgets_everything(entry, source):
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_estimator_law_and_servo_tell_different_things(entry):
     knowledge = robot(4, 2, 3)
-    settings_, names = entry.config(), ["probing", "jacobian_prediction_error"]
+    settings_, names = default_config(entry), ["probing", "jacobian_prediction_error"]
     controller = entry.build(settings_, knowledge)
     (_, _, merged), *_ = random_run(controller, knowledge.spec, 3, 0.5)
     assert isinstance(controller, ServoController)
@@ -114,7 +115,7 @@ def test_only_the_calibrated_controller_is_told_the_truth():
 def test_the_kalman_preset_commands_what_the_unscented_one_does():
     knowledge = robot(6, 3, 11)
     runs = [
-        random_run(entry.build(entry.config(), knowledge), knowledge.spec, 5, 0.5, steps=60)
+        random_run(entry.build(default_config(entry), knowledge), knowledge.spec, 5, 0.5, steps=60)
         for entry in (ukf_mfac.ENTRY, kalman_mfac.ENTRY)
     ]
     for (u, J, _), (u_kalman, J_kalman, _) in zip(*runs, strict=True):

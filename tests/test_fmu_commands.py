@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import zipfile
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from fmus.information import read_information
 from fmus.ur5_plant import cached_fmu
-from harness.configuration import ConfigurationError
+from harness.configuration import ConfigurationError, Settings
+from harness.experiment import RunRequest, build_experiment
 from harness.fmu_commands import fmu_app
 
 
@@ -28,6 +31,15 @@ def test_an_exported_fmu_validates_and_tells_about_itself(tmp_path):
     assert "FMI 3.0, co-simulation" in informed.output
     assert "capabilities in co-simulation: canGetAndSetFMUState, canSerializeFMUState, provides" in informed.output
     assert "ball_position" in informed.output
+
+
+def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(tmp_path):
+    path = tmp_path / "ur5.fmu"
+    assert invoke("export", "-o", path, "--fmi", 3, "--mismatch", "severe", "--seed", 3).exit_code == 0
+    start = {variable.name: variable.start for variable in read_information(path).variables}
+    run = build_experiment(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings())
+    exported = np.array(start["joint_offset"].split(), dtype=float)
+    np.testing.assert_allclose(exported, run.sample.joint_offset, rtol=1e-12)
 
 
 @pytest.mark.parametrize(

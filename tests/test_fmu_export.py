@@ -31,9 +31,9 @@ from fmus.information import read_information
 from fmus.reference import OUTPUT_FILE, reference_run
 from fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from fmus.validate import validate_fmu
-from fmus.variables import model_of, parameters_of, rpy_from_rotation
+from fmus.variables import model_of, parameters_of
 from plant.fmu_archive import FmuFolder
-from plant.kinematics import rotation_from_rpy
+from plant.kinematics import rotation_from_rpy, rpy_from_rotation
 from plant.mismatch import parse_mismatch, sample_mismatch
 from plant.plant import PlantSetup
 from plant.ur5 import HOME, JOINT_NAMES, nominal_ur5

@@ -1,4 +1,4 @@
-"""Tests of the MFAC law (eq. 44) against least squares, the limit λ → 0 and a step by hand."""
+"""Tests of the MFAC law (eq. 45) against least squares, the limit λ → 0 and a step by hand."""
 
 import numpy as np
 import pytest

@@ -2,11 +2,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from plant.mismatch import MAX_TILT, Mismatch, parse_mismatch, sample_mismatch
+from plant.mismatch import MAX_TILT, Mismatch, magnitude_texts, parse_mismatch, sample_mismatch
 from plant.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
 
 POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
@@ -101,3 +103,49 @@ def test_a_missing_calibration_file_is_named():
 def test_a_negative_magnitude_is_refused():
     with pytest.raises(ValueError, match="tool must be at least 0"):
         Mismatch(tool=-0.1)
+
+
+@pytest.mark.parametrize(
+    ("axis", "text", "magnitudes"),
+    [
+        ("camera_rotation", "0:90:45deg", ("0deg", "45deg", "90deg")),
+        ("links", "0:30:10%", ("0%", "10%", "20%", "30%")),
+        ("tool", "5/12.5mm", ("5mm", "12.5mm")),
+        ("gear_ratio", "0.1", ("0.1",)),
+        ("joint_offsets", "0:0.3:0.1rad", ("0rad", "0.1rad", "0.2rad", "0.3rad")),
+    ],
+)
+def test_a_range_of_magnitudes_includes_both_ends(axis, text, magnitudes):
+    assert magnitude_texts(axis, text) == magnitudes
+
+
+@pytest.mark.parametrize(
+    ("axis", "text", "message"),
+    [
+        ("lens", "0:1:1", "unknown mismatch axis 'lens'; valid: links, joint_offsets"),
+        ("links", "30:0:10%", "the range '30:0:10%' of links is empty"),
+        ("links", "0:30:0%", "is empty"),
+        ("tool", "0:60mm", "tool needs begin:end:step with a unit, such as tool=0:60:20mm; got '0:60mm'"),
+        ("tool", "", "tool needs begin:end:step"),
+        ("tool", "0:60:20deg", "tool needs a magnitude with one of the units 'mm'"),
+    ],
+)
+def test_a_bad_range_of_magnitudes_is_refused(axis, text, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        magnitude_texts(axis, text)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
+    model, sample = sample_mismatch(parse_mismatch("camera_move=120deg"), nominal_ur5(), seed)
+    moved = sample.moved(model)
+    turn = Rotation.from_matrix(model.X_BC[:3, :3].T @ moved.X_BC[:3, :3])
+    assert turn.magnitude() == pytest.approx(np.radians(120.0))
+    tilt = np.arccos(model.X_BC[:3, 2] @ moved.X_BC[:3, 2])
+    assert tilt <= np.radians(30.0) + 1e-9
+    np.testing.assert_allclose(model.to_camera(WORKSPACE_CENTRE), moved.to_camera(WORKSPACE_CENTRE), atol=1e-12)
+
+
+def test_without_a_move_there_is_no_moved_robot():
+    model, sample = sample_mismatch(parse_mismatch("severe"), nominal_ur5(), 0)
+    assert sample.moved(model) is None

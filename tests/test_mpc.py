@@ -91,7 +91,7 @@ def test_first_step_of_free_moves_by_hand():
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
-def test_constant_mode_without_active_limits_is_equation_45(seed, solver):
+def test_constant_mode_without_active_limits_is_equation_46(seed, solver):
     spec = make_spec(speed=1e3, reach=1e3)
     law = make_law(spec, mode="constant", alpha=0.9, solver=solver, move_weight=0.5, use_preview=False)
     J, e = random_jacobian(seed), np.random.default_rng(seed + 9).normal(scale=0.2, size=3)

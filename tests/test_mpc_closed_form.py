@@ -83,24 +83,24 @@ def random_problem(seed, m=3, n=6):
     return rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.1, 1.0, n)
 
 
-def printed_equation_45(J, e, Q, abc):
+def printed_equation_46(J, e, Q, abc):
     return np.linalg.pinv(abc.a * J + np.linalg.pinv(J.T) @ Q) @ ((abc.b - abc.c) * e)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_equation_45_as_printed_is_the_minimiser_for_a_multiple_of_the_identity(seed):
+def test_equation_46_as_printed_is_the_minimiser_for_a_multiple_of_the_identity(seed):
     J, e, _ = random_problem(seed)
     abc = horizon_integrals(10, 0.9, 0.2)
     step = constant_step(J, (abc.b - abc.c) * e, abc.a, np.full(6, 0.7))
-    np.testing.assert_allclose(printed_equation_45(J, e, 0.7 * np.eye(6), abc), step, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(printed_equation_46(J, e, 0.7 * np.eye(6), abc), step, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_equation_45_as_printed_is_another_step_for_other_weights(seed):
+def test_equation_46_as_printed_is_another_step_for_other_weights(seed):
     J, e, Q = random_problem(seed)
     abc = horizon_integrals(2, 0.9, 0.2)
     step = constant_step(J, (abc.b - abc.c) * e, abc.a, Q)
-    printed = printed_equation_45(J, e, np.diag(Q), abc)
+    printed = printed_equation_46(J, e, np.diag(Q), abc)
     assert np.abs(printed - step).max() > 1e-4
 
     def criterion(dq):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from controllers.networks import (
     ControllerNetwork,
     JacobianNetwork,
+    LatestFeatures,
     controller_output,
     hidden_features,
     information_vector,
@@ -41,6 +42,40 @@ def test_the_jacobian_equals_a_plain_loop_over_columns_and_units():
             theta = np.exp(-((distance / network.widths[i, unit]) ** 2))
             J[:, i] += network.weights[i, :, unit] * theta
     np.testing.assert_allclose(network.jacobian(q), J, atol=1e-12)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("shape", [(), (4, 2)])
+def test_the_quick_features_of_the_jacobian_network_are_those_of_the_plain_formula(shared, shape):
+    network = jacobian_network(units=20)
+    if shared:
+        centres = np.broadcast_to(network.centres[0], network.centres.shape)
+        network = JacobianNetwork(centres, network.widths, network.weights)
+    for q in (np.random.default_rng(4).normal(scale=3.0, size=(*shape, 3)), np.full((*shape, 3), 1e3)):
+        plain = jacobian_features(q, network.centres, network.widths)
+        np.testing.assert_allclose(network.features(q), plain, rtol=1e-12)
+    np.testing.assert_array_equal(network.features(network.centres[1, 2])[1, 2], 1.0)
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian"])
+@pytest.mark.parametrize("shape", [(), (4, 2)])
+def test_the_quick_features_of_the_controller_network_are_those_of_the_plain_formula(kernel, shape):
+    network = controller_network(hidden=20, kernel=kernel)
+    for xi in (np.random.default_rng(4).normal(scale=3.0, size=(*shape, 7)), np.full((*shape, 7), 1e3)):
+        plain = hidden_features(xi, network.centres, network.widths, kernel)
+        np.testing.assert_allclose(network.features(xi), plain, rtol=1e-12)
+    np.testing.assert_array_equal(network.features(network.centres[3])[3], 1.0)
+
+
+def test_the_latest_features_are_those_of_the_position_asked_for():
+    network, (first, second) = jacobian_network(), np.random.default_rng(5).normal(size=(2, 3))
+    latest = LatestFeatures(network)
+    for q in (first, first, second, first):
+        np.testing.assert_array_equal(latest.at(q), network.features(q))
+    q = first.copy()
+    latest.at(q)
+    q[0] += 1.0
+    np.testing.assert_array_equal(latest.at(q), network.features(q))
 
 
 def test_many_joint_positions_at_once_give_what_each_gives_alone():

@@ -124,3 +124,51 @@ def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):
     assert observed == [row[2] for row in plain[1:]]
     for picture in pictures:
         assert picture is None or (picture.dtype == np.uint8 and picture.ndim == 3 and picture.std() > 0)
+
+
+def test_a_moved_camera_shows_the_ball_elsewhere_until_the_reset(plant):
+    model, sample = sample_mismatch(parse_mismatch("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
+    moved = sample.moved(model)
+    plant.reset(0)
+    before = plant.truth()
+    plant.move_camera(moved.X_BC)
+    observation = plant.step(Command(np.zeros(6)))
+    for _ in range(3):
+        observation = plant.step(Command(np.zeros(6)))
+    after = plant.truth()
+    assert np.linalg.norm(after.feature - before.feature) > 0.005
+    np.testing.assert_allclose(after.feature, moved.feature(observation.joint_position), atol=1e-6)
+    np.testing.assert_allclose(after.jacobian, moved.jacobian(observation.joint_position), atol=1e-6)
+    assert np.linalg.norm(observation.feature - after.feature) < 0.01
+    plant.reset(0)
+    np.testing.assert_allclose(plant.truth().feature, before.feature, atol=1e-9)
+
+
+def test_noise_and_latency_can_be_varied(entry):
+    model = nominal_ur5()
+
+    def spread(factor: float) -> float:
+        plant = entry.build(entry.vary_sensing(entry.config(), factor, 3), PlantSetup(model, np.array(HOME), PERIOD))
+        try:
+            seen = [plant.reset(4).feature, *(plant.step(Command(np.zeros(6))).feature for _ in range(30))]
+            return float(np.std(seen, axis=0).max())
+        finally:
+            plant.close()
+
+    quiet, usual, loud = spread(0.0), spread(1.0), spread(3.0)
+    assert quiet < 0.5 * usual
+    assert loud > 1.8 * usual
+
+
+START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the point about which the camera turns
+
+
+def test_latency_shows_a_moved_camera_late(entry):
+    model, sample = sample_mismatch(parse_mismatch("camera_move=20deg"), nominal_ur5(), 1)
+    plant = entry.build(entry.vary_sensing(entry.config(), 0.0, 3), PlantSetup(model, START, PERIOD))
+    first = plant.reset(0).feature
+    plant.move_camera(sample.moved(model).X_BC)
+    seen = [np.linalg.norm(plant.step(Command(np.zeros(6))).feature - first) for _ in range(6)]
+    plant.close()
+    assert max(seen[:3]) < 0.002
+    assert min(seen[3:]) > 0.005

@@ -22,6 +22,22 @@ def motion(q, dq, dy, duration=0.05):
     return Motion(np.asarray(q), np.asarray(dq), np.asarray(dy), np.zeros(len(dy)), duration)
 
 
+def as_matrix(weights):
+    """Return [W_1 … W_n], (m, n L), of weights (n, m, L)."""
+    return np.concatenate(weights, axis=1)
+
+
+def moved_by(theta, dq):
+    """Return μ_t, (T, n L)."""
+    return np.array([np.concatenate([dq[t, i] * theta[t, i] for i in range(len(dq[t]))]) for t in range(len(dq))])
+
+
+def squares(theta, dq):
+    """Return the mean of ‖θ_i(q_t)‖² over the columns and ‖μ_t‖² of each motion."""
+    sizes = (theta**2).sum(axis=2)
+    return list(zip(sizes.mean(axis=1), (dq**2 * sizes).sum(axis=1), strict=True))
+
+
 def window(net, count, seed=1):
     rng = np.random.default_rng(seed)
     q, dq, dy = rng.normal(size=(count, net.n)), rng.normal(size=(count, net.n)), rng.normal(size=(count, net.m))
@@ -41,11 +57,11 @@ def test_the_gradient_is_that_of_automatic_differentiation():
         )
         Q += casadi.sumsqr(casadi.DM(dy[t]) - predicted)
     expected = casadi.Function("g", [W], [casadi.gradient(Q, W)])(net.weights.ravel())
-    gradient, _ = window_gradient(net.weights, theta, dq, dy)
-    np.testing.assert_allclose(-2.0 * gradient.ravel(), np.asarray(expected)[:, 0], atol=1e-12)
+    gradient, _ = window_gradient(as_matrix(net.weights), moved_by(theta, dq), dy)
+    np.testing.assert_allclose(-2.0 * gradient, as_matrix(np.asarray(expected).reshape(n, m, units)), atol=1e-12)
 
 
-def test_tensors_and_plain_loops_give_the_same_update():
+def test_matrices_and_plain_loops_give_the_same_update():
     net, config = network(), RbfConfig(window=3, k2=0.7, epsilon=0.01)
     theta, dq, dy = window(net, 3)
     gradient, size, norms = np.zeros(net.weights.shape), 0.0, []
@@ -56,9 +72,10 @@ def test_tensors_and_plain_loops_give_the_same_update():
             norms.append(theta[t, i] @ theta[t, i])
             for unit in range(4):
                 gradient[i, :, unit] += (dy[t] - J @ dq[t]) * dq[t, i] * theta[t, i, unit]
-    tensor, _ = window_gradient(net.weights, theta, dq, dy)
-    np.testing.assert_allclose(tensor, gradient, atol=1e-12)
-    step = window_step(theta, dq, config.k2, config.epsilon)
+    moved = moved_by(theta, dq)
+    matrix, _ = window_gradient(as_matrix(net.weights), moved, dy)
+    np.testing.assert_allclose(matrix, as_matrix(gradient), atol=1e-12)
+    step = window_step(squares(theta, dq), config.k2, config.epsilon)
     assert step == pytest.approx(0.7 / (0.01 * np.mean(norms) + size), rel=1e-12)
 
 
@@ -93,9 +110,10 @@ def test_beyond_a_step_size_of_two_the_weights_do_move_away():
     weights = true.weights + rng.normal(size=true.weights.shape)
     q, dq = rng.normal(size=3), rng.normal(size=3)
     theta = jacobian_features(q, true.centres, true.widths)[None]
-    gradient, _ = window_gradient(weights, theta, dq[None], (true.jacobian(q) @ dq)[None])
-    moved = weights + window_step(theta, dq[None], 2.1, 0.0) * gradient
-    assert np.sum((moved - true.weights) ** 2) > np.sum((weights - true.weights) ** 2)
+    row, W, W_true = moved_by(theta, dq[None]), as_matrix(weights), as_matrix(true.weights)
+    gradient, _ = window_gradient(W, row, (true.jacobian(q) @ dq)[None])
+    after = W + window_step(squares(theta, dq[None]), 2.1, 0.0) * gradient
+    assert np.sum((after - W_true) ** 2) > np.sum((W - W_true) ** 2)
 
 
 def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
@@ -125,8 +143,10 @@ def test_only_the_last_motions_of_the_window_count():
     estimator.update(motions[-1])
     theta = np.array([jacobian_features(each.joint_position, net.centres, net.widths) for each in motions[-2:]])
     dq, dy = (np.array([getattr(each, name) for each in motions[-2:]]) for name in ("joint_step", "feature_step"))
-    gradient, _ = window_gradient(weights, theta, dq, dy)
-    np.testing.assert_allclose(estimator.weights, weights + window_step(theta, dq, 0.5, 1e-3) * gradient, atol=1e-13)
+    moved = moved_by(theta, dq)
+    gradient, _ = window_gradient(as_matrix(weights), moved, dy)
+    expected = as_matrix(weights) + window_step(squares(theta, dq), 0.5, 1e-3) * gradient
+    np.testing.assert_allclose(as_matrix(estimator.weights), expected, atol=1e-13)
 
 
 def test_reset_restores_the_offline_network_whatever_the_initial_jacobian():

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controllers.controller import RobotKnowledge
-from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw, project_to_row_space
+from controllers.laws.law import scale_to_limit
+from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
 from controllers.networks import ControllerNetwork, controller_output, information_vector
 from plant.signals import Observation, PlantSpec
@@ -50,18 +51,22 @@ def case(net, seed=1, horizon=4, limit=1e6):
     return J, history, steps, ahead
 
 
-def test_the_roll_out_equals_a_plain_loop():
-    net = network(error_history=2, position_history=2)
-    J, (errors, positions), steps, ahead = case(net)
-    e_list, q_list = list(errors), list(positions)
+@pytest.mark.parametrize(("error_history", "position_history"), [(1, 1), (2, 2), (3, 1), (1, 3)])
+@pytest.mark.parametrize("limit", [1e6, 0.02])
+def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit):
+    net = network(error_history=error_history, position_history=position_history)
+    J, (errors, positions), steps, ahead = case(net, limit=limit)
+    e_list, q_list, wanted = list(errors), list(positions), []
     for t in range(4):
-        xi = np.concatenate([*e_list[:2], *q_list[:2]])
+        xi = np.concatenate([*e_list[:error_history], *q_list[:position_history]])
         h = np.exp(-np.linalg.norm(xi - net.centres, axis=1) / net.widths**2)
-        q = sum(net.weights[:, j] @ h * xi[j] for j in range(len(xi)))
-        e = e_list[0] + steps[t] - J @ (q - q_list[0])
-        e_list, q_list = [e, *e_list], [q, *q_list]
-        np.testing.assert_allclose(ahead.errors[t], e, atol=1e-12)
+        wanted.append(sum(net.weights[:, j] @ h * xi[j] for j in range(len(xi))) - q_list[0])
+        dq = scale_to_limit(wanted[t], np.full(net.n, limit))
+        e_list, q_list = [e_list[0] + steps[t] - J @ dq, *e_list], [q_list[0] + dq, *q_list]
+        np.testing.assert_allclose(ahead.errors[t], e_list[0], atol=1e-12)
         np.testing.assert_allclose(ahead.xi[t], xi, atol=1e-12)
+        np.testing.assert_allclose(ahead.h[t], h, atol=1e-12)
+    np.testing.assert_allclose(ahead.wanted, wanted[0], atol=1e-12)
 
 
 def test_the_roll_out_keeps_the_joint_step_limit():
@@ -133,16 +138,6 @@ def test_the_first_step_equals_the_one_computed_by_hand():
         np.array([[1.0]]), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
     )
     np.testing.assert_allclose(u, [0.3 / PERIOD], rtol=1e-12)
-
-
-def test_the_projection_keeps_what_moves_the_feature_and_nothing_else():
-    rng = np.random.default_rng(5)
-    J, W = rng.normal(size=(2, 4)), rng.normal(size=(4, 3, 5))
-    projected = project_to_row_space(W, J)
-    np.testing.assert_allclose(np.einsum("mn,npl->mpl", J, projected), np.einsum("mn,npl->mpl", J, W), atol=1e-12)
-    null = np.eye(4) - np.linalg.pinv(J) @ J
-    np.testing.assert_allclose(np.einsum("ij,jpl->ipl", null, projected), 0.0, atol=1e-12)
-    np.testing.assert_allclose(project_to_row_space(projected, J), projected, atol=1e-12)
 
 
 def null_motion(row_space_only):
@@ -261,7 +256,7 @@ def test_commands_are_finite_and_limited_for_any_sizes(n, m, error_history, posi
 
 
 def test_nothing_to_descend_gives_no_step():
-    ahead = RollOut(np.zeros((2, 2)), np.ones((2, 5)), np.ones((2, 4)))
+    ahead = RollOut(np.zeros((2, 2)), np.ones((2, 5)), np.ones((2, 4)), np.zeros(3))
     assert update_step(descent_direction(np.ones((2, 3)), ahead), ahead, 0.5, 0.0) == 0.0
     assert controller_output(np.zeros((3, 5, 4)), ahead.xi[0], ahead.h[0]).tolist() == [0.0, 0.0, 0.0]
 

@@ -8,6 +8,7 @@ import pytest
 from controllers import rbf_pid, rbfnn_mfac
 from controllers.controller import RobotKnowledge
 from controllers.training import train
+from harness.defaults import default_config
 from plant.hand_eye import hand_eye_spec
 from plant.kinematic import KinematicConfig, KinematicPlant
 from plant.mismatch import PROFILES, sample_mismatch
@@ -51,7 +52,7 @@ def test_moderately_wrong_robots_settle_within_5_mm(preset, latency, knowledge):
         robot, _ = sample_mismatch(PROFILES["moderate"], MODEL, seed)
         start, goal = rng.uniform(LOWER, UPPER), robot.feature(rng.uniform(LOWER, UPPER))
         plant = KinematicPlant(KinematicConfig(latency_periods=latency), PlantSetup(robot, start, PERIOD))
-        controller = preset.ENTRY.build(preset.ENTRY.config(), knowledge)
+        controller = preset.ENTRY.build(default_config(preset.ENTRY), knowledge)
         errors = true_errors(controller, plant, lambda _, goal=goal: goal, 160, seed)
         assert errors[-20:].max() < 0.005
         assert controller.estimated_jacobian().shape == (3, 6)

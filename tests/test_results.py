@@ -93,7 +93,7 @@ def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
         results.load_runs(folder)
     with pytest.raises(ConfigurationError, match="is not a results folder"):
         results.load_steps(tmp_path)
-    with pytest.raises(ConfigurationError, match="holds no finished run"):
+    with pytest.raises(ConfigurationError, match="is not a results folder"):
         results.collect(tmp_path)
 
 

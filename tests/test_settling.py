@@ -8,6 +8,7 @@ import pytest
 from controllers import broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rls, ukf_mfac
 from controllers.controller import RobotKnowledge
 from controllers.initial import InitialConfig
+from harness.defaults import default_config
 from plant.hand_eye import HandEyeModel
 from plant.kinematic import KinematicConfig, KinematicPlant
 from plant.kinematics import arm_from_dh, rotation_from_rpy
@@ -45,18 +46,18 @@ def true_errors(entry, config, degrees=15.0, periods=160, **plant_settings):
 @pytest.mark.parametrize("entry", PRESETS, ids=lambda entry: entry.name)
 @pytest.mark.parametrize("settings", [{}, {"latency_periods": 1, "drop_probability": 0.1}], ids=["default", "late"])
 def test_a_preset_settles_within_5_mm(entry, settings):
-    errors = true_errors(entry, entry.config(), **settings)
+    errors = true_errors(entry, default_config(entry), **settings)
     assert errors[0] > 0.1
     assert errors[-40:].max() < BAND
 
 
 def test_an_estimator_settles_where_its_first_jacobian_comes_from_probing_alone():
-    config = dataclasses.replace(ukf_mfac.ENTRY.config(), initial=InitialConfig("probe"))
+    config = dataclasses.replace(default_config(ukf_mfac.ENTRY), initial=InitialConfig("probe"))
     assert true_errors(ukf_mfac.ENTRY, config, degrees=90.0, periods=220)[-40:].max() < BAND
 
 
 def test_an_estimator_beats_the_constant_jacobian_under_a_strongly_turned_camera():
     def periods_outside(entry):
-        return int(np.sum(true_errors(entry, entry.config(), degrees=50.0) > BAND))
+        return int(np.sum(true_errors(entry, default_config(entry), degrees=50.0) > BAND))
 
     assert periods_outside(ukf_mfac.ENTRY) < periods_outside(constant.ENTRY)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import final
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from controllers.controller import Diagnostics
 from controllers.estimators.estimator import Estimator, Motion
-from controllers.networks import JacobianNetwork, jacobian_features, jacobian_output
+from controllers.networks import JacobianNetwork, LatestFeatures, jacobian_output
 from plant.signals import FloatArray, check_number
 
 
@@ -29,36 +30,33 @@ class RbfConfig:
         check_number("epsilon", self.epsilon, at_least=0.0)
 
 
-def window_gradient(
-    weights: FloatArray, theta: FloatArray, joint_steps: FloatArray, feature_steps: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def window_gradient(weights: FloatArray, moved: FloatArray, feature_steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return −½ ∂Q/∂W of the window's squared prediction error (eqs. 31, 32) and the errors themselves.
 
+    With μ_t = [Δq_{1,t} θ_1(q_t) … Δq_{n,t} θ_n(q_t)] and W = [W_1 … W_n] is Ĵ_t Δq_t = W μ_t, all columns at once.
+
     Args:
-        weights: W, (n, m, L), m/rad.
-        theta: θ(q_t), (T, n, L).
-        joint_steps: Δq_t, (T, n), rad.
+        weights: W, (m, n L), m/rad.
+        moved: μ_t, (T, n L), rad.
         feature_steps: Δy_t, (T, m), m.
 
     Returns:
-        G_i = Σ_t (Δy_t − Ĵ_t Δq_t) Δq_{i,t} θ_i(q_t)ᵀ, (n, m, L), and Δy_t − Ĵ_t Δq_t, (T, m).
+        G = Σ_t (Δy_t − W μ_t) μ_tᵀ, (m, n L), and Δy_t − W μ_t, (T, m).
     """
-    moved = np.swapaxes(joint_steps[:, :, None] * theta, 0, 1)
-    error = feature_steps - np.matmul(moved, np.swapaxes(weights, 1, 2)).sum(axis=0)
-    return np.matmul(error.T, moved), error
+    error = feature_steps - moved @ weights.T
+    return error.T @ moved, error
 
 
-def window_step(theta: FloatArray, joint_steps: FloatArray, k2: float, epsilon: float) -> float:
-    """Return α₂ = k₂ / (ε ‖θ‖² + Σ_t Σ_i Δq²_{i,t} ‖θ_i(q_t)‖²) (eq. 36 with ε); 0 where nothing has moved.
+def window_step(squares: Collection[tuple[float, float]], k2: float, epsilon: float) -> float:
+    """Return α₂ = k₂ / (ε ‖θ‖² + Σ_t ‖μ_t‖²) (eq. 36 with ε); 0 where nothing has moved.
 
     Args:
-        theta: θ(q_t), (T, n, L).
-        joint_steps: Δq_t, (T, n), rad.
+        squares: for each motion of the window the mean of ‖θ_i(q_t)‖² over the columns, and
+            ‖μ_t‖² = Σ_i Δq²_{i,t} ‖θ_i(q_t)‖², rad²; ‖θ‖² is the mean of the first over the window.
         k2: k₂.
-        epsilon: ε, rad²; ‖θ‖² is the mean of ‖θ_i(q_t)‖² over columns and window.
+        epsilon: ε, rad².
     """
-    size = np.einsum("til,til->ti", theta, theta)
-    total = epsilon * float(size.mean()) + float(np.vdot(joint_steps**2, size))
+    total = epsilon * sum(theta for theta, _ in squares) / len(squares) + sum(moved for _, moved in squares)
     return k2 / total if total > 0.0 else 0.0
 
 
@@ -82,13 +80,15 @@ class RbfEstimator(Estimator):
         """Start from the offline `network`."""
         self._config = config
         self._network = network
+        self._features = LatestFeatures(network)
         self._weights = network.weights
+        self._count = 0
         self._restore()
 
     @property
     def weights(self) -> FloatArray:
         """W as it is now, (n, m, L), m/rad; a copy."""
-        return np.array(self._weights)
+        return np.array(self._columns())
 
     def reset(self, jacobian: FloatArray) -> None:
         """Forget everything and restore the offline network.
@@ -106,29 +106,41 @@ class RbfEstimator(Estimator):
 
     def update(self, motion: Motion) -> None:
         """Learn from the window that `motion` completes."""
-        theta = jacobian_features(motion.joint_position, self._network.centres, self._network.widths)
-        self._window.append((theta, motion.joint_step, motion.feature_step))
-        thetas, joint_steps, feature_steps = (np.array(column) for column in zip(*self._window, strict=True))
-        gradient, error = window_gradient(self._weights, thetas, joint_steps, feature_steps)
-        self._step = window_step(thetas, joint_steps, self._config.k2, self._config.epsilon)
+        theta = self._features.at(motion.joint_position)
+        row = self._count % self._config.window
+        moved = self._moved[row]
+        np.multiply(motion.joint_step[:, None], theta, out=moved.reshape(theta.shape))
+        self._feature_steps[row] = motion.feature_step
+        self._squares.append((float(np.vdot(theta, theta)) / len(theta), float(np.vdot(moved, moved))))
+        self._count += 1
+        filled = slice(min(self._count, self._config.window))
+        gradient, self._error = window_gradient(self._weights, self._moved[filled], self._feature_steps[filled])
+        self._step = window_step(self._squares, self._config.k2, self._config.epsilon)
         self._weights = self._weights + self._step * gradient
-        self._window_error = float(np.linalg.norm(error))
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad."""
-        theta = jacobian_features(joint_position, self._network.centres, self._network.widths)
-        return jacobian_output(self._weights, theta)
+        return jacobian_output(self._columns(), self._features.at(joint_position))
 
     def diagnostics(self) -> Diagnostics:
         """Return the step size α₂, the root of Q, the window's prediction error (m), and the norm of all weights."""
         return {
             "estimator_step_size": self._step,
-            "window_error": self._window_error,
+            "window_error": float(np.linalg.norm(self._error)),
             "estimator_weight_norm": float(np.linalg.norm(self._weights)),
         }
 
+    def _columns(self) -> FloatArray:
+        """Return W_i as a view, (n, m, L), of the weights, (m, n L)."""
+        network = self._network
+        return self._weights.reshape(network.m, network.n, -1).swapaxes(0, 1)
+
     def _restore(self) -> None:
-        self._weights = self._network.weights.copy()
-        self._window: deque[tuple[FloatArray, FloatArray, FloatArray]] = deque(maxlen=self._config.window)
+        network, window = self._network, self._config.window
+        self._weights = network.weights.swapaxes(0, 1).reshape(network.m, -1)
+        self._moved: FloatArray = np.empty((window, self._weights.shape[1]))  # μ_t; the oldest row is overwritten
+        self._feature_steps: FloatArray = np.empty((window, network.m))
+        self._squares: deque[tuple[float, float]] = deque(maxlen=window)
+        self._count = 0
+        self._error = np.zeros((1, network.m))
         self._step = 0.0
-        self._window_error = 0.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from controllers.controller import Diagnostics
 from controllers.estimators.estimator import Estimator, Motion
-from controllers.networks import JacobianNetwork, jacobian_features, jacobian_output
+from controllers.networks import JacobianNetwork, LatestFeatures, jacobian_output
 from plant.signals import FloatArray, check_number
 
 
@@ -43,7 +43,7 @@ def lyapunov_step(
     """
     s = (motion.feature_step - jacobian @ motion.joint_step) / motion.duration
     pull = n3 * s - n2 * motion.error
-    return np.einsum("i,m,il->iml", motion.joint_step, pull, theta), s
+    return pull[:, None] * (motion.joint_step[:, None] * theta)[:, None, :], s
 
 
 @final
@@ -68,6 +68,7 @@ class RbfLyapunovEstimator(Estimator):
         """Start from the offline `network`."""
         self._config = config
         self._network = network
+        self._features = LatestFeatures(network)
         self._weights = network.weights
         self._restore()
 
@@ -91,23 +92,23 @@ class RbfLyapunovEstimator(Estimator):
 
     def update(self, motion: Motion) -> None:
         """Learn from one motion."""
-        theta = self._features(motion.joint_position)
+        theta = self._features.at(motion.joint_position)
         J = jacobian_output(self._weights, theta)
         change, s = lyapunov_step(theta, motion, J, self._config.n2, self._config.n3)
         self._weights = self._weights + change
-        self._rate_error = float(np.linalg.norm(s))
+        self._rate_error = s
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad."""
-        return jacobian_output(self._weights, self._features(joint_position))
+        return jacobian_output(self._weights, self._features.at(joint_position))
 
     def diagnostics(self) -> Diagnostics:
         """Return ‖s‖, the prediction error of the feature's velocity (m/s), and the norm of all weights."""
-        return {"rate_error": self._rate_error, "estimator_weight_norm": float(np.linalg.norm(self._weights))}
-
-    def _features(self, q: FloatArray) -> FloatArray:
-        return jacobian_features(q, self._network.centres, self._network.widths)
+        return {
+            "rate_error": float(np.linalg.norm(self._rate_error)),
+            "estimator_weight_norm": float(np.linalg.norm(self._weights)),
+        }
 
     def _restore(self) -> None:
         self._weights = self._network.weights.copy()
-        self._rate_error = 0.0
+        self._rate_error = np.zeros(self._network.m)

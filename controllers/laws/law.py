@@ -45,5 +45,5 @@ def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     Returns:
         (..., n), rad/s.
     """
-    excess = np.max(np.abs(joint_velocity) / limit, axis=-1, keepdims=True)
+    excess = np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1, keepdims=True)
     return np.asarray(joint_velocity / np.maximum(excess, 1.0))

@@ -1,4 +1,4 @@
-"""Model-free adaptive control (eq. 44 of the paper).
+"""Model-free adaptive control (eq. 45 of the paper).
 
     dq(k) = ρ (λI + ĴᵀĴ)⁻¹ Ĵᵀ e(k) = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e(k),      u(k) = dq(k) / dt,      ρ ∈ (0, 1], λ > 0
 
@@ -33,7 +33,7 @@ class MfacConfig:
 
 
 def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: float) -> FloatArray:
-    """Return dq = ρ Jᵀ (λI + JJᵀ)⁻¹ e, the form of eq. 44 that solves m equations instead of n.
+    """Return dq = ρ Jᵀ (λI + JJᵀ)⁻¹ e, the form of eq. 45 that solves m equations instead of n.
 
     Args:
         J: (m, n), m/rad.
@@ -49,7 +49,7 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
 
 @final
 class MfacLaw(Law):
-    """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 44), limited as a whole so that the direction stays.
+    """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 45), limited as a whole so that the direction stays.
 
     With `feedforward` the motion of the reference over the coming period is added without the factor ρ:
     dq = Ĵᵀ (λI + ĴĴᵀ)⁻¹ (ρ e + y_ref(k+1) − y_ref(k)).

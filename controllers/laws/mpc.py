@@ -1,4 +1,4 @@
-"""Model predictive control with a frozen Jacobian: eq. 45 generalised to free moves, preview and limits."""
+"""Model predictive control with a frozen Jacobian: eq. 46 generalised to free moves, preview and limits."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class MpcConfig:
 
 @final
 class MpcLaw(Law):
-    """Receding-horizon law on the affine prediction y(k+τ) = ŷ + Ĵ Σ_{s≤τ} dq_s, after eq. 45.
+    """Receding-horizon law on the affine prediction y(k+τ) = ŷ + Ĵ Σ_{s≤τ} dq_s, after eq. 46.
 
     With e = y_ref − y now, r_τ = y_ref(k+τ) − y_ref(k), β = exp(−ρ), the predicted displacement should follow
 
@@ -87,7 +87,7 @@ class MpcLaw(Law):
 
     with w_τ = α^τ, plus `terminal_weight` at τ = H, over the joint limits; the first step is sent, u = dq / dt.
     One target for both makes them one family: for a reference at rest, without active limits, "constant" is
-    (a ĴᵀĴ + Q) dq = (b − c) Ĵᵀ e, eq. 45 for Q = q I.
+    (a ĴᵀĴ + Q) dq = (b − c) Ĵᵀ e, eq. 46 for Q = q I.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
@@ -97,7 +97,7 @@ class MpcLaw(Law):
     | `Q` | diagonal of the move weight | (n,) | m²/rad² |
     | `rho`, `alpha` | decay rate ρ and forgetting α | | 1/period, – |
 
-    Departures from the paper: limits, preview, free moves and the terminal term; the printed eq. 45 is replaced by the
+    Departures from the paper: limits, preview, free moves and the terminal term; the printed eq. 46 is replaced by the
     minimiser it comes from (they agree for Q = q I only). With `delay_periods` = d the prediction starts d periods
     ahead, ŷ(k+d) = y + Ĵ Σ of the last d steps sent; the paper has d = 0. A position or view limit that is already
     violated may not get worse, so that noise alone never makes the program infeasible.

@@ -1,4 +1,4 @@
-"""The integrals a, b, c of eq. 45 and the predictive laws without limits, in closed form.
+"""The integrals a, b, c of eq. 46 and the predictive laws without limits, in closed form.
 
 Symbols (times τ and horizon H in control periods):
 
@@ -32,7 +32,7 @@ _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 @dataclass(frozen=True, slots=True)
 class HorizonIntegrals:
-    """a, b and c of eq. 45."""
+    """a, b and c of eq. 46."""
 
     a: float
     b: float
@@ -40,7 +40,7 @@ class HorizonIntegrals:
 
 
 def horizon_integrals(horizon: float, alpha: float, rho: float) -> HorizonIntegrals:
-    """Return a, b and c of eq. 45.
+    """Return a, b and c of eq. 46.
 
     Args:
         horizon: H, periods, positive.
@@ -119,7 +119,7 @@ def preview_weights(horizon: int, alpha: float) -> FloatArray:
 def constant_step(J: FloatArray, target: FloatArray, a: float, Q: FloatArray) -> FloatArray:
     """Return the minimiser of ½ a ‖J dq‖² − targetᵀ J dq + ½ dqᵀ Q dq: (a JᵀJ + Q) dq = Jᵀ target.
 
-    With target = (b − c) e it is eq. 45 for Q = q I; for another Q the printed eq. 45 is not this minimiser.
+    With target = (b − c) e it is eq. 46 for Q = q I; for another Q the printed eq. 46 is not this minimiser.
 
     Args:
         J: (m, n), m/rad.

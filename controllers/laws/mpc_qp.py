@@ -41,7 +41,7 @@ class QpShape:
         m: features.
         weights: w, (H,), weights of the predicted errors; in constant-move mode only their number counts.
         move_weight: diagonal of Q, (n,).
-        constant_gain: a of eq. 45 in constant-move mode, None for H free moves.
+        constant_gain: a of eq. 46 in constant-move mode, None for H free moves.
         limit_acceleration: whether rows for the acceleration are wanted.
         limit_position: whether rows for the joint positions are wanted.
         view_rows: V, (v, m); no rows = no limit on the view.

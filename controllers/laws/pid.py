@@ -6,7 +6,7 @@ with e = y_ref − y (m,), its integral I and its filtered derivative d:
 
     I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt),   ẏ_ref(k) = (y_ref(k+1) − y_ref(k)) / dt
 
-K_i = K_d = 0 and δ = 0 is eq. 43, whose minus sign belongs to the paper's error y − y_ref.
+K_i = K_d = 0 and δ = 0 is eq. 43 (and eq. 9), whose minus sign belongs to the paper's error y − y_ref.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ import numpy as np
 from controllers.controller import Diagnostics, RobotKnowledge
 from controllers.laws.law import Law, scale_to_limit
 from controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
+from controllers.laws.row_space import project_to_row_space
 from controllers.networks import ControllerNetwork, controller_output
 from plant.signals import FloatArray, Observation, check_number
 
@@ -93,8 +94,8 @@ class RbfnnLaw(Law):
         self._errors: FloatArray | None = None
         self._positions: FloatArray | None = None
         self._step_size = 0.0
-        self._saturated = False
-        self._criterion, self._predicted_error = 0.0, 0.0
+        self._wanted = np.zeros(self._network.n)
+        self._ahead: RollOut | None = None
 
     def reset(self, observation: Observation) -> None:
         """Restore the offline network and empty both histories."""
@@ -108,61 +109,49 @@ class RbfnnLaw(Law):
             self._positions = _pushed(self._positions, observation.joint_position, network.position_history)
         if config.row_space_only:
             self._learned = project_to_row_space(self._learned, jacobian)
-        weights = self.weights
-        history = self._errors, self._positions
-        ahead = roll_out(network, weights, jacobian, history, self._reference_steps(reference), self._step_limit)
-        self._criterion, self._predicted_error = ahead.criterion, float(np.linalg.norm(ahead.errors[-1]))
-        xi, h, q = ahead.xi[0], ahead.h[0], self._positions[0]
-        wanted = controller_output(weights, xi, h) - q
-        if observation.feature_valid:
-            wanted = self._learn(jacobian, ahead, wanted)
+        history, reference_steps = (self._errors, self._positions), self._reference_steps(reference)
+        ahead = self._ahead = roll_out(network, self.weights, jacobian, history, reference_steps, self._step_limit)
+        wanted = self._wanted = self._learn(jacobian, ahead) if observation.feature_valid else ahead.wanted
         step = scale_to_limit(wanted, self._step_limit)
         if config.position == "commanded":
-            self._positions = _pushed(self._positions, q + step, network.position_history)
-        self._saturated = self._excess(wanted) > 1.0
+            self._positions = _pushed(self._positions, self._positions[0] + step, network.position_history)
         return step / self._period
 
     def diagnostics(self) -> Diagnostics:
         """Return criterion I_c (m²), step size α, predicted error ‖e(k+T)‖ (m), norms of weights, saturation."""
         return {
-            "criterion": self._criterion,
+            "criterion": self._ahead.criterion if self._ahead else 0.0,
             "step_size": self._step_size,
-            "predicted_error": self._predicted_error,
+            "predicted_error": float(np.linalg.norm(self._ahead.errors[-1])) if self._ahead else 0.0,
             "controller_weight_norm": float(np.linalg.norm(self.weights)),
             "learned_weight_norm": float(np.linalg.norm(self._learned)),
-            "saturated": float(self._saturated),
+            "saturated": float(self._excess(self._wanted) > 1.0),
         }
 
     def _reference_steps(self, reference: FloatArray) -> FloatArray:
         """Return how the reference is assumed to move in each of the T steps, (T, m), m."""
         if not self._config.preview:
             return np.zeros((self._config.horizon, self._network.m))
-        return np.diff(reference[: self._config.horizon + 1], axis=0)
+        return reference[1 : self._config.horizon + 1] - reference[: self._config.horizon]
 
-    def _learn(self, jacobian: FloatArray, ahead: RollOut, wanted: FloatArray) -> FloatArray:
+    def _learn(self, jacobian: FloatArray, ahead: RollOut) -> FloatArray:
         """Update the weights and return the joint step that the new ones want, (n,), rad.
 
         Anti-windup: where the old weights exceed the limit, an update that exceeds it further is dropped.
         """
         direction = descent_direction(jacobian, ahead)
         alpha = update_step(direction, ahead, self._config.k, self._config.epsilon)
-        renewed = wanted + alpha * controller_output(direction, ahead.xi[0], ahead.h[0])
-        before = self._excess(wanted)
+        renewed = ahead.wanted + alpha * controller_output(direction, ahead.xi[0], ahead.h[0])
+        before = self._excess(ahead.wanted)
         if self._config.anti_windup and before > 1.0 and self._excess(renewed) > before:
             self._step_size = 0.0
-            return wanted
+            return ahead.wanted
         self._step_size = alpha
         self._learned = self._learned + alpha * direction
         return renewed
 
     def _excess(self, step: FloatArray) -> float:
-        return float(np.max(np.abs(step) / self._step_limit))
-
-
-def project_to_row_space(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Return Ĵ⁺Ĵ W: the part of the weights (n, p, N_h) whose output moves the feature under `jacobian` (m, n)."""
-    projector = np.linalg.pinv(jacobian) @ jacobian
-    return np.asarray((projector @ weights.reshape(len(weights), -1)).reshape(weights.shape))
+        return float(np.maximum.reduce(np.abs(step) / self._step_limit))
 
 
 def _pushed(history: FloatArray | None, newest: FloatArray, length: int) -> FloatArray:

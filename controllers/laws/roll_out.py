@@ -13,11 +13,11 @@ paper writes a negative α into an update with the opposite sign.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
-from controllers.laws.law import scale_to_limit
-from controllers.networks import ControllerNetwork, controller_output, information_vector
+from controllers.networks import ControllerNetwork, information_vector
 from plant.signals import FloatArray
 
 
@@ -29,11 +29,13 @@ class RollOut:
         errors: e(k+1) … e(k+T), (T, m), m.
         xi: ξ(k) … ξ(k+T−1), (T, p).
         h: h(k) … h(k+T−1), (T, N_h).
+        wanted: ψ(ξ) ξ − q(k−1), (n,), rad, the first joint step before it is limited.
     """
 
     errors: FloatArray
     xi: FloatArray
     h: FloatArray
+    wanted: FloatArray
 
     @property
     def criterion(self) -> float:
@@ -62,19 +64,40 @@ def roll_out(
     Returns:
         Errors, information vectors and hidden layers.
     """
-    errors, positions = history
-    horizon = len(reference_steps)
-    e_ahead = np.empty((horizon, errors.shape[1]))
-    xis, hs = np.empty((horizon, network.centres.shape[1])), np.empty((horizon, network.centres.shape[0]))
+    (n, p, hidden), horizon = weights.shape, len(reference_steps)
+    m, newest = len(jacobian), history[0].size  # q(k−1) begins at `newest` in ξ
+    flat, A = weights.reshape(n * p, hidden), _shift(m, n, *map(len, history)).copy()
+    A[:m, p : p + n] = -jacobian
+    states, hs = np.empty((horizon + 1, A.shape[1])), np.empty((horizon, hidden))
+    xis = states[:, :p]  # a state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ
+    xis[0], states[:-1, p + n :] = information_vector(*history), reference_steps
+    reach, wanted = 1.0 / step_limit, np.zeros(n)
     for t in range(horizon):
-        xis[t] = information_vector(errors, positions)
-        hs[t] = network.features(xis[t])
-        q = positions[0]
-        dq = scale_to_limit(controller_output(weights, xis[t], hs[t]) - q, step_limit)
-        e_ahead[t] = errors[0] + reference_steps[t] - jacobian @ dq
-        errors = np.concatenate([e_ahead[t : t + 1], errors[:-1]])
-        positions = np.concatenate([(q + dq)[None], positions[:-1]])
-    return RollOut(e_ahead, xis, hs)
+        state, xi = states[t], xis[t]
+        h = hs[t] = network.features(xi)
+        dq = flat.dot(h).reshape(n, p).dot(xi) - xi[newest : newest + n]
+        if t == 0:
+            wanted = dq
+        excess = max(map(abs, (dq * reach).tolist()))
+        state[p : p + n] = dq / excess if excess > 1.0 else dq
+        A.dot(state, out=xis[t + 1])
+    return RollOut(xis[1:, :m].copy(), xis[:-1].copy(), hs, wanted)
+
+
+@cache
+def _shift(m: int, n: int, error_history: int, position_history: int) -> FloatArray:
+    """Return A with ξ(k+t) = A [ξ(k+t−1), Δq, Δy_ref] where Ĵ = 0, (p, p + n + m).
+
+    The newest error is e + Δy_ref and the newest position q + Δq; what is older moves on by one place.
+    """
+    newest, p = m * error_history, m * error_history + n * position_history
+    A = np.zeros((p, p + n + m))
+    for size, begin, end, added in ((m, 0, newest, p + n), (n, newest, p, p)):
+        first, older = slice(begin, begin + size), slice(begin + size, end)
+        A[first, first] = A[first, added : added + size] = np.eye(size)
+        A[older, begin : end - size] = np.eye(end - begin - size)
+    A.flags.writeable = False
+    return A
 
 
 def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:

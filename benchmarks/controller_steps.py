@@ -1,0 +1,88 @@
+"""Processor time of a step of each named method over a real closed loop, all in one run: the circle on `kinematic`.
+
+Every method drives a plant of its own and the methods take turns of some steps each, so that a disturbance meets all
+alike while each finds its data in the caches as in a run of its own. What is timed is `Controller.step` with one
+thread; the first steps, in which solvers are made, do not count, and processor time leaves out waiting for a processor.
+The paper claims that the proposed method's update costs less than an optimising controller: the last line is that
+claim.
+Run it from an installed checkout: `python benchmarks/controller_steps.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from harness.configuration import Settings
+from harness.experiment import RunRequest, build_experiment
+from harness.registry import CONTROLLERS
+from plant.seeds import named_seed
+
+PROPOSED, OPTIMISING, FACTOR = "rbfnn_mfac", "ukf_mpc", 1.0
+WARM_UP = 20  # steps
+TURN = 20  # steps
+
+
+class Loop:
+    """One method in closed loop with its plant."""
+
+    def __init__(self, request: RunRequest) -> None:
+        """Build both and put them at the start."""
+        self._experiment = build_experiment(request, Settings())
+        self._observation = self._experiment.plant.reset(named_seed(request.seed, "plant"))
+        self._experiment.controller.reset(self._observation, named_seed(request.seed, "controller"))
+        self.times: list[float] = []
+
+    def advance(self) -> None:
+        """Take a step and note what the controller's part of it cost, s."""
+        experiment = self._experiment
+        desired = experiment.scenario.reference.preview(
+            len(self.times), experiment.run.period, 1 + experiment.run.preview
+        )
+        began = time.process_time()
+        command = experiment.controller.step(self._observation, desired)
+        self.times.append(time.process_time() - began)
+        self._observation = experiment.plant.step(command)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the task is done."""
+        return len(self.times) >= self._experiment.periods
+
+
+def main() -> None:
+    """Print medians, 95th percentiles and ratios to the optimising method.
+
+    Raises:
+        SystemExit: the proposed method's step is not the cheaper one.
+    """
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--mismatch", default="moderate")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    loops = {
+        name: Loop(RunRequest("kinematic", name, "circle", options.mismatch, options.seed)) for name in CONTROLLERS
+    }
+    with threadpool_limits(1):
+        while not loops[PROPOSED].finished:
+            for loop in loops.values():
+                for _ in range(TURN):
+                    loop.advance()
+    times = {name: 1e6 * np.array(loop.times[WARM_UP:]) for name, loop in loops.items()}
+    medians = {name: float(np.median(steps)) for name, steps in times.items()}
+    for name, steps in times.items():
+        ratio = medians[name] / medians[OPTIMISING]
+        late = float(np.percentile(steps, 95))
+        print(f"{name:16} median {medians[name]:6.1f} µs   95 % {late:6.1f} µs   {ratio:5.2f} × {OPTIMISING}")
+    ratio = medians[PROPOSED] / medians[OPTIMISING]
+    print(f"{PROPOSED} / {OPTIMISING}: {ratio:.2f} (wanted below {FACTOR:g})")
+    if ratio >= FACTOR:
+        sys.exit(f"controller_steps: a step of {PROPOSED} costs {ratio:.2f} times one of {OPTIMISING}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""The command `servobench tune`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from harness.configuration import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from harness.tuning.files import TunedValues
+    from harness.tuning.study import MethodStudy, TuningPlan
+
+INTERRUPTED = 130
+MAX_DEFAULT_WORKERS = 8
+
+console = Console()
+
+
+def tune(
+    controllers: Annotated[str, typer.Option(help="Names by comma, or all that have a search space.")] = "all",
+    trials: Annotated[int, typer.Option(help="Trials of each method, that of the defaults included.")] = 100,
+    seeds: Annotated[int, typer.Option(help="Moves a trial on each plant; half as many circles come on top.")] = 8,
+    plants: Annotated[str, typer.Option(help="Names by comma.")] = "kinematic",
+    workers: Annotated[int | None, typer.Option(help="Worker processes; default: the processors.")] = None,
+    offset: Annotated[int, typer.Option(help="Where in the range of tuning seeds to begin.")] = 0,
+    study_seed: Annotated[int, typer.Option(help="Seed of the sampler.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the studies; one that was interrupted goes on.")] = (
+        Path("results") / "tuning"
+    ),
+) -> None:
+    """Search for the best settings of each method, with the same budget on the same training plants."""
+    from harness.tuning.objective import TuningSet  # noqa: PLC0415 - the optimiser costs half a second, for tune alone
+    from harness.tuning.study import TuningPlan, open_studies, write_outcomes  # noqa: PLC0415
+
+    if workers is not None and workers < 1:
+        raise ConfigurationError(f"workers must be at least 1, got {workers}")
+    plan = TuningPlan(_controllers(controllers), trials, TuningSet(_words(plants), seeds, offset), study_seed)
+    studies = open_studies(out, plan)
+    count = workers or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
+    interrupted = not _carry_out(studies, plan, count)
+    console.print(_table(write_outcomes(out, studies)))
+    console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
+    if interrupted:
+        console.print("interrupted; the same call goes on where it stopped")
+        sys.exit(INTERRUPTED)
+
+
+def _carry_out(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> bool:
+    """Advance the studies to their end and show how far they are; return whether they got there."""
+    from harness.tuning.study import advance  # noqa: PLC0415 - as above
+
+    runs = len(plan.runs.runs())
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("runs, best {task.fields[best]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+    ) as progress:
+        bars = {
+            study.controller: progress.add_task(
+                study.controller, total=plan.trials * runs, completed=len(study.finished()) * runs, best="–"
+            )
+            for study in studies
+        }
+        try:
+            for finished in advance(studies, plan, workers):
+                best = "–" if finished.best is None else f"{finished.best:.4f}"
+                progress.update(bars[finished.controller], advance=1, best=best)
+        except KeyboardInterrupt:
+            return False
+    return True
+
+
+def _table(outcomes: Mapping[str, TunedValues]) -> Table:
+    table = Table("controller", "trials", "score of defaults", "score tuned", "best trial")
+    for name, tuned in outcomes.items():
+        table.add_row(
+            name, str(tuned.trials), f"{tuned.score_of_defaults:.4f}", f"{tuned.score:.4f}", str(tuned.best_trial)
+        )
+    return table
+
+
+def _controllers(text: str) -> tuple[str, ...]:
+    from harness.tuning.spaces import SPACES  # noqa: PLC0415 - as above
+
+    names = tuple(SPACES) if text.strip() == "all" else _words(text)
+    if not names:
+        raise ConfigurationError(f"--controllers is empty; valid: {', '.join(SPACES)}")
+    return names
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))

@@ -1,0 +1,1 @@
+"""Equal tuning: every method gets the same trials on the same plants with the same objective."""
