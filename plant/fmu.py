@@ -119,6 +119,7 @@ class FmuPlant(Plant):
         find, slave = self.description.select, self._slave
         self._has_joints, self._clips_itself = bool(mapping.joints), mapping.clips_itself
         self._command = Port(find(mapping.inputs, "inputs"))
+        self._shape = self._command.values.shape
         self._result = Port(find((*mapping.joints, *mapping.features), "joints and features"))
         self._write, self._read = slave.raw_writer(self._command), slave.raw_reader(self._result)
         self._advance = slave.stepper(self._own_step)
@@ -178,8 +179,8 @@ class FmuPlant(Plant):
             FmuError: the FMU failed, or a result is not finite.
         """
         wanted, buffer = command.joint_velocity, self._command.values
-        if wanted.shape != buffer.shape:
-            raise ValueError(f"joint_velocity must have shape {buffer.shape}, got {wanted.shape}")
+        if wanted.shape != self._shape:
+            raise ValueError(f"joint_velocity must have shape {self._shape}, got {wanted.shape}")
         if self._delays:
             self._commands.append(wanted)
             wanted = self._commands.popleft()
