@@ -25,6 +25,7 @@ from harness.manifest import describe_batch
 from harness.options import ConfigOption, SetOption, default_workers, split_names
 from harness.progress import run_progress
 from harness.registry import controller_names, find_controller, find_plant, plant_names
+from harness.robustness_command import robustness
 from harness.summary import summary_tables
 from harness.sweep_command import sweep
 from harness.tasks import find_task, task_names
@@ -47,6 +48,7 @@ NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of t
 
 app.add_typer(fmu_app, name="fmu")
 app.command()(sweep)
+app.command()(robustness)
 app.command()(tune)
 
 

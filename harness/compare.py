@@ -17,6 +17,7 @@ from harness import results
 from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest, build_experiment, known_sections
 from harness.run import run_experiment
+from harness.seed_ranges import refuse_tuning_seeds
 
 PICTURES = "pictures"
 
@@ -87,8 +88,9 @@ def check_batch(
         latency_periods: of the camera; None for what a plant is configured with.
 
     Raises:
-        ConfigurationError: a name, setting or mismatch that cannot be used.
+        ConfigurationError: a name, setting or mismatch that cannot be used, or a seed that is kept for tuning.
     """
+    refuse_tuning_seeds(batch.seeds)
     settings.check_sections([*known_sections(), *batch.plants, *batch.controllers])
     names = (batch.plants[0], batch.controllers[0], batch.tasks[0], batch.mismatches[0])
     first = RunRequest(*names, batch.seeds[0], noise_factor, latency_periods)

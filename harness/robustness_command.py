@@ -1,0 +1,58 @@
+"""The command `servobench robustness`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pandas as pd
+import typer
+from rich.console import Console
+
+from harness import results
+from harness.compare import parse_seeds
+from harness.configuration import read_settings
+from harness.options import ConfigOption, SetOption, split_names
+from harness.registry import controller_names, find_controller, find_plant, plant_names
+from harness.robustness import TASK, draw_map, map_cells, moved_settings, number_of
+from harness.sweep_command import carry_out_sweep
+
+USUAL, MOVED, FIGURES = "usual", "moved", "figures"
+
+console = Console()
+
+
+def robustness(
+    out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to go on with.")],
+    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
+    controllers: Annotated[str, typer.Option(help="Names by comma, or all.")] = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
+    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "40",
+    workers: Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to send the runs to.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a map that was killed.")] = False,
+    set_: SetOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Draw the robustness map: success and settling time along seven axes, one made worse at a time."""
+    settings = read_settings(config, set_ or [])
+    names = split_names("controllers", controllers, controller_names(), find_controller)
+    usual, moved = map_cells(split_names("plant", plant, plant_names(), find_plant)[0], names, parse_seeds(seeds))
+    for folder, cells, chosen in ((USUAL, usual, settings), (MOVED, moved, moved_settings(settings))):
+        going_on = resume and (out / folder).exists()
+        carry_out_sweep(cells, chosen, out / folder, workers, scheduler, resume=going_on)
+    files = draw_map(load_map(out), out / FIGURES)
+    console.print(f"the map is in {files[0]}; tables in {out / USUAL} and {out / MOVED}", soft_wrap=True)
+
+
+def load_map(folder: Path) -> pd.DataFrame:
+    """Return the runs of a map, both parts; `moved_at_s` says when the camera was moved, NaN where it was not.
+
+    Raises:
+        ConfigurationError: not the folder of a map.
+    """
+    usual, moved = (results.load_runs(folder / part) for part in (USUAL, MOVED))
+    configuration = results.read_manifest(folder / MOVED)["configuration"]
+    moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
+    at_rest = moved["magnitude"].map(number_of).astype(float) == 0.0
+    return pd.concat([usual, moved.assign(moved_at_s=np.where(at_rest, np.nan, moment))], ignore_index=True)
