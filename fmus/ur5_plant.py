@@ -13,7 +13,8 @@ import platformdirs
 from fmus.compile import CompilationFailed, CompilerMissing
 from fmus.export import ExportOptions, export_fmu, fingerprint
 from fmus.variables import Actuation, parameters_of
-from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu import FmuPlant
+from plant.fmu_config import FmuConfig
 from plant.fmu_entry import build_plant
 from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
