@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fmus.compile import Platform, compile_library, this_platform
+from fmus.compile import CODE, Platform, compile_library, this_platform
 from fmus.generate import kinematics_source, layout_header
 from fmus.model_description import Description, write_build_description, write_fmi2, write_fmi3
 from fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
@@ -93,15 +93,20 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
     token = _token(contents)
     layout_name = "sources/layout.h"
     contents[layout_name] = contents[layout_name].replace(_PLACEHOLDER.encode(), token.encode())
-    description = _description(options)
-    write = write_fmi2 if options.fmi_version == 2 else write_fmi3
-    contents["modelDescription.xml"] = write(description, token)
-    if options.fmi_version == 3:
-        contents["sources/buildDescription.xml"] = write_build_description(description)
+    contents |= _descriptions(options, token)
     with tempfile.TemporaryDirectory(prefix="servobench-export-") as folder:
         _compile(Path(folder), contents, options)
         _write_archive(path, contents)
     return path
+
+
+def fingerprint(options: ExportOptions) -> str:
+    """Return a text that changes with whatever decides how the FMU behaves: sources, descriptions, compilation."""
+    contents = {name: text.encode() for name, text in source_files(options).items()}
+    contents |= _descriptions(options, _PLACEHOLDER)
+    for platform in options.platforms:
+        contents[f"binaries/{platform.name}"] = repr((CODE, platform)).encode()
+    return _token(contents)
 
 
 def source_files(options: ExportOptions) -> dict[str, str]:
@@ -146,6 +151,17 @@ def _own_file(name: str) -> str:
 
 def _fmi_header(name: str) -> str:
     return (files("fmpy") / "c-code" / name).read_text(encoding="utf-8")
+
+
+def _descriptions(options: ExportOptions, token: str) -> dict[str, bytes]:
+    """Return what is written in XML by its place in the archive."""
+    description = _description(options)
+    if options.fmi_version == 2:
+        return {"modelDescription.xml": write_fmi2(description, token)}
+    return {
+        "modelDescription.xml": write_fmi3(description, token),
+        "sources/buildDescription.xml": write_build_description(description),
+    }
 
 
 def _description(options: ExportOptions) -> Description:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,9 +35,9 @@ class FmuInformation:
         model_name: for people.
         token: GUID or instantiation token.
         tool: what made it.
-        interfaces: of co-simulation, model exchange and scheduled execution, those it offers.
+        interfaces: of co-simulation, model exchange and scheduled execution, those it offers; with the names of the
+            boolean capabilities that are true for each.
         platforms: folders below binaries/.
-        capabilities: names of the boolean capabilities that are true for co-simulation (else model exchange).
         has_sources: it can be compiled.
         variables: all of them, in order.
     """
@@ -44,9 +46,8 @@ class FmuInformation:
     model_name: str
     token: str
     tool: str
-    interfaces: tuple[str, ...]
+    interfaces: Mapping[str, tuple[str, ...]]
     platforms: tuple[str, ...]
-    capabilities: tuple[str, ...]
     has_sources: bool
     variables: tuple[VariableInformation, ...]
 
@@ -61,21 +62,14 @@ def read_information(path: Path) -> FmuInformation:
     try:
         root = folder.root
         description = parse_description(path, root)
-        offered = {
-            "co-simulation": description.coSimulation,
-            "model exchange": description.modelExchange,
-            "scheduled execution": description.scheduledExecution,
-        }
-        present = {name: interface for name, interface in offered.items() if interface is not None}
         binaries = root / "binaries"
         return FmuInformation(
             fmi_version=str(description.fmiVersion),
             model_name=str(description.modelName),
             token=str(description.guid or description.instantiationToken),
             tool=str(description.generationTool or "unknown"),
-            interfaces=tuple(present),
+            interfaces=_interfaces(root),
             platforms=tuple(sorted(item.name for item in binaries.iterdir())) if binaries.is_dir() else (),
-            capabilities=_capabilities(next(iter(present.values()), None)),
             has_sources=(root / "sources").is_dir(),
             variables=tuple(_variable(variable) for variable in description.modelVariables),
         )
@@ -83,19 +77,26 @@ def read_information(path: Path) -> FmuInformation:
         folder.close()
 
 
-CAPABILITIES = (
-    "canHandleVariableCommunicationStepSize",
-    "canGetAndSetFMUstate",
-    "canSerializeFMUstate",
-    "providesDirectionalDerivative",
-    "providesDirectionalDerivatives",
-    "canBeInstantiatedOnlyOncePerProcess",
-    "needsExecutionTool",
-)
+INTERFACES = {
+    "CoSimulation": "co-simulation",
+    "ModelExchange": "model exchange",
+    "ScheduledExecution": "scheduled execution",
+}
 
 
-def _capabilities(interface: Any) -> tuple[str, ...]:  # noqa: ANN401 - fmpy's classes carry no usable types
-    return tuple(name for name in CAPABILITIES if getattr(interface, name, False))
+def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
+    """Return the capabilities by interface, as written: fmpy does not keep all of FMI 3."""
+    description = ET.parse(root / "modelDescription.xml").getroot()
+    elements = {name: description.find(tag) for tag, name in INTERFACES.items()}
+    return {
+        name: tuple(
+            key
+            for key, value in element.attrib.items()
+            if key.startswith(("can", "needs", "provides")) and value in ("true", "1")
+        )
+        for name, element in elements.items()
+        if element is not None
+    }
 
 
 def _variable(variable: Any) -> VariableInformation:  # noqa: ANN401 - as above

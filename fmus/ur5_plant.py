@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -11,10 +10,11 @@ from typing import Literal
 import numpy as np
 import platformdirs
 
-from fmus.compile import CompilationFailed, CompilerMissing, this_platform
-from fmus.export import ExportOptions, export_fmu, source_files
+from fmus.compile import CompilationFailed, CompilerMissing
+from fmus.export import ExportOptions, export_fmu, fingerprint
 from fmus.variables import Actuation, parameters_of
-from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu import FmuPlant
+from plant.fmu_config import FmuConfig
 from plant.fmu_entry import build_plant
 from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
@@ -64,11 +64,8 @@ def cached_fmu(fmi_version: int) -> Path:
         CompilationFailed: it has to be built and the compiler refused it.
     """
     options = ExportOptions(fmi_version)
-    digest = hashlib.sha256(this_platform().name.encode())
-    for name, text in sorted(source_files(options).items()):
-        digest.update(f"{name}\0{text}\0".encode())
     folder = Path(platformdirs.user_cache_dir("servobench")) / "fmus"
-    path = folder / f"ur5_mismatched-fmi{fmi_version}-{digest.hexdigest()[:16]}.fmu"
+    path = folder / f"ur5_mismatched-fmi{fmi_version}-{fingerprint(options).strip('{}')}.fmu"
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         export_fmu(path, options)
@@ -104,11 +101,12 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> FmuPlant:
     """Return the exported UR5 as a plant.
 
     Raises:
-        ValueError: a setting out of its bounds, a start of the wrong size, or no compiler when the FMU has to be built.
+        ValueError: a setting out of its bounds, a start of the wrong size, or an FMU that has to be built and cannot:
+            no compiler, or no place in the cache folder.
     """
     try:
         path = cached_fmu(config.fmi_version)
-    except (CompilerMissing, CompilationFailed) as error:
+    except (CompilerMissing, CompilationFailed, OSError) as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
     return build_plant(config.around(), ur5_mapping(path, config, setup), setup)
 

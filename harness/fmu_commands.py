@@ -76,7 +76,8 @@ def info(file: FileArgument) -> None:
     console.print(f"made by {information.tool}; token {information.token}")
     sources = "; with sources" if information.has_sources else ""
     console.print(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
-    console.print(f"capabilities: {', '.join(information.capabilities) or 'none'}")
+    for name, capabilities in information.interfaces.items():
+        console.print(f"capabilities in {name}: {', '.join(capabilities) or 'none'}", soft_wrap=True)
     table = Table("name", "causality", "size", "unit", "start")
     for variable in information.variables:
         size = " × ".join(map(str, variable.shape)) or "1"

@@ -11,13 +11,14 @@ import copy
 import ctypes
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 
 import numpy as np
 
 from plant.fmu_archive import FmuFolder
+from plant.fmu_config import FmuConfig
 from plant.fmu_mapping import FmuMapping, Names, mapping_spec
 from plant.fmu_slave import Call, FmuError, Port, Slave
 from plant.fmu_slave2 import Slave2
@@ -35,30 +36,8 @@ from plant.signals import (
     PlantSpec,
     Truth,
     as_vector,
-    check_number,
     trusted_observation,
 )
-
-
-@dataclass(frozen=True)
-class FmuConfig:
-    """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
-
-    command_delay_periods: int = 1  # periods between a command and its first effect
-    feature_noise: float = 0.001  # in the feature's unit (m), standard deviation an axis
-    latency_periods: int = 0  # periods between exposure and delivery of the feature
-    drop_probability: float = 0.0  # chance that a frame is lost
-
-    def __post_init__(self) -> None:
-        """Check the numbers that no part below checks."""
-        check_number("command_delay_periods", self.command_delay_periods, at_least=0)
-        check_number("feature_noise", self.feature_noise, at_least=0.0)
-
-
-def vary_sensing(config: FmuConfig, noise_factor: float, latency_periods: int | None) -> FmuConfig:
-    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
-    latency = config.latency_periods if latency_periods is None else latency_periods
-    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +98,7 @@ class FmuPlant(Plant):
         find, slave = self.description.select, self._slave
         self._has_joints, self._clips_itself = bool(mapping.joints), mapping.clips_itself
         self._command = Port(find(mapping.inputs, "inputs"))
+        self._shape = self._command.values.shape
         self._result = Port(find((*mapping.joints, *mapping.features), "joints and features"))
         self._write, self._read = slave.raw_writer(self._command), slave.raw_reader(self._result)
         self._advance = slave.stepper(self._own_step)
@@ -178,8 +158,8 @@ class FmuPlant(Plant):
             FmuError: the FMU failed, or a result is not finite.
         """
         wanted, buffer = command.joint_velocity, self._command.values
-        if wanted.shape != buffer.shape:
-            raise ValueError(f"joint_velocity must have shape {buffer.shape}, got {wanted.shape}")
+        if wanted.shape != self._shape:
+            raise ValueError(f"joint_velocity must have shape {self._shape}, got {wanted.shape}")
         if self._delays:
             self._commands.append(wanted)
             wanted = self._commands.popleft()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from plant.fmu import FmuConfig, FmuPlant, vary_sensing
+from plant.fmu import FmuPlant
+from plant.fmu_config import FmuConfig, vary_sensing
 from plant.fmu_mapping import FmuMapping, read_mapping
 from plant.fmu_slave import FmuError
 from plant.plant import PlantEntry, PlantSetup

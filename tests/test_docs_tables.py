@@ -17,7 +17,7 @@ from harness import registry
 from harness.configuration import flatten, read_settings
 from harness.experiment import RunRequest
 from harness.run import run_experiment
-from plant.fmu import FmuConfig
+from plant.fmu_config import FmuConfig
 from plant.fmu_mapping import _KEYS
 from plant.mismatch import AXES, PROFILES, parse_mismatch
 from plant.signals import RunFault

@@ -29,6 +29,7 @@ def test_an_exported_fmu_validates_and_tells_about_itself(tmp_path):
     assert "no problem found" in validated.output
     informed = invoke("info", path)
     assert "FMI 3.0, co-simulation" in informed.output
+    assert "capabilities in co-simulation: canGetAndSetFMUState, canSerializeFMUState, provides" in informed.output
     assert "ball_position" in informed.output
 
 

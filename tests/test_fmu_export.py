@@ -26,7 +26,7 @@ from fmus.compile import (
     parse_platforms,
     this_platform,
 )
-from fmus.export import ExportOptions, arm_layout, default_actuation, export_fmu
+from fmus.export import ExportOptions, arm_layout, default_actuation, export_fmu, fingerprint
 from fmus.information import read_information
 from fmus.reference import OUTPUT_FILE, reference_run
 from fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
@@ -83,6 +83,16 @@ def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
     with zipfile.ZipFile(path) as archive:
         assert "severe, seed 3" in archive.read("documentation/index.html").decode()
     assert [item.name for item in tmp_path.iterdir()] == ["severe.fmu"]
+
+
+def test_the_fingerprint_changes_with_whatever_decides_how_the_fmu_behaves(monkeypatch):
+    plain = fingerprint(ExportOptions(2))
+    assert fingerprint(ExportOptions(2)) == plain
+    others = [fingerprint(ExportOptions(3)), fingerprint(ExportOptions(2, mismatched("severe")))]
+    others.append(fingerprint(ExportOptions(2, platforms=tuple(PLATFORMS.values()))))
+    monkeypatch.setattr("fmus.export.CODE", ("-O3",))
+    others.append(fingerprint(ExportOptions(2)))
+    assert len({plain, *others}) == 5
 
 
 EXPORT = """
@@ -173,7 +183,11 @@ def test_information_tells_version_platform_and_variables(version):
     assert information.fmi_version == f"{version}.0"
     assert information.platforms == (this_platform().folder(version),)
     assert information.has_sources
-    assert "canSerializeFMUstate" in information.capabilities
+    offered = ["co-simulation", "model exchange"] if version == 2 else ["co-simulation"]
+    assert list(information.interfaces) == offered
+    for capabilities in information.interfaces.values():
+        assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
+        assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
     assert len(information.variables) == (144 if version == 2 else 26)
     assert all(variable.unit and variable.description for variable in information.variables) or version == 2
 
@@ -219,6 +233,10 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
     cached_fmu.cache_clear()
     monkeypatch.setattr("platformdirs.user_cache_dir", lambda _: str(tmp_path / "cache"))
     with pytest.raises(ValueError, match="install gcc or clang"):
+        ENTRY.build(Ur5FmuConfig(), setup())
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda _: str(tmp_path / "file"))
+    with pytest.raises(ValueError, match="the FMU cannot be built: .*file"):
         ENTRY.build(Ur5FmuConfig(), setup())
     cached_fmu.cache_clear()
 

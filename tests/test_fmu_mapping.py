@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from plant.fmu_mapping import read_mapping
+from plant.fmu_mapping import FmuMapping, read_mapping
 
 WHOLE = """
 file = "crane.fmu"
@@ -13,13 +16,17 @@ inputs = ["v[1]", "v[2]"]
 features = "hook"
 joints = ["q"]
 home = "q0"
+start = [0.3, 1.2]
 period = 0.01
 [parameters]
 mass = 12
 gains = [1.0, 2.0]
+[nominal]
+gains = 3.0
 [truth]
 features = ["hook"]
 jacobian = ["J"]
+states = "s"
 [limits]
 max_joint_speed = 2
 joint_lower = -3.1
@@ -51,6 +58,20 @@ def test_every_key_arrives(tmp_path):
     assert (mapping.joint_names, mapping.feature_names, mapping.feature_unit) == (("slew", "luff"), ("x", "y"), "mm")
     np.testing.assert_array_equal(mapping.parameters["gains"], [1.0, 2.0])
     assert mapping.parameters["mass"] == 12.0
+    assert mapping.nominal == {"gains": 3.0}
+    assert mapping.true_states == ("s",)
+    assert mapping.start.tolist() == [0.3, 1.2]
+    assert read_mapping(written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))).nominal is None
+
+
+def test_the_mapping_in_the_documentation_is_one_and_names_every_key(tmp_path):
+    readme = (Path(__file__).parent.parent / "fmus" / "README.md").read_text(encoding="utf-8")
+    text = readme.partition("```toml\n")[2].partition("```")[0]
+    mapping = read_mapping(written(tmp_path, text))
+    values = {item.name: getattr(mapping, item.name) for item in fields(FmuMapping)}
+    del values["camera"]  # for the exported UR5 only
+    unset = [name for name, value in values.items() if value is None or (isinstance(value, tuple | dict) and not value)]
+    assert unset == []
 
 
 @pytest.mark.parametrize(
@@ -62,7 +83,8 @@ def test_every_key_arrives(tmp_path):
         ("joint_lower", "joint_low", "unknown key 'limits.joint_low'; did you mean 'limits.joint_lower'"),
         ('home = "q0"', "home = 3", "home must be text, got 3"),
         ('joints = ["q"]', "joints = [1]", r"joints must be a name or a list of names, got \[1\]"),
-        ('home = "q0"', "start = [0.1, 0.2]", "start needs home, the parameter that takes it"),
+        ("gains = 3.0", "gains = 'large'", "gains must be a number, got 'large'"),
+        ('home = "q0"', "", "start needs home, the parameter that takes it"),
         ("period = 0.01", 'period = "short"', "period must be a number, got 'short'"),
         ("period = 0.01", "period = 0.0", "period must be above 0, got 0.0"),
         ("mass = 12", 'mass = "heavy"', "mass must be a number, got 'heavy'"),

@@ -17,8 +17,9 @@ import pytest
 from foreign_fmu import build_crane, describe
 
 from fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from plant.fmu import FmuConfig, FmuPlant
+from plant.fmu import FmuPlant
 from plant.fmu_archive import PREFIX, FmuFolder, sweep_stale_folders
+from plant.fmu_config import FmuConfig
 from plant.fmu_entry import mapped_entry
 from plant.fmu_mapping import FmuMapping
 from plant.fmu_slave import FmuError

@@ -147,9 +147,11 @@ def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
     wanted = crane_jacobian(observation.joint_position, NOMINAL_ARM)
     np.testing.assert_allclose(experiment.controller.estimated_jacobian(), wanted, rtol=0, atol=1e-12)
     experiment.plant.close()
-    row = run_experiment(request(path, "ukf_mfac"), quiet(path)).row
-    assert row["status"] == "completed"
-    assert row["steady_state_error_m"] < 1e-3
+    region = {"training": {"lower": [-0.5, 0.3], "upper": [1.5, 2.5]}}
+    for controller in ("ukf_mfac", "rbfnn_mfac"):
+        row = run_experiment(request(path, controller), Settings(quiet(path).sections | {"rbfnn_mfac": region})).row
+        assert row["status"] == "completed"
+        assert row["steady_state_error_m"] < 2e-3
 
 
 @pytest.mark.parametrize(
