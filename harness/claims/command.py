@@ -13,7 +13,7 @@ from harness import results
 from harness.claims.answers import answer_all
 from harness.claims.figures import draw_answers
 from harness.claims.studies import studies
-from harness.claims.table import ANSWERS, differences, markdown_table, write_tables
+from harness.claims.table import ANSWERS, differences, markdown_table, read_answers, write_tables
 from harness.configuration import ConfigurationError
 from harness.options import split_names
 from harness.registry import find_plant, plant_names
@@ -40,6 +40,7 @@ def claims(
     names = split_names("plants", plants, plant_names(), find_plant)
     if any(find_plant(name).own_robot for name in names):
         raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
+    wanted = None if check is None else read_answers(check)
     todo = studies(names, seeds)
     for study in todo:
         folder = out / study.name
@@ -58,8 +59,8 @@ def claims(
         )
         console.print(answer.evidence, markup=False, highlight=False)
     console.print(f"answers in {out / ANSWERS}, {len(figures)} figures in {out / 'figures'}", soft_wrap=True)
-    if check is not None:
-        lines = differences(answers, check)
+    if wanted is not None:
+        lines = differences(answers, wanted)
         console.print("\n".join(lines) or f"the same answers as in {check}", soft_wrap=True, markup=False)
         if lines:
             sys.exit(DIFFERENT)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import pandas as pd
 
 from harness.claims.studies import CIRCLE, MOVES, OTHERS, PROPOSED
@@ -79,10 +80,11 @@ def pairings(
     for task in MOVES:
         table = by_seed(runs[runs["task"] == task], metric, never)
         found += [(task, rival, (table[PROPOSED] - table[rival]).dropna() * factor) for rival in OTHERS]
-    corrected = holm([signed_rank_p_value(difference.to_numpy()) for _, _, difference in found])
+    corrected = holm([signed_rank_p_value(difference.to_numpy()) if len(difference) else 1.0
+                      for _, _, difference in found])  # fmt: skip
     measured = []
     for (task, rival, difference), p_value in zip(found, corrected, strict=True):
-        middle = median_with_interval(difference)
+        middle = median_with_interval(difference) if len(difference) else Estimate(np.nan, np.nan, np.nan, 0)
         measured.append(Measurement(panel, task, rival, middle, p_value < LEVEL and sign * difference.mean() > 0.0))
     return measured
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 import pandas as pd
 
@@ -14,6 +14,8 @@ from harness.configuration import ConfigurationError
 ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
 COLUMNS: Final = ("claim", "statement", "plant", "verdict", "evidence")
+
+Answers: TypeAlias = Mapping[tuple[str, str], tuple[str, str]]
 
 
 def answer_table(answers: Sequence[Answer]) -> pd.DataFrame:
@@ -49,25 +51,29 @@ def write_tables(answers: Sequence[Answer], folder: Path) -> None:
     measurement_table(answers).to_csv(folder / MEASUREMENTS, index=False)
 
 
-def differences(answers: Sequence[Answer], committed: Path) -> list[str]:
-    """Return a line for each answer that is not the one in the table `committed`.
+def read_answers(path: Path) -> Answers:
+    """Return verdict and evidence by claim and plant from a table of answers.
 
     Raises:
         ConfigurationError: the file is not a table of answers.
     """
     try:
-        told = pd.read_csv(committed, dtype=str, keep_default_na=False)
-        rows = told[["claim", "plant", "verdict", "evidence"]].itertuples(index=False)
-        wanted = {(claim, plant): (verdict, evidence) for claim, plant, verdict, evidence in rows}
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        rows = table[["claim", "plant", "verdict", "evidence"]].itertuples(index=False)
+        return {(claim, plant): (verdict, evidence) for claim, plant, verdict, evidence in rows}
     except (OSError, ValueError, KeyError) as error:
-        raise ConfigurationError(f"{committed} is not a table of answers: {' '.join(str(error).split())}") from error
+        raise ConfigurationError(f"{path} is not a table of answers: {' '.join(str(error).split())}") from error
+
+
+def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
+    """Return a line for each answer that is not the one wanted."""
     lines = []
     for answer in answers:
-        key = (answer.claim, answer.plant)
+        name, key = f"claim {answer.claim} on {answer.plant}", (answer.claim, answer.plant)
         if key not in wanted:
-            lines.append(f"claim {answer.claim} on {answer.plant}: not in {committed}")
+            lines.append(f"{name}: not in the table")
         elif wanted[key] != (answer.verdict, answer.evidence):
-            lines.append(f"claim {answer.claim} on {answer.plant}: now {answer.verdict}: {answer.evidence}")
+            lines.append(f"{name}: now {answer.verdict}: {answer.evidence}")
     return lines
 
 
