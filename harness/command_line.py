@@ -15,6 +15,7 @@ from rich.table import Table
 
 from controllers.composed import ESTIMATORS, LAWS
 from harness import results
+from harness.claims.command import claims
 from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings
 from harness.defaults import default_config
@@ -48,6 +49,7 @@ NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of t
 
 app.add_typer(fmu_app, name="fmu")
 app.command()(sweep)
+app.command()(claims)
 app.command()(robustness)
 app.command()(tune)
 

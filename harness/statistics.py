@@ -177,7 +177,7 @@ def compare_pairs(
         raise ValueError("pairs must hold at least one pair of controllers")
     differences = [_differences(runs, pair, never, metric, keys) for pair in pairs]
     p_values = [signed_rank_p_value(difference) for difference in differences]
-    corrected = multipletests(p_values, method="holm")[1]
+    corrected = holm(p_values)
     return [
         Comparison(
             *pair, median_with_interval(difference, seed=seed, confidence=confidence), p_value, float(corrected_p_value)
@@ -186,11 +186,17 @@ def compare_pairs(
     ]
 
 
-def signed_rank_p_value(difference: FloatArray) -> float:
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values after Holm's correction for their number."""
+    return [float(value) for value in multipletests(p_values, method="holm")[1]]
+
+
+def signed_rank_p_value(differences: ArrayLike) -> float:
     """Return the two-sided p-value of Wilcoxon's signed-rank test with Pratt's zeros; 1 where all are zero.
 
     Differences below a billionth of the largest count as zero and equal ones as ties: 0.3 − 0.1 and 0.2 are no ranks.
     """
+    difference = np.asarray(differences, dtype=np.float64)
     largest = float(np.abs(difference).max())
     if largest == 0.0:
         return 1.0

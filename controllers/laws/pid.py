@@ -48,7 +48,8 @@ def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
     """
     if damping == 0.0:
         return np.asarray(np.linalg.pinv(J))
-    return np.asarray(np.linalg.solve(J @ J.T + damping**2 * np.eye(J.shape[0]), J).T)
+    U, sigma, Vt = np.linalg.svd(J, full_matrices=False)  # JJᵀ + δ²I may be singular to rounding where J is huge
+    return np.asarray((Vt.T * (sigma / (sigma**2 + damping**2))) @ U.T)
 
 
 def reference_velocity(reference: FloatArray, period: float) -> FloatArray:

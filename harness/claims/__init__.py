@@ -1,0 +1,1 @@
+"""The paper's seven claims, answered by statistics that anyone can repeat."""
