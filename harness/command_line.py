@@ -23,7 +23,9 @@ from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
 from harness.fmu_commands import fmu_app
 from harness.manifest import describe_batch
+from harness.record_command import record
 from harness.registry import controller_names, find_controller, find_plant, plant_names
+from harness.report_command import make_report, report
 from harness.summary import summary_tables
 from harness.tasks import find_task, task_names
 from harness.training import cache_folder
@@ -44,10 +46,13 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting, such as kinematic.lag=0.1.")
 ]
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
+ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
 NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
 
 
 app.add_typer(fmu_app, name="fmu")
+app.command()(record)
+app.command()(report)
 
 
 @app.command()
@@ -82,6 +87,7 @@ def run(
     config: ConfigOption = None,
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
+    with_report: ReportOption = False,
 ) -> None:
     """Carry out one run."""
     assignments = list(set_ or [])
@@ -91,7 +97,7 @@ def run(
         assignments.append("bullet.view=true")
     name = f"{controller}+{estimator}" if estimator else controller
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
-    _carry_out(batch, read_settings(config, assignments), 1, out)
+    _carry_out(batch, read_settings(config, assignments), 1, out, with_report=with_report)
 
 
 @app.command()
@@ -105,6 +111,7 @@ def compare(
     set_: SetOption = None,
     config: ConfigOption = None,
     out: OutOption = None,
+    with_report: ReportOption = True,
 ) -> None:
     """Run every combination and compare the controllers."""
     batch = Batch(
@@ -115,7 +122,7 @@ def compare(
         parse_seeds(seeds),
     )
     count = workers or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
-    _carry_out(batch, read_settings(config, set_ or []), count, out)
+    _carry_out(batch, read_settings(config, set_ or []), count, out, with_report=with_report)
 
 
 @app.command()
@@ -159,8 +166,8 @@ def main() -> None:
         sys.exit(INTERRUPTED)
 
 
-def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None) -> None:
-    """Check everything, run everything, and leave tables and figures behind."""
+def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None, *, with_report: bool) -> None:
+    """Check everything, run everything, and leave tables, figures and a report behind."""
     with console.status("checking the configuration") as status:
         check_batch(
             batch, settings, lambda share, what: status.update(f"training networks once: {100 * share:3.0f} %, {what}")
@@ -188,6 +195,8 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None)
     if interrupted:
         console.print(f"interrupted: {len(runs)} of {len(requests)} runs were finished and kept")
         sys.exit(INTERRUPTED)
+    if with_report:
+        make_report(folder)
 
 
 def _print_faults(runs: pd.DataFrame) -> None:
