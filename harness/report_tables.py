@@ -45,7 +45,8 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> str:
     results.check_folder(folder)
     manifest: dict[str, Any] = json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))
     completed = int((runs["status"] == COMPLETED).sum())
-    lines = [f"- **{len(runs)} runs**, of which {completed} reached their last period."]
+    runs_in_words = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    lines = [f"- **{runs_in_words}**, of which {completed} reached the last period."]
     lines += [
         f"- {name.replace('_', ' ')}: {_listed(runs[name].unique().tolist())}"
         for name in ("plant", "controller", "task", "mismatch", *CONDITIONS[2:])
@@ -96,11 +97,19 @@ def median_interval(values: pd.Series[float]) -> tuple[float, float, float]:
 
 
 def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the runs of the moves and those of the tracked curves; only a move can have an overshoot."""
-    if "overshoot" not in runs:
-        return runs.iloc[:0], runs
-    moves = runs.loc[runs["overshoot"].notna(), "task"].unique()
-    return runs[runs["task"].isin(moves)], runs[~runs["task"].isin(moves)]
+    """Return the runs of the moves and those of the tracked curves; only a move can have an overshoot.
+
+    A task of which no run was judged, as each ended before its first period, is in neither.
+    """
+    judged = runs.loc[_column(runs, "max_error_m").notna(), "task"].unique()
+    moves = runs.loc[_column(runs, "overshoot").notna(), "task"].unique()
+    curves = [task for task in judged if task not in moves]
+    return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
+
+
+def settled_runs(runs: pd.DataFrame) -> pd.Series[bool]:
+    """Return which runs settled; one that ended early did not, however near it was."""
+    return _column(runs, "settling_time_s").notna() & (runs["status"] == COMPLETED)
 
 
 def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -108,7 +117,7 @@ def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
     moves, _ = split_tasks(runs)
     rows = []
     for key, group in _groups(moves):
-        settled = int(group["settling_time_s"].notna().sum())
+        settled = int(settled_runs(group).sum())
         low, high = wilson_interval(settled, len(group))
         rows.append(
             key
@@ -176,9 +185,14 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def _groups(runs: pd.DataFrame, *more: str) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    names = [name for name in (*CONDITIONS, *more, "controller") if name in runs]
+    names = [name for name in (*CONDITIONS, *more, "controller") if name in runs and _tells(runs, name)]
     grouped = runs.groupby(names, sort=False, dropna=False)
     return [(dict(zip(names, key, strict=True)), group) for key, group in grouped]
+
+
+def _tells(runs: pd.DataFrame, name: str) -> bool:
+    """Return whether a column says something: what only a sweep varies is left out where it is always the same."""
+    return name not in CONDITIONS[2:] or runs[name].nunique() > 1
 
 
 def _median(group: pd.DataFrame, name: str) -> dict[str, Any]:

@@ -28,7 +28,9 @@ def draw_effort(runs: pd.DataFrame, styles: Styles) -> Figure | None:
         return None
     tasks = runs["task"].unique().tolist()
     names = runs["controller"].unique().tolist()
-    figure = Figure(figsize=(2.2 + 1.9 * len(tasks), 1.2 + len(rows) * (0.6 + 0.2 * len(names))), layout="constrained")
+    figure = Figure(
+        figsize=(max(6.0, 2.2 + 1.9 * len(tasks)), 1.2 + len(rows) * (0.6 + 0.2 * len(names))), layout="constrained"
+    )
     panels = figure.subplots(len(rows), len(tasks), sharey=True, squeeze=False)
     for line, (column, factor, label) in zip(panels, rows, strict=True):
         for axes, task in zip(line, tasks, strict=True):

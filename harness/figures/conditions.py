@@ -19,11 +19,11 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
     """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies; None if none does.
 
     Args:
-        runs: rows of the table of runs; the moves.
+        runs: rows of the table of runs, with the column `settled` added.
         styles: of the controllers.
     """
     sweeps = _sweeps(runs)
-    if not sweeps or "settling_time_s" not in runs:
+    if not sweeps:
         return None
     columns = min(3, len(sweeps))
     rows = -(-len(sweeps) // columns)
@@ -32,9 +32,9 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
     for axes, (label, part) in zip(panels, sweeps.items(), strict=False):
         spread = 0.012 * float(np.ptp(part["size"]))
         for i, (name, group) in enumerate(part.groupby("controller", sort=False)):
-            counts = group.groupby("size")["settling_time_s"].agg(["count", "size"])
-            share = 100.0 * counts["count"] / counts["size"]
-            low, high = proportion_confint(counts["count"], counts["size"], method="wilson")
+            counts = group.groupby("size")["settled"].agg(["sum", "count"])
+            share = 100.0 * counts["sum"] / counts["count"]
+            low, high = proportion_confint(counts["sum"], counts["count"], method="wilson")
             bars = np.clip(np.stack([share - 100 * low, 100 * high - share]), 0.0, None)
             style = styles[str(name)].line_arguments(1) | {"markevery": None}
             shift = spread * (i - 0.5 * (part["controller"].nunique() - 1))  # intervals beside, not upon each other

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ FORMATS = ("png", "pdf")
 RESOLUTION = 150  # dpi of PNG
 SCREEN = 80  # dpi at which a figure is shown in a page
 PALETTE = 64  # colours
+LETTERS = 12  # of a title in an inch
 MOVES_A_FIGURE = 4
 HEADINGS = {
     "errors": "Errors and measured features",
@@ -118,7 +120,7 @@ def _group_figures(group: Group, runs: pd.DataFrame, styles: Styles) -> Iterator
             continue
         runs_in_it = f"{group.plant}, mismatch {group.mismatch}" + ("" if kind == "effort" else f", seed {group.seed}")
         title = f"{HEADINGS[kind]}: {', '.join(part for part in (what, runs_in_it) if part)}"
-        figure.suptitle(title, fontsize=10)
+        figure.suptitle(textwrap.fill(title, round(LETTERS * figure.get_figwidth())), fontsize=10)
         words = "_".join(part for part in (kind, what, group.plant, group.mismatch) if part)
         yield NamedFigure(kind, re.sub(r"[^A-Za-z0-9.=+_-]", "_", words), title, figure)
 

@@ -18,7 +18,7 @@ from plant.signals import FloatArray
 
 MILLI = 1000.0
 SETTLED = f"settling band, {MILLI * SETTLING_BAND:g} mm"
-ENDED = "run ended early"
+ENDED, END = "run ended early", "|"  # and its marker, which no method has
 CAMERA_TILT = -62.0  # deg; −90 looks along the optical axis, from which depth could not be seen
 NO_VALUES = "no values"
 EXACT = 1e-9  # relative error below which an estimate counts as the truth
@@ -74,8 +74,8 @@ def draw_path(axes: Axes3D, tracks: Tracks, styles: Styles) -> None:
         if len(points):
             axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
             if not track.completed:
-                axes.plot(*points[-1:].T, color=styles[name].colour, marker="x", markersize=9, markeredgewidth=2.0,
-                          linestyle="", zorder=12)  # fmt: skip
+                axes.plot(*points[-1:].T, color=styles[name].colour, marker=END, markersize=14, markeredgewidth=2.0,
+                          linestyle="", zorder=12, gid=ENDED)  # fmt: skip
     _draw_ends(axes, longest, reference)
     _dress_space(axes, longest.features)
 
@@ -87,7 +87,7 @@ def add_legend(figure: Figure, panels: Iterable[Axes], columns: int = 5) -> None
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
     if any(line.get_gid() == ENDED for axes in panels for line in axes.get_lines()):
-        entries[ENDED] = mpl.lines.Line2D([], [], color="black", marker="x", markersize=8, linestyle="")
+        entries[ENDED] = mpl.lines.Line2D([], [], color="black", marker=END, markersize=12, linestyle="")
     if entries:
         figure.legend(
             list(entries.values()), list(entries), loc="outside lower center", ncols=min(columns, len(entries)),
@@ -114,7 +114,7 @@ def _draw_over_time(axes: Axes, tracks: Tracks, styles: Styles, column: str, fac
         axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
         if not track.completed:
             last = np.flatnonzero(np.isfinite(values))[-1]
-            axes.plot(track.time[last], values[last], color=styles[name].colour, marker="x", markersize=9,
+            axes.plot(track.time[last], values[last], color=styles[name].colour, marker=END, markersize=14,
                       markeredgewidth=2.0, linestyle="", zorder=12, gid=ENDED)  # fmt: skip
 
 

@@ -14,9 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.figures.panels import Styles, add_legend, draw_error, draw_feature, draw_jacobian, draw_path
 from harness.figures.tracks import Tracks
+
+ROOM_IN_SPACE = (0.0, 0.0, 1.0, 0.95)  # matplotlib does not reckon with the labels of axes in space
 
 
 def draw_moves(tasks: dict[str, Tracks], styles: Styles) -> Figure:
@@ -45,7 +48,8 @@ def draw_move_paths(tasks: dict[str, Tracks], styles: Styles) -> Figure:
     """Draw the path of each task in space as the camera sees it, with start and target (figure 5)."""
     columns = min(2, len(tasks))
     rows = -(-len(tasks) // columns)
-    figure = Figure(figsize=(4.6 * columns if columns > 1 else 6.0, 0.6 + 4.0 * rows), layout="constrained")
+    figure = Figure(figsize=(4.6 * columns if columns > 1 else 6.0, 0.6 + 4.0 * rows),
+                    layout=ConstrainedLayoutEngine(rect=ROOM_IN_SPACE))  # fmt: skip
     panels = []
     for i, (task, tracks) in enumerate(tasks.items()):
         axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
@@ -74,7 +78,7 @@ def draw_tracking(tracks: Tracks, styles: Styles) -> Figure:
 
 def draw_tracking_path(tracks: Tracks, styles: Styles) -> Figure:
     """Draw desired and true path in space (figure 7)."""
-    figure = Figure(figsize=(7.0, 5.6), layout="constrained")
+    figure = Figure(figsize=(7.0, 5.8), layout=ConstrainedLayoutEngine(rect=ROOM_IN_SPACE))
     axes = figure.add_subplot(projection="3d")
     draw_path(axes, tracks, styles)
     add_legend(figure, [axes])
