@@ -18,7 +18,6 @@ from typing import Any
 import nbformat
 from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
 from jupyter_client.manager import AsyncKernelManager
-from jupyter_core.utils import run_sync
 from nbclient import NotebookClient
 from nbclient.exceptions import CellControlSignal, DeadKernelError
 from nbconvert.exporters import HTMLExporter
@@ -116,6 +115,21 @@ class _ThisPython(KernelSpecManager):
         return KernelSpec(argv=argv, display_name=kernel_name, language="python")
 
 
+def _kernel_class(connection: Path) -> type[AsyncKernelManager]:
+    """Return a manager of a kernel of this interpreter that talks over files beside `connection`."""
+
+    class ThisKernel(AsyncKernelManager):
+        def __init__(self, **settings: Any) -> None:  # noqa: ANN401 - handed on to traitlets
+            super().__init__(
+                kernel_spec_manager=_ThisPython(),
+                connection_file=str(connection),
+                transport="ipc" if os.name == "posix" else "tcp",  # such sockets are open to nobody else
+                **settings,
+            )
+
+    return ThisKernel
+
+
 def execute_notebook(folder: Path) -> Any:  # noqa: ANN401 - a notebook as nbformat has it, untyped
     """Return the analysis notebook with its outputs for a results folder.
 
@@ -133,16 +147,8 @@ def execute_notebook(folder: Path) -> Any:  # noqa: ANN401 - a notebook as nbfor
     }
     try:
         with tempfile.TemporaryDirectory(prefix="servobench-") as scratch:
-            manager = AsyncKernelManager(
-                kernel_name="python3",
-                kernel_spec_manager=_ThisPython(),
-                connection_file=str(Path(scratch) / "kernel.json"),
-                transport="ipc" if os.name == "posix" else "tcp",  # sockets that are files are nobody else's
-            )
-            try:
-                NotebookClient(notebook, timeout=CELL_TIMEOUT, km=manager).execute(env=environment)
-            finally:
-                run_sync(manager.shutdown_kernel)(now=True)
+            kernel = _kernel_class(Path(scratch) / "kernel.json")
+            NotebookClient(notebook, timeout=CELL_TIMEOUT, kernel_manager_class=kernel).execute(env=environment)
     except (CellControlSignal, DeadKernelError, RuntimeError, OSError) as error:
         reason = re.sub(r"\x1b\[[0-9;]*m", "", str(error)).strip().splitlines() or [type(error).__name__]
         raise ReportFailed(f"report on {folder}: the notebook failed: {reason[-1]}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import select
@@ -108,14 +109,15 @@ def browser_page(folder: Path) -> Iterator[Page]:
     flags = ["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
              "--enable-unsafe-swiftshader", "--remote-debugging-pipe", "--no-first-run",
              "--disable-background-networking", "--window-size=1300,1000", f"--user-data-dir={folder}"]  # fmt: skip
-    # The browser reads from descriptor 3 and writes to descriptor 4.
-    script = f'exec "$0" "$@" 3<&{to_browser[0]} 4>&{from_browser[1]}'
+    # The browser reads from descriptor 3 and writes to descriptor 4; ours must not be one of these.
+    theirs = tuple(fcntl.fcntl(end, fcntl.F_DUPFD, 10) for end in (to_browser[0], from_browser[1]))
+    script = f'exec "$0" "$@" 3<&{theirs[0]} 4>&{theirs[1]}'
     process = subprocess.Popen(
-        ["/bin/sh", "-c", script, str(find_browser()), *flags],
-        pass_fds=(to_browser[0], from_browser[1]), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        ["bash", "-c", script, str(find_browser()), *flags],
+        pass_fds=theirs, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    os.close(to_browser[0])
-    os.close(from_browser[1])
+    for end in (to_browser[0], from_browser[1], *theirs):
+        os.close(end)
     page = Page(from_browser[0], to_browser[1])
     try:
         page.attach()

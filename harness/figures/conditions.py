@@ -63,7 +63,7 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     )
     none = runs[runs["mismatch"] == "none"].assign(size=0.0)
     for (axis, unit), group in found.groupby(["axis", "unit"], sort=False):
-        part = pd.concat([none, group])
+        part = pd.concat([none, group]) if len(none) else group
         if part["size"].nunique() > 1:
             sweeps[f"{str(axis).replace('_', ' ')} [{unit}]"] = part
     return sweeps
