@@ -134,10 +134,11 @@ def test_the_page_of_a_comparison_works_in_a_browser_without_a_network(compared,
         assert "exp2 on kinematic" in page.evaluate("document.querySelector('#paths').textContent")
         assert not page.evaluate("document.querySelector('[data-title*=Share]')")
         sort_by = (
-            "Array.from(document.querySelectorAll('th')).filter(h => h.textContent.trim() === 'controller').at(-1)"
+            "Array.from(document.querySelectorAll('th'))"
+            ".filter(h => h.textContent.trim() === 'controller' && h.offsetHeight > 0).at(-1)"
         )
         column = (
-            "Array.from(document.querySelectorAll('table.dataTable')).at(-1)"
+            "Array.from(document.querySelectorAll('.dt-scroll-body table')).at(-1)"
             ".querySelectorAll('tbody tr td:nth-child(4)')"
         )
         read = f"Array.from({column}, d => d.textContent)"
