@@ -196,7 +196,10 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None,
         console.print(f"interrupted: {len(runs)} of {len(requests)} runs were finished and kept")
         sys.exit(INTERRUPTED)
     if with_report:
-        make_report(folder)
+        try:
+            make_report(folder)
+        except ConfigurationError as error:  # the runs are safe, and `servobench report` can be called again
+            console.print(f"no report: {error}", soft_wrap=True, markup=False)
 
 
 def _print_faults(runs: pd.DataFrame) -> None:

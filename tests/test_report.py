@@ -71,6 +71,17 @@ def test_the_path_of_the_report_is_told_at_the_end(monkeypatch, capsys, tmp_path
     assert made == [tmp_path / "a"]
 
 
+def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(monkeypatch, capsys, tmp_path):
+    def fail(folder, out):
+        raise report.ReportFailed(f"report on {folder}: the notebook failed: no kernel")
+
+    monkeypatch.setattr(report, "write_report", fail)
+    run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1", "--report"]
+    assert servobench(monkeypatch, *run, "--out", str(tmp_path / "out")) == 0
+    assert "no report: report on" in capsys.readouterr().out
+    assert len(results.load_runs(tmp_path / "out")) == 1
+
+
 def test_a_folder_with_failed_runs_only_gives_an_honest_report(tmp_path):
     page = report.write_report(failed_only(tmp_path / "out")).read_text()
     assert "of which 0 reached the last period" in page
