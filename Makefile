@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: run test lint format benchmark lock clean
+.PHONY: run test lint format figures benchmark lock clean
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
@@ -20,6 +20,10 @@ lint: $(VENV)/ready
 format: $(VENV)/ready
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+# Draw the README's pictures anew from committed seeds.
+figures: $(VENV)/ready
+	$(BIN)/python -m harness.readme_pictures docs/pictures
 
 benchmark: $(VENV)/ready
 	for file in benchmarks/*.py; do $(BIN)/python $$file || exit 1; done

@@ -25,7 +25,9 @@ from harness.fmu_commands import fmu_app
 from harness.manifest import describe_batch
 from harness.options import ConfigOption, SetOption, default_workers, split_names
 from harness.progress import run_progress
+from harness.record_command import record
 from harness.registry import controller_names, find_controller, find_plant, plant_names
+from harness.report_command import make_report, report
 from harness.robustness_command import robustness
 from harness.summary import summary_tables
 from harness.sweep_command import sweep
@@ -44,6 +46,7 @@ app = typer.Typer(
 console = Console()
 
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
+ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
 NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
 
 
@@ -52,6 +55,8 @@ app.command()(sweep)
 app.command()(claims)
 app.command()(robustness)
 app.command()(tune)
+app.command()(record)
+app.command()(report)
 
 
 @app.command()
@@ -86,6 +91,7 @@ def run(
     config: ConfigOption = None,
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
+    with_report: ReportOption = False,
 ) -> None:
     """Carry out one run."""
     assignments = list(set_ or [])
@@ -95,7 +101,7 @@ def run(
         assignments.append("bullet.view=true")
     name = f"{controller}+{estimator}" if estimator else controller
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
-    _carry_out(batch, read_settings(config, assignments), 1, out)
+    _carry_out(batch, read_settings(config, assignments), 1, out, with_report=with_report)
 
 
 @app.command()
@@ -109,6 +115,7 @@ def compare(
     set_: SetOption = None,
     config: ConfigOption = None,
     out: OutOption = None,
+    with_report: ReportOption = True,
 ) -> None:
     """Run every combination and compare the controllers."""
     batch = Batch(
@@ -119,7 +126,7 @@ def compare(
         parse_seeds(seeds),
     )
     count = workers or default_workers()
-    _carry_out(batch, read_settings(config, set_ or []), count, out)
+    _carry_out(batch, read_settings(config, set_ or []), count, out, with_report=with_report)
 
 
 @app.command()
@@ -163,8 +170,8 @@ def main() -> None:
         sys.exit(INTERRUPTED)
 
 
-def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None) -> None:
-    """Check everything, run everything, and leave tables and figures behind."""
+def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None, *, with_report: bool) -> None:
+    """Check everything, run everything, and leave tables, figures and a report behind."""
     with console.status("checking the configuration") as status:
         check_batch(
             batch, settings, lambda share, what: status.update(f"training networks once: {100 * share:3.0f} %, {what}")
@@ -192,6 +199,11 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None)
     if interrupted:
         console.print(f"interrupted: {len(runs)} of {len(requests)} runs were finished and kept")
         sys.exit(INTERRUPTED)
+    if with_report:
+        try:
+            make_report(folder)
+        except ConfigurationError as error:  # the runs are safe, and `servobench report` can be called again
+            console.print(f"no report: {error}", soft_wrap=True, markup=False)
 
 
 def _print_faults(runs: pd.DataFrame) -> None:

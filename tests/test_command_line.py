@@ -59,7 +59,10 @@ def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_pat
     assert manifest["configuration"]["exp2"]["duration"] == 3
     assert manifest["seeds"] == [3]
     assert manifest["packages"]["numpy"]
-    assert len(list((out / "figures").glob("*.png"))) == 4
+    figures = {path.stem for path in (out / "figures").glob("*.png")}
+    assert figures == {path.stem for path in (out / "figures").glob("*.pdf")}
+    assert len(figures) == 6
+    assert not (out / "report.html").exists()
     assert json.loads(runs["mismatch_values"][0])["camera_angle"] != 0.0
 
 
@@ -96,7 +99,7 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
             servobench(
                 monkeypatch, "compare", "--plants", plant, "--controllers", "ukf_mfac,constant",
                 "--tasks", "exp2,random", "--mismatch", "moderate", "--seeds", "5:6", "--workers", workers,
-                "--out", str(out), "--set", "exp2.duration=1", "--set", "random.duration=1",
+                "--out", str(out), "--set", "exp2.duration=1", "--set", "random.duration=1", "--no-report",
             )
             == 0
         )  # fmt: skip

@@ -1,30 +1,66 @@
-"""Figures of a comparison: for each plant, mismatch and task the runs of one seed, all controllers together."""
+"""All figures of a results folder, from its tables alone."""
 
 from __future__ import annotations
 
+import io
 import re
+import textwrap
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from PIL import Image
 
 from harness import results
-from harness.configuration import ConfigurationError
-from harness.figures.style import MethodStyle, method_styles
-from harness.metrics import SETTLING_BAND
+from harness.figures.batch import draw_effort, draw_joint_speeds, draw_step_times
+from harness.figures.panels import Styles
+from harness.figures.paper import draw_jacobians, draw_move_paths, draw_moves, draw_tracking, draw_tracking_path
+from harness.figures.style import figure_style, method_styles
+from harness.figures.tracks import Group, load_groups
 
 FOLDER = "figures"
-MILLI = 1000.0
+FORMATS = ("png", "pdf")
+RESOLUTION = 150  # dpi of PNG
+SCREEN = 80  # dpi at which a figure is shown in a page
+PALETTE = 64  # colours
+LETTERS = 12  # of a title in an inch
+MOVES_A_FIGURE = 4
+HEADINGS = {
+    "errors": "Errors and measured features",
+    "paths": "True paths as the camera sees them",
+    "tracking": "Desired and measured features, and error",
+    "tracking_path": "Desired and true path as the camera sees them",
+    "jacobian": "Relative error of the estimated Jacobian",
+    "effort": "Control effort and saturation of every run",
+    "step_times": "Time of a controller's step",
+    "joint_speeds": "Commanded joint speeds",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class NamedFigure:
+    """A figure and what it is called.
+
+    Attributes:
+        kind: what it shows, one of HEADINGS.
+        stem: name of its file without ending.
+        title: the heading and what its runs have in common.
+        figure: the drawing.
+    """
+
+    kind: str
+    stem: str
+    title: str
+    figure: Figure
 
 
 def draw_figures(folder: Path) -> list[Path]:
-    """Draw the figures of a results folder into its folder `figures`.
+    """Draw the figures of a results folder into its folder `figures`, as PNG and PDF.
 
     Args:
-        folder: a results folder; the first seed of each group is drawn.
+        folder: a results folder; the first seed of each plant and mismatch is drawn.
 
     Returns:
         The files.
@@ -32,126 +68,76 @@ def draw_figures(folder: Path) -> list[Path]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    runs = results.load_runs(folder)
-    (folder / FOLDER).mkdir(exist_ok=True)
     paths = []
-    for (plant, mismatch, task), group in runs.groupby(["plant", "mismatch", "task"], sort=False):
-        chosen = group[group["seed"] == group["seed"].min()]
-        try:
-            steps = results.load_steps(folder, chosen["run_id"].tolist())
-        except ConfigurationError:  # no run of the group reached its first step
-            continue
-        tracks = {
-            row["controller"]: track
-            for row in chosen.to_dict("records")
-            if len(track := steps[steps["run_id"] == row["run_id"]].dropna(axis=1, how="all"))
-        }
-        title = f"{task} on {plant}, mismatch {mismatch}, seed {chosen['seed'].iloc[0]}"
-        stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", f"{plant}_{task}_{mismatch}")
-        for kind, draw in (
-            ("error", _draw_error),
-            ("features", _draw_features),
-            ("trajectory", _draw_trajectory),
-            ("joint_speeds", _draw_joint_speeds),
-        ):
-            with mpl.rc_context({"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "axes.axisbelow": True}):
-                figure = draw(tracks, method_styles(list(tracks)))
-                figure.suptitle(title, fontsize=10)
-                path = folder / FOLDER / f"{kind}_{stem}.png"
-                figure.savefig(path, dpi=150)
-            paths.append(path)
+    for named in folder_figures(folder):
+        (folder / FOLDER).mkdir(exist_ok=True)
+        paths += save_figure(named.figure, folder / FOLDER / named.stem)
     return paths
 
 
-def _draw_error(tracks: dict[str, pd.DataFrame], styles: dict[str, MethodStyle]) -> Figure:
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-    axes = figure.add_subplot()
-    for name, track in tracks.items():
-        axes.semilogy(
-            track["time_s"], MILLI * track["error_norm_m"], label=name, **styles[name].line_arguments(len(track))
-        )
-    axes.axhline(MILLI * SETTLING_BAND, color="0.4", linewidth=0.8, linestyle=(0, (2, 2)))
-    axes.annotate("5 mm", (1.0, MILLI * SETTLING_BAND), xycoords=("axes fraction", "data"), fontsize=8, color="0.4",
-                  xytext=(3, 0), textcoords="offset points", va="center")  # fmt: skip
-    axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set(xlabel="time [s]", ylabel="true error norm [mm]")
-    _add_legend(figure, axes)
-    return figure
+def save_figure(figure: Figure, stem: Path) -> list[Path]:
+    """Write a figure as PNG and as PDF beside each other; the same figure gives the same bytes."""
+    paths = []
+    for ending in FORMATS:
+        path = stem.with_name(f"{stem.name}.{ending}")
+        with figure_style():
+            metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
+            figure.savefig(path, dpi=RESOLUTION, metadata=metadata)
+        figure.set_layout_engine("none")  # everything stands where it should; finding that takes most of the time
+        paths.append(path)
+    return paths
 
 
-def _draw_features(tracks: dict[str, pd.DataFrame], styles: dict[str, MethodStyle]) -> Figure:
-    columns = [name for name in next(iter(tracks.values())).columns if name.startswith("true_feature_")]
-    figure = Figure(figsize=(7.0, 1.3 + 1.6 * len(columns)), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(len(columns), 1, sharex=True))
-    for axes, column in zip(panels, columns, strict=True):
-        feature = column.removeprefix("true_feature_")
-        for name, track in tracks.items():
-            axes.plot(track["time_s"], track[column], label=name, **styles[name].line_arguments(len(track)))
-        longest = max(tracks.values(), key=len)
-        axes.plot(
-            longest["time_s"],
-            longest[f"reference_{feature}"],
-            color="black",
-            linewidth=2.5,
-            alpha=0.3,
-            label="reference",
-        )
-        name, _, unit = feature.rpartition("_")
-        axes.set_ylabel(f"{name} [{unit}]")
-    panels[-1].set_xlabel("time [s]")
-    _add_legend(figure, panels[0])
-    return figure
+def picture_of(figure: Figure) -> tuple[bytes, int]:
+    """Return a figure as a small PNG of twice the pixels that it is to be shown with, and its width in those, px."""
+    large, small = io.BytesIO(), io.BytesIO()
+    with figure_style():
+        figure.savefig(large, dpi=2 * SCREEN)
+    # A line drawing has few colours; a palette makes half the size of it.
+    with Image.open(large) as picture:
+        picture.convert("RGB").quantize(PALETTE, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+    return small.getvalue(), round(SCREEN * figure.get_figwidth())
 
 
-def _draw_trajectory(tracks: dict[str, pd.DataFrame], styles: dict[str, MethodStyle]) -> Figure:
-    """Draw the paths in space as the camera sees them: x right, y down, depth away from the reader."""
-    figure = Figure(figsize=(7.0, 5.6), layout="constrained")
-    axes = figure.add_subplot(projection="3d")
-    kinds = [name for name in next(iter(tracks.values())).columns if name.startswith("true_feature_")][:3]
-    if len(kinds) < 3:
-        axes.text2D(0.5, 0.5, "fewer than three features", transform=axes.transAxes, ha="center")
-        return figure
-    for name, track in tracks.items():
-        points = track[kinds].to_numpy()
-        axes.plot(*points.T, label=name, **styles[name].line_arguments(len(track)))
-    longest = max(tracks.values(), key=len)
-    reference = longest[[kind.replace("true_feature", "reference") for kind in kinds]].to_numpy()
-    start = longest[kinds].to_numpy()[0]
-    axes.scatter(*start, color="black", marker="s", s=35, label="start", zorder=10)
-    if np.ptp(reference, axis=0).max() > 0.0:
-        axes.plot(*reference.T, color="black", linewidth=2.5, alpha=0.3, label="reference")
-    else:
-        axes.scatter(*reference[0], color="black", marker="*", s=90, label="target", zorder=10)
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z (depth) [m]")
-    axes.zaxis.labelpad = 12.0
-    axes.set_title(" ")  # keeps the figure's title off the axis label
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.view_init(elev=-62.0, azim=-90.0, roll=0.0)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_major_locator(mpl.ticker.MaxNLocator(4))
-    _add_legend(figure, axes)
-    return figure
+def folder_figures(folder: Path) -> Iterator[NamedFigure]:
+    """Yield every figure of a results folder, one in memory at a time.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    runs = results.load_runs(folder)
+    styles = method_styles(runs["controller"].tolist())
+    for group in load_groups(folder):
+        yield from _group_figures(group, runs, styles)
 
 
-def _draw_joint_speeds(tracks: dict[str, pd.DataFrame], styles: dict[str, MethodStyle]) -> Figure:
-    columns = [name for name in next(iter(tracks.values())).columns if name.startswith("joint_velocity_command_")]
-    rows = -(-len(columns) // 2)
-    figure = Figure(figsize=(8.0, 1.0 + 1.7 * rows), layout="constrained")
-    panels = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False).ravel()
-    for axes, column in zip(panels, columns, strict=False):
-        for name, track in tracks.items():
-            style = styles[name].line_arguments(len(track)) | {"linewidth": 1.0, "markersize": 3.5}
-            axes.plot(track["time_s"], track[column], label=name, **style)
-        axes.set_title(column.removeprefix("joint_velocity_command_").removesuffix("_rad_s"), fontsize=9)
-    for axes in panels[len(columns) :]:
-        axes.set_visible(False)
-    for axes in panels[len(columns) - 2 : len(columns)]:
-        axes.set_xlabel("time [s]")
-    figure.supylabel("commanded joint speed [rad/s]", fontsize=9)
-    _add_legend(figure, panels[0])
-    return figure
+def _group_figures(group: Group, runs: pd.DataFrame, styles: Styles) -> Iterator[NamedFigure]:
+    chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
+    with figure_style():
+        figures = list(_drawings(group, chosen, styles))
+    for kind, what, figure in figures:
+        if figure is None:
+            continue
+        runs_in_it = f"{group.plant}, mismatch {group.mismatch}" + ("" if kind == "effort" else f", seed {group.seed}")
+        title = f"{HEADINGS[kind]}: {', '.join(part for part in (what, runs_in_it) if part)}"
+        figure.suptitle(textwrap.fill(title, round(LETTERS * figure.get_figwidth())), fontsize=10)
+        words = "_".join(part for part in (kind, what, group.plant, group.mismatch) if part)
+        yield NamedFigure(kind, re.sub(r"[^A-Za-z0-9.=+_-]", "_", words), title, figure)
 
 
-def _add_legend(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)), frameon=False, fontsize=8)
+def _drawings(group: Group, runs: pd.DataFrame, styles: Styles) -> Iterator[tuple[str, str, Figure | None]]:
+    """Yield kind, what it is of within the group, and the figure."""
+    moves = list(group.select(point_to_point=True).items())
+    for first in range(0, len(moves), MOVES_A_FIGURE):
+        part = dict(moves[first : first + MOVES_A_FIGURE])
+        what = "" if len(moves) <= MOVES_A_FIGURE else "-".join(part)
+        yield "errors", what, draw_moves(part, styles)
+        yield "paths", what, draw_move_paths(part, styles)
+    for task, tracks in group.select(point_to_point=False).items():
+        yield "tracking", task, draw_tracking(tracks, styles)
+        yield "tracking_path", task, draw_tracking_path(tracks, styles)
+    yield "jacobian", "", draw_jacobians(group.tasks, styles)
+    yield "effort", "", draw_effort(runs, styles)
+    yield "step_times", "", draw_step_times(group.tasks, styles)
+    for task, tracks in group.tasks.items():
+        yield "joint_speeds", task, draw_joint_speeds(tracks, styles)

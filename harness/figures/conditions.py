@@ -1,0 +1,69 @@
+"""How the share of settled runs changes with what a folder varies: a mismatch's size, the noise, the latency."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from statsmodels.stats.proportion import proportion_confint
+
+from harness.figures.panels import Styles, add_legend
+
+MAGNITUDE = re.compile(r"^(?P<axis>[a-z_]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
+NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}
+
+
+def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
+    """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies; None if none does.
+
+    Args:
+        runs: rows of the table of runs, with the column `settled` added.
+        styles: of the controllers.
+    """
+    sweeps = _sweeps(runs)
+    if not sweeps:
+        return None
+    columns = min(3, len(sweeps))
+    rows = -(-len(sweeps) // columns)
+    figure = Figure(figsize=(1.0 + 3.2 * columns if columns > 1 else 6.0, 1.0 + 2.5 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axes, (label, part) in zip(panels, sweeps.items(), strict=False):
+        spread = 0.012 * float(np.ptp(part["size"]))
+        for i, (name, group) in enumerate(part.groupby("controller", sort=False)):
+            counts = group.groupby("size")["settled"].agg(["sum", "count"])
+            share = 100.0 * counts["sum"] / counts["count"]
+            low, high = proportion_confint(counts["sum"], counts["count"], method="wilson")
+            bars = np.clip(np.stack([share - 100 * low, 100 * high - share]), 0.0, None)
+            style = styles[str(name)].line_arguments(1) | {"markevery": None}
+            shift = spread * (i - 0.5 * (part["controller"].nunique() - 1))  # intervals beside, not upon each other
+            axes.errorbar(counts.index + shift, share, yerr=bars, label=name, capsize=2, elinewidth=0.8, **style)
+        axes.set(xlabel=label, ylim=(-4, 104))
+    for i, axes in enumerate(panels):
+        axes.set_visible(i < len(sweeps))
+        if i % columns == 0:
+            axes.set_ylabel("settled runs [%]")
+    add_legend(figure, [axes for axes in panels if axes.get_visible()])
+    return figure
+
+
+def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each condition with at least two sizes the runs concerned, with the column `size`."""
+    sweeps = {
+        label: runs.assign(size=runs[name].astype(float))
+        for name, label in NUMBERS.items()
+        if name in runs and runs[name].nunique() > 1
+    }
+    matches = runs["mismatch"].map(MAGNITUDE.match)
+    found = runs[matches.notna()].assign(
+        axis=[match["axis"] for match in matches if match],
+        unit=[match["unit"] for match in matches if match],
+        size=[float(match["size"]) for match in matches if match],
+    )
+    none = runs[runs["mismatch"] == "none"].assign(size=0.0)
+    for (axis, unit), group in found.groupby(["axis", "unit"], sort=False):
+        part = pd.concat([none, group]) if len(none) else group
+        if part["size"].nunique() > 1:
+            sweeps[f"{str(axis).replace('_', ' ')} [{unit}]"] = part
+    return sweeps

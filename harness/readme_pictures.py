@@ -1,0 +1,68 @@
+"""The pictures that the README shows, from committed seeds: `python -m harness.readme_pictures FOLDER`."""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from PIL import Image
+
+from harness import results
+from harness.compare import Batch, check_batch, run_batch
+from harness.configuration import Settings
+from harness.figures.draw import folder_figures, picture_of
+from harness.manifest import describe_batch
+from harness.record import draw_frame
+from harness.replay import logged_run
+
+BATCH = Batch(
+    plants=("bullet",),
+    controllers=("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid", "calibrated"),
+    tasks=("exp1", "exp2", "exp3", "exp4", "circle"),
+    mismatches=("moderate",),
+    seeds=(0,),
+)
+SHOWN = "bullet-rbfnn_mfac-circle-moderate-0"
+PERIOD = 150  # of the run shown: three quarters of a lap
+FILES = {"errors": "errors", "tracking": "circle", "paths": "paths"}  # kind of figure -> name of its file
+COLOURS = 128  # of the rendered picture's palette
+
+
+def draw_pictures(folder: Path) -> Iterator[Path]:
+    """Draw the pictures into a folder and yield each file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="servobench-") as scratch:
+        batch = Path(scratch) / "batch"
+        settings, requests = Settings(), BATCH.requests()
+        check_batch(BATCH, settings)
+        results.create_folder(batch, describe_batch(requests, settings))
+        for _ in run_batch(requests, settings, batch, 1):
+            pass
+        results.collect(batch)
+        yield _write(folder / "bench.png", _bench(batch))
+        for named in folder_figures(batch):
+            if named.kind in FILES:
+                yield _write(folder / f"{FILES[named.kind]}.png", picture_of(named.figure)[0])
+
+
+def _bench(batch: Path) -> bytes:
+    """Return a frame of the film of a run as PNG."""
+    runs = results.load_runs(batch)
+    row = {str(name): value for name, value in runs[runs["run_id"] == SHOWN].iloc[0].items()}
+    frame = draw_frame(logged_run(row, results.load_steps(batch, [SHOWN]), {}), PERIOD)
+    stream = io.BytesIO()
+    Image.fromarray(frame).quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+def _write(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path
+
+
+if __name__ == "__main__":
+    for made in draw_pictures(Path(sys.argv[1])):
+        sys.stdout.write(f"{made}: {made.stat().st_size / 1000:.0f} kB\n")

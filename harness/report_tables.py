@@ -1,0 +1,223 @@
+"""The tables and sentences of the analysis notebook, from the table of runs alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import bootstrap
+from statsmodels.stats.proportion import proportion_confint
+
+from harness import results
+from harness.run import COMPLETED
+
+CONDITIONS = ("plant", "mismatch", "noise_factor", "latency_periods")  # what a folder may vary beside the task
+RESAMPLES = 2000
+BOOTSTRAP_SEED = 1
+MEASURES = {  # column -> heading, factor, digits
+    "settling_time_s": ("settling [s]", 1.0, 2),
+    "overshoot": ("overshoot [%]", 100.0, 1),
+    "steady_state_error_m": ("last second [mm]", 1000.0, 2),
+    "rms_error_evaluated_m": ("RMS, evaluated part [mm]", 1000.0, 2),
+    "max_error_m": ("largest error [mm]", 1000.0, 1),
+    "path_length_ratio": ("path ratio", 1.0, 3),
+    "jacobian_error_mean": ("mean Jacobian error [%]", 100.0, 1),
+    "control_effort_rad": ("control effort [rad]", 1.0, 2),
+    "saturation_fraction": ("saturated periods [%]", 100.0, 1),
+    "feature_invalid_fraction": ("periods without a feature [%]", 100.0, 1),
+    "controller_time_median_us": ("controller step, median [µs]", 1.0, 0),
+    "controller_time_p99_us": ("controller step, 99 % [µs]", 1.0, 0),
+    "plant_time_median_us": ("plant step, median [µs]", 1.0, 0),
+}
+SHORTEST = 60  # characters of a reason that are shown in a table
+
+
+def describe_folder(folder: Path, runs: pd.DataFrame) -> str:
+    """Return in Markdown what was run and with what.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    results.check_folder(folder)
+    manifest: dict[str, Any] = json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))
+    completed = int((runs["status"] == COMPLETED).sum())
+    runs_in_words = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    lines = [f"- **{runs_in_words}**, of which {completed} reached the last period."]
+    lines += [
+        f"- {name.replace('_', ' ')}: {_listed(runs[name].unique().tolist())}"
+        for name in ("plant", "controller", "task", "mismatch", *CONDITIONS[2:])
+        if name in runs
+    ]
+    lines.append(f"- seeds: {_seeds(runs['seed'].tolist())}")
+    packages = manifest.get("packages") or {}
+    made = (
+        f"made {manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
+    )
+    commit = manifest.get("git_commit")
+    lines.append(f"- {made}{f', commit `{commit}`' if commit else ''}, Python {manifest.get('python', 'unknown')}")
+    return "\n".join(lines)
+
+
+def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield name and content of each table that a folder has beside its runs and steps, such as answered claims."""
+    for path in sorted(folder.iterdir()):
+        if path.name in (results.RUNS, results.STEPS) or path.name.startswith("."):
+            continue
+        if path.suffix == ".parquet":
+            yield path.stem, pd.read_parquet(path)
+        elif path.suffix == ".csv":
+            yield path.stem, pd.read_csv(path)
+
+
+def wilson_interval(successes: int, count: int) -> tuple[float, float]:
+    """Return the 95 % Wilson interval of a share; NaN without any trial."""
+    if count == 0:
+        return np.nan, np.nan
+    low, high = proportion_confint(successes, count, alpha=0.05, method="wilson")
+    return float(low), float(high)
+
+
+def median_interval(values: pd.Series[float]) -> tuple[float, float, float]:
+    """Return the median of the finite values and its 95 % bootstrap interval; NaN where there are too few."""
+    finite = values.astype(float).replace([np.inf, -np.inf], np.nan).dropna().to_numpy()
+    if len(finite) == 0:
+        return np.nan, np.nan, np.nan
+    middle = float(np.median(finite))
+    if len(finite) < 3 or np.ptp(finite) == 0.0:
+        return middle, np.nan, np.nan
+    interval = bootstrap(
+        (finite,), np.median, n_resamples=RESAMPLES, method="percentile", vectorized=True,
+        random_state=np.random.default_rng(BOOTSTRAP_SEED),
+    ).confidence_interval  # fmt: skip
+    return middle, float(interval.low), float(interval.high)
+
+
+def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the runs of the moves and those of the tracked curves; only a move can have an overshoot.
+
+    A task of which no run was judged, as each ended before its first period, is in neither.
+    """
+    judged = runs.loc[_column(runs, "max_error_m").notna(), "task"].unique()
+    moves = runs.loc[_column(runs, "overshoot").notna(), "task"].unique()
+    curves = [task for task in judged if task not in moves]
+    return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
+
+
+def settled_runs(runs: pd.DataFrame) -> pd.Series[bool]:
+    """Return which runs settled; one that ended early did not, however near it was."""
+    return _column(runs, "settling_time_s").notna() & (runs["status"] == COMPLETED)
+
+
+def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each condition and controller how many moves settled, how fast, and with what error."""
+    moves, _ = split_tasks(runs)
+    rows = []
+    for key, group in _groups(moves):
+        settled = int(settled_runs(group).sum())
+        low, high = wilson_interval(settled, len(group))
+        rows.append(
+            key
+            | {
+                "moves": len(group),
+                "settled": settled,
+                "settled [%]": round(100 * settled / len(group)),
+                "settled, 95 %": f"{100 * low:.0f} – {100 * high:.0f}",
+            }
+            | _median(group, "settling_time_s")
+            | _median(group, "overshoot")
+            | _median(group, "steady_state_error_m")
+        )
+    return pd.DataFrame(rows)
+
+
+def tracking_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each condition, task and controller the errors along the curve."""
+    _, curves = split_tasks(runs)
+    rows = []
+    for key, group in _groups(curves, "task"):
+        completed = int((group["status"] == COMPLETED).sum())
+        row = key | {"runs": len(group), "completed": completed}
+        rows.append(row | _median(group, "rms_error_evaluated_m") | _median(group, "max_error_m"))
+    return pd.DataFrame(rows)
+
+
+def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each plant and controller what a step costs and how much the joints are used."""
+    rows = []
+    for (plant, controller), group in runs.groupby(["plant", "controller"], sort=False):
+        row: dict[str, Any] = {"plant": plant, "controller": controller}
+        for name in ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
+                     "jacobian_error_mean"):  # fmt: skip
+            heading, factor, digits = MEASURES[name]
+            row[heading] = _number(factor * _column(group, name).median(), digits)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each way in which runs of a controller ended early, with one of the reasons."""
+    failed = runs[runs["status"] != COMPLETED]
+    rows = []
+    for (controller, plant, status), group in failed.groupby(["controller", "plant", "status"], sort=False):
+        total = len(runs[(runs["controller"] == controller) & (runs["plant"] == plant)])
+        row = {"controller": controller, "plant": plant, "ended by": status, "runs": f"{len(group)} of {total}"}
+        first = group.iloc[0]
+        rows.append(row | {"for example": first["run_id"], "reason": str(first.get("reason", ""))})
+    return pd.DataFrame(rows)
+
+
+def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return every run as a row for the reader: conditions, how it ended, and its measures in handy units."""
+    names = [name for name in (*CONDITIONS, "task", "controller", "seed", "status") if name in runs]
+    table = runs[names].copy()
+    for name, (heading, factor, digits) in MEASURES.items():
+        if name in runs:
+            table[heading] = (factor * runs[name].astype(float)).round(digits)
+    if "reason" in runs and (runs["reason"].fillna("") != "").any():
+        table["reason"] = [
+            text if len(text) <= SHORTEST else f"{text[: SHORTEST - 1]}…" for text in runs["reason"].fillna("")
+        ]
+    return table.reset_index(drop=True)
+
+
+def _groups(runs: pd.DataFrame, *more: str) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+    names = [name for name in (*CONDITIONS, *more, "controller") if name in runs and _tells(runs, name)]
+    grouped = runs.groupby(names, sort=False, dropna=False)
+    return [(dict(zip(names, key, strict=True)), group) for key, group in grouped]
+
+
+def _tells(runs: pd.DataFrame, name: str) -> bool:
+    """Return whether a column says something: what only a sweep varies is left out where it is always the same."""
+    return name not in CONDITIONS[2:] or runs[name].nunique() > 1
+
+
+def _median(group: pd.DataFrame, name: str) -> dict[str, Any]:
+    """Return the median of a measure under its heading, with its interval behind it where there is one."""
+    heading, factor, digits = MEASURES[name]
+    middle, low, high = (factor * value for value in median_interval(_column(group, name)))
+    interval = "" if np.isnan(low) else f"{low:.{digits}f} – {high:.{digits}f}"
+    return {heading: _number(middle, digits), f"{heading.split(' [')[0]}, 95 %": interval}
+
+
+def _column(group: pd.DataFrame, name: str) -> pd.Series[float]:
+    return group[name].astype(float) if name in group else pd.Series(np.nan, index=group.index)
+
+
+def _number(value: float, digits: int) -> float:
+    return round(float(value), digits) if digits or np.isnan(value) else float(round(value))
+
+
+def _listed(values: list[Any], most: int = 15) -> str:
+    words = [f"`{value}`" for value in values[:most]]
+    return ", ".join(words) + (f" and {len(values) - most} more" if len(values) > most else "")
+
+
+def _seeds(seeds: list[int]) -> str:
+    unique = sorted(set(seeds))
+    if len(unique) > 2 and unique == list(range(unique[0], unique[-1] + 1)):
+        return f"{unique[0]} to {unique[-1]} ({len(unique)})"
+    return _listed(unique)
