@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -19,6 +19,7 @@ from plant.fmu_entry import build_plant
 from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
 from plant.plant import PlantEntry, PlantSetup
+from plant.sensing import vary_feature_noise
 from plant.signals import as_vector, check_number
 
 
@@ -47,12 +48,6 @@ class Ur5FmuConfig:
     def around(self) -> FmuConfig:
         """Return the settings of what lies around the FMU."""
         return FmuConfig(self.command_delay_periods, self.feature_noise, self.latency_periods, self.drop_probability)
-
-
-def vary_sensing(config: Ur5FmuConfig, noise_factor: float, latency_periods: int | None) -> Ur5FmuConfig:
-    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
-    latency = config.latency_periods if latency_periods is None else latency_periods
-    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)
 
 
 @cache
@@ -116,5 +111,5 @@ ENTRY = PlantEntry(
     summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
     config=Ur5FmuConfig,
     build=build_ur5,
-    sense=vary_sensing,
+    sense=vary_feature_noise,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from plant.signals import check_number
 
@@ -20,9 +20,3 @@ class FmuConfig:
         """Check the numbers that no part below checks."""
         check_number("command_delay_periods", self.command_delay_periods, at_least=0)
         check_number("feature_noise", self.feature_noise, at_least=0.0)
-
-
-def vary_sensing(config: FmuConfig, noise_factor: float, latency_periods: int | None) -> FmuConfig:
-    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
-    latency = config.latency_periods if latency_periods is None else latency_periods
-    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)

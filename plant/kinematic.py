@@ -19,7 +19,7 @@ import numpy as np
 from plant.hand_eye import hand_eye_spec
 from plant.plant import Plant, PlantDiverged, PlantEntry, PlantSetup
 from plant.seeds import named_generator
-from plant.sensing import FeatureChannel
+from plant.sensing import FeatureChannel, vary_feature_noise
 from plant.signals import (
     Command,
     FloatArray,
@@ -48,12 +48,6 @@ class KinematicConfig:
         check_number("lag", self.lag, at_least=0.0)
         check_number("command_delay_periods", self.command_delay_periods, at_least=0)
         check_number("feature_noise", self.feature_noise, at_least=0.0)
-
-
-def vary_sensing(config: KinematicConfig, noise_factor: float, latency_periods: int | None) -> KinematicConfig:
-    """Return `config` with its noise multiplied and its latency set; see `PlantEntry.sense`."""
-    latency = config.latency_periods if latency_periods is None else latency_periods
-    return replace(config, feature_noise=noise_factor * config.feature_noise, latency_periods=latency)
 
 
 @lru_cache(maxsize=64)
@@ -150,5 +144,5 @@ ENTRY = PlantEntry(
     summary="numpy arm with joint lag, command delay and feature noise: exact and fast",
     config=KinematicConfig,
     build=KinematicPlant,
-    sense=vary_sensing,
+    sense=vary_feature_noise,
 )

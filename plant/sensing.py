@@ -3,10 +3,28 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from plant.signals import FloatArray, check_number
+
+Config = TypeVar("Config")
+
+
+def vary_feature_noise(config: Config, noise_factor: float, latency_periods: int | None) -> Config:
+    """Return a plant's configuration with other noise and latency; see `PlantEntry.sense`.
+
+    Args:
+        config: frozen dataclass with the fields `feature_noise` and `latency_periods`.
+        noise_factor: on the noise.
+        latency_periods: None leaves it as it is.
+    """
+    values: Any = config
+    latency = values.latency_periods if latency_periods is None else latency_periods
+    changed: Config = replace(values, feature_noise=noise_factor * values.feature_noise, latency_periods=latency)
+    return changed
 
 
 class FeatureChannel:
