@@ -29,6 +29,7 @@ from harness.record_command import record
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.report_command import make_report, report
 from harness.robustness_command import robustness
+from harness.statistics_command import statistics
 from harness.summary import summary_tables
 from harness.sweep_command import sweep
 from harness.tasks import find_task, task_names
@@ -54,6 +55,7 @@ app.add_typer(fmu_app, name="fmu")
 app.command()(sweep)
 app.command()(claims)
 app.command()(robustness)
+app.command()(statistics)
 app.command()(tune)
 app.command()(record)
 app.command()(report)

@@ -1,0 +1,112 @@
+"""Tables that judge the controllers of a results folder: rates, medians, tails, failures, paired differences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+from typing import Any, Final
+
+import pandas as pd
+
+from harness.run import COMPLETED
+from harness.statistics import (
+    SETTLED,
+    Estimate,
+    compare_pairs,
+    median_with_interval,
+    outcomes,
+    settling_times,
+    success_rate,
+    tail_mean,
+)
+
+PLACE: Final = ("plant", "task", "mismatch", "noise_factor", "latency_periods")
+TAIL: Final = 0.95
+
+
+def places(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Return the runs of each plant, task and condition, with words for it, in order of appearance."""
+    known = [name for name in PLACE if name in runs]
+    found = []
+    for key, group in runs.groupby(known, sort=False, dropna=False):
+        values: dict[str, Any] = dict(zip(known, key, strict=True))
+        words = f"{values['task']} on {values['plant']}, {values['mismatch']}"
+        if values.get("noise_factor", 1.0) != 1.0:
+            words += f", noise × {values['noise_factor']:g}"
+        latency = float(values.get("latency_periods", float("nan")))
+        if math.isfinite(latency):
+            words += f", latency {latency:g} periods"
+        found.append((words, group))
+    return found
+
+
+def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each controller: how often and when it settled, how bad its worst runs were, how runs failed.
+
+    Args:
+        runs: of one plant, task and condition.
+
+    Returns:
+        Columns controller, runs, settled [%], settling time [s], overshoot [%], RMS of the judged part [mm], worst 5 %
+        of the final error [mm] and failures, as text; medians and rates with 95 % intervals.
+    """
+    rows = []
+    for name, own in runs.groupby("controller", sort=False):
+        ended = outcomes(own)
+        rate = success_rate(int((ended == SETTLED).sum()), len(own))
+        failed = ended[ended != SETTLED].value_counts()
+        rows.append(
+            {
+                "controller": name,
+                "runs": str(len(own)),
+                "settled, %": _text(Estimate(100 * rate.value, 100 * rate.low, 100 * rate.high, rate.count), 1),
+                "settling time, s": _median(settling_times(own), 1.0, 2),
+                "overshoot, %": _median(own.get("overshoot"), 100.0, 1),
+                "RMS end, mm": _median(own.get("rms_error_evaluated_m"), 1000.0, 1),
+                "worst 5 %, mm": _tail(own),
+                "failures": ", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def compare_controllers(runs: pd.DataFrame, never: float, metric: str = "settling_time_s") -> pd.DataFrame:
+    """Return a row for each pair of controllers: the median of their paired difference and what Wilcoxon's test says.
+
+    Args:
+        runs: of one plant, task and condition.
+        never: what a run without a value counts as.
+        metric: the column compared.
+    """
+    pairs: Sequence[tuple[str, str]] = list(combinations(dict.fromkeys(runs["controller"]), 2))
+    if not pairs:
+        return pd.DataFrame()
+    compared = compare_pairs(runs, pairs, never=never, metric=metric, keys=("seed",))
+    return pd.DataFrame(
+        [
+            {
+                "pair": f"{pair.first} − {pair.second}",
+                "pairs": str(pair.difference.count),
+                "difference": _text(pair.difference, 3),
+                "p after Holm": f"{pair.corrected_p_value:.2g}",
+            }
+            for pair in compared
+        ]
+    )
+
+
+def _median(values: pd.Series[float] | None, factor: float, digits: int) -> str:
+    if values is None or values.notna().sum() == 0:
+        return "–"
+    return _text(median_with_interval(factor * values.astype(float)), digits)
+
+
+def _tail(runs: pd.DataFrame) -> str:
+    if "steady_state_error_m" not in runs:
+        return "–"
+    return f"{1000.0 * tail_mean(runs['steady_state_error_m'].where(runs['status'] == COMPLETED), TAIL):.1f}"
+
+
+def _text(estimate: Estimate, digits: int) -> str:
+    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
