@@ -197,7 +197,7 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None,
         figures = draw_figures(folder)
     if out is None:
         results.point_latest(folder)
-    console.print(f"tables and {len(figures)} figures in {folder}", soft_wrap=True)
+    console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
     if interrupted:
         console.print(f"interrupted: {len(runs)} of {len(requests)} runs were finished and kept")
         sys.exit(INTERRUPTED)

@@ -138,7 +138,7 @@ def _dress_space(axes: Axes3D, features: list[str]) -> None:
     axes.view_init(elev=CAMERA_TILT, azim=-90.0, roll=0.0)
     axes.tick_params(axis="y", pad=9.0)
     axes.tick_params(axis="z", pad=5.0)
-    axes.yaxis.labelpad, axes.zaxis.labelpad = 22.0, 12.0
+    axes.yaxis.labelpad, axes.zaxis.labelpad = 18.0, 12.0
     for axis, count in ((axes.xaxis, 5), (axes.yaxis, 4), (axes.zaxis, 3)):
         axis.set_major_locator(mpl.ticker.MaxNLocator(count))
 

@@ -19,7 +19,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from harness.figures.panels import Styles, add_legend, draw_error, draw_feature, draw_jacobian, draw_path
 from harness.figures.tracks import Tracks
 
-ROOM_IN_SPACE = (0.0, 0.0, 1.0, 0.95)  # matplotlib does not reckon with the labels of axes in space
+ROOM_IN_SPACE = (0.0, 0.0, 0.95, 0.95)  # matplotlib does not reckon with the labels of axes in space
 
 
 def draw_moves(tasks: dict[str, Tracks], styles: Styles) -> Figure:
