@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import bootstrap
-from statsmodels.stats.proportion import proportion_confint
 
 from harness import results
 from harness.run import COMPLETED
+from harness.statistics import Estimate, median_with_interval, success_rate
 
 CONDITIONS = ("plant", "mismatch", "noise_factor", "latency_periods")  # what a folder may vary beside the task
-RESAMPLES = 2000
-BOOTSTRAP_SEED = 1
+NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
 MEASURES = {  # column -> heading, factor, digits
     "settling_time_s": ("settling [s]", 1.0, 2),
     "overshoot": ("overshoot [%]", 100.0, 1),
@@ -73,29 +71,6 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
             yield path.stem, pd.read_csv(path)
 
 
-def wilson_interval(successes: int, count: int) -> tuple[float, float]:
-    """Return the 95 % Wilson interval of a share; NaN without any trial."""
-    if count == 0:
-        return np.nan, np.nan
-    low, high = proportion_confint(successes, count, alpha=0.05, method="wilson")
-    return float(low), float(high)
-
-
-def median_interval(values: pd.Series[float]) -> tuple[float, float, float]:
-    """Return the median of the finite values and its 95 % bootstrap interval; NaN where there are too few."""
-    finite = values.astype(float).replace([np.inf, -np.inf], np.nan).dropna().to_numpy()
-    if len(finite) == 0:
-        return np.nan, np.nan, np.nan
-    middle = float(np.median(finite))
-    if len(finite) < 3 or np.ptp(finite) == 0.0:
-        return middle, np.nan, np.nan
-    interval = bootstrap(
-        (finite,), np.median, n_resamples=RESAMPLES, method="percentile", vectorized=True,
-        random_state=np.random.default_rng(BOOTSTRAP_SEED),
-    ).confidence_interval  # fmt: skip
-    return middle, float(interval.low), float(interval.high)
-
-
 def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the runs of the moves and those of the tracked curves; only a move can have an overshoot.
 
@@ -118,14 +93,14 @@ def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for key, group in _groups(moves):
         settled = int(settled_runs(group).sum())
-        low, high = wilson_interval(settled, len(group))
+        rate = success_rate(settled, len(group))
         rows.append(
             key
             | {
                 "moves": len(group),
                 "settled": settled,
                 "settled [%]": round(100 * settled / len(group)),
-                "settled, 95 %": f"{100 * low:.0f} – {100 * high:.0f}",
+                "settled, 95 %": f"{100 * rate.low:.0f} – {100 * rate.high:.0f}",
             }
             | _median(group, "settling_time_s")
             | _median(group, "overshoot")
@@ -172,7 +147,9 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return every run as a row for the reader: conditions, how it ended, and its measures in handy units."""
-    names = [name for name in (*CONDITIONS, "task", "controller", "seed", "status") if name in runs]
+    names = [
+        name for name in (*CONDITIONS, "task", "controller", "seed", "status") if name in runs and _tells(runs, name)
+    ]
     table = runs[names].copy()
     for name, (heading, factor, digits) in MEASURES.items():
         if name in runs:
@@ -196,11 +173,19 @@ def _tells(runs: pd.DataFrame, name: str) -> bool:
 
 
 def _median(group: pd.DataFrame, name: str) -> dict[str, Any]:
-    """Return the median of a measure under its heading, with its interval behind it where there is one."""
+    """Return the median of a measure under its heading, with its interval behind it where there is one.
+
+    A move that never settled counts as one that settles after all others, ∞; of other measures a gap is left out.
+    """
     heading, factor, digits = MEASURES[name]
-    middle, low, high = (factor * value for value in median_interval(_column(group, name)))
-    interval = "" if np.isnan(low) else f"{low:.{digits}f} – {high:.{digits}f}"
-    return {heading: _number(middle, digits), f"{heading.split(' [')[0]}, 95 %": interval}
+    values = factor * _column(group, name)
+    if name == "settling_time_s":
+        values = values.where(settled_runs(group))
+        middle = median_with_interval(values)
+    else:
+        middle = median_with_interval(values, missing="left_out") if values.notna().any() else NOTHING
+    interval = "" if np.isnan(middle.low) else f"{middle.low:.{digits}f} – {middle.high:.{digits}f}"
+    return {heading: _number(middle.value, digits), f"{heading.split(' [')[0]}, 95 %": interval.replace("inf", "∞")}
 
 
 def _column(group: pd.DataFrame, name: str) -> pd.Series[float]:

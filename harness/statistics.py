@@ -118,9 +118,10 @@ def median_with_interval(
         largest = float(sample.max())
     if len(sample) == 1:
         return Estimate(float(_restored(sample, largest)[0]), np.nan, np.nan, 1)
-    drawn = stats.bootstrap(
-        (sample,), np.median, n_resamples=resamples, method="percentile", rng=np.random.default_rng(seed)
-    ).bootstrap_distribution
+    with np.errstate(under="ignore"):  # scipy also takes a standard error, of numbers however small
+        drawn = stats.bootstrap(
+            (sample,), np.median, n_resamples=resamples, method="percentile", rng=np.random.default_rng(seed)
+        ).bootstrap_distribution
     medians = _restored(np.sort(drawn), largest)
     cut = int((1.0 - confidence) / 2.0 * resamples)  # order statistics, as nothing lies between a number and infinity
     value = float(_restored(np.array([np.median(sample)]), largest)[0])

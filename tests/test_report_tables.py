@@ -10,35 +10,21 @@ from harness.report_tables import (
     cost_table,
     describe_folder,
     failure_table,
-    median_interval,
     other_tables,
     runs_table,
     settling_table,
     split_tasks,
     tracking_table,
-    wilson_interval,
 )
 
 
-def test_the_wilson_interval_is_that_of_the_formula():
-    # Wilson 1927 with z = 1.96: 8 of 10.
-    z, n, p = 1.959963984540054, 10, 0.8
-    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
-    half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
-    assert wilson_interval(8, 10) == pytest.approx((middle - half, middle + half))
-    assert np.isnan(wilson_interval(0, 0)).all()
-
-
-def test_a_median_has_an_interval_from_three_different_values_on_and_the_same_each_time():
-    values = pd.Series([1.0, 2.0, 3.0, 4.0, 100.0, np.nan, np.inf])
-    middle, low, high = median_interval(values)
-    assert middle == 3.0
-    assert low < middle < high
-    assert median_interval(values) == (middle, low, high)
-    assert median_interval(pd.Series([1.0, 2.0]))[0] == 1.5
-    assert np.isnan(median_interval(pd.Series([1.0, 2.0]))[1:]).all()
-    assert np.isnan(median_interval(pd.Series([2.0, 2.0, 2.0]))[1:]).all()
-    assert np.isnan(median_interval(pd.Series([np.nan]))).all()
+def test_a_move_that_never_settled_counts_as_one_that_settles_after_all_others():
+    runs = pd.DataFrame(
+        [made_up_row(str(seed), seed=seed, settling_time_s=time) for seed, time in enumerate((1.0, 2.0, np.nan))]
+    )
+    assert settling_table(runs)["settling [s]"].tolist() == [2.0]
+    runs["settling_time_s"] = [1.0, np.nan, np.nan]
+    assert settling_table(runs)["settling [s]"].tolist() == [np.inf]
 
 
 def test_a_run_that_ended_early_counts_as_not_settled():

@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from statsmodels.stats.proportion import proportion_confint
 
 from harness.figures.panels import Styles, add_legend
+from harness.statistics import success_rate
 
 MAGNITUDE = re.compile(r"^(?P<axis>[a-z_]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}
@@ -33,9 +33,10 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
         spread = 0.012 * float(np.ptp(part["size"]))
         for i, (name, group) in enumerate(part.groupby("controller", sort=False)):
             counts = group.groupby("size")["settled"].agg(["sum", "count"])
-            share = 100.0 * counts["sum"] / counts["count"]
-            low, high = proportion_confint(counts["sum"], counts["count"], method="wilson")
-            bars = np.clip(np.stack([share - 100 * low, 100 * high - share]), 0.0, None)
+            rates = [success_rate(int(total), int(count)) for total, count in counts.to_numpy()]
+            share = 100.0 * np.array([rate.value for rate in rates])
+            low, high = (100.0 * np.array([getattr(rate, end) for rate in rates]) for end in ("low", "high"))
+            bars = np.clip(np.stack([share - low, high - share]), 0.0, None)
             style = styles[str(name)].line_arguments(1) | {"markevery": None}
             shift = spread * (i - 0.5 * (part["controller"].nunique() - 1))  # intervals beside, not upon each other
             axes.errorbar(counts.index + shift, share, yerr=bars, label=name, capsize=2, elinewidth=0.8, **style)

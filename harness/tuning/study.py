@@ -9,6 +9,8 @@ no pruning: each trial of each method has the same runs.
 
 from __future__ import annotations
 
+import contextlib
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC
@@ -231,7 +233,8 @@ def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> I
     """Carry out the trials that are left, a round at a time, and yield after every run."""
     runs = plan.runs.runs()
     while active := [study for study in studies if len(study.finished()) < plan.trials]:
-        trials = [study.ask() for study in active]
+        with undisturbed():
+            trials = [study.ask() for study in active]
         for trial in trials:
             _train(trial, plan.runs.plants[0])
         costs = np.zeros((len(trials), len(runs)))
@@ -239,8 +242,22 @@ def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> I
         for trial_index, run_index, cost in evaluate(trials, runs, workers):
             costs[trial_index, run_index] = cost
             yield Finished(active[trial_index].controller, best[trial_index])
-        for study, row in zip(active, costs, strict=True):
-            study.tell(row.tolist())
+        with undisturbed():
+            for study, row in zip(active, costs, strict=True):
+                study.tell(row.tolist())
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C back until the end: it must not come while a journal is locked or written."""
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 def write_outcomes(folder: Path, studies: Sequence[MethodStudy]) -> Mapping[str, TunedValues]:
