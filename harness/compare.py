@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import joblib
+from joblib.externals.loky import get_reusable_executor
 
 from controllers.training import Progress
 from harness import results
@@ -122,7 +123,11 @@ def run_batch(
         joblib.delayed(_carry_out)(index, request, settings, folder, request.seed == pictured, workers > 1)
         for index, request in enumerate(requests)
     )
-    yield from parallel(jobs)
+    try:
+        yield from parallel(jobs)
+    finally:
+        if workers > 1:  # idle workers would keep their memory while tables and pictures are made
+            get_reusable_executor().shutdown(wait=True)
 
 
 def _carry_out(
