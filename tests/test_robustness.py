@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import binom
+from statsmodels.stats.proportion import proportion_confint
 
 from harness import results
 from harness.command_line import main
 from harness.configuration import ConfigurationError, Settings
+from harness.experiment import RunRequest
 from harness.robustness import (
     LINES,
     MOVE,
@@ -26,6 +30,7 @@ from harness.robustness import (
     settled_share,
     settling_median,
 )
+from harness.run import run_experiment
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():
@@ -76,3 +81,83 @@ def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
     assert {path.name for path in (out / "figures").iterdir()} == {
         "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
     }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A world that is worse than usual, and how many of 100 robots each method settled on when it was measured.
+
+    Attributes:
+        name: for the test's name.
+        mismatch: of the robots.
+        settled: method -> settled runs of 100, seeds 500 to 599 on `fmu`.
+        latency: of the camera, periods; None for the plant's.
+        duration: of a run, s.
+    """
+
+    name: str
+    mismatch: str
+    settled: dict[str, int]
+    latency: int | None = None
+    duration: float = 10.0
+
+
+SCENARIOS = (
+    Scenario("severe", "severe", {"rbfnn_mfac": 99, "ukf_mfac": 100, "ukf_mpc": 100, "rbf_pid": 100}),
+    Scenario(
+        "camera_turned_by_60_degrees",
+        "moderate+camera_rotation=60deg",
+        {"rbfnn_mfac": 98, "ukf_mfac": 100, "ukf_mpc": 100, "rbf_pid": 100},
+    ),
+    Scenario(
+        "camera_turned_by_120_degrees",
+        "moderate+camera_rotation=120deg",
+        {"ukf_mfac": 100, "ukf_mpc": 100, "rbf_pid": 94},  # where the proposed method settles 7 of 100
+    ),
+    Scenario(
+        "links_20_percent_tool_60_mm",
+        "moderate+links=20%+tool=60mm",
+        {"rbfnn_mfac": 100, "ukf_mfac": 100, "ukf_mpc": 100, "rbf_pid": 100},
+    ),
+    Scenario(
+        "latency_of_one_period",
+        "moderate",
+        {"rbfnn_mfac": 99, "ukf_mfac": 100, "ukf_mpc": 100, "rbf_pid": 100},
+        latency=1,
+    ),
+    Scenario(
+        "camera_moved_by_45_degrees",
+        "moderate+camera_move=45deg",
+        {"rbfnn_mfac": 98, "ukf_mfac": 100, "ukf_mpc": 100, "rbf_pid": 100},
+        duration=16.0,
+    ),
+)
+RUNS = 8  # of each method in each scenario; other robots than those that were measured
+CASES = [
+    pytest.param(plant, scenario, controller, id=f"{plant}-{scenario.name}-{controller}")
+    for plant in ("kinematic", "fmu")
+    for scenario in SCENARIOS
+    for controller in scenario.settled
+]
+
+
+def fewest(settled_of_100: int) -> int:
+    """Return the smallest number of RUNS that a method at the lower end of its 99 % interval reaches with 99.9 %."""
+    low, _ = proportion_confint(settled_of_100, 100, alpha=0.01, method="wilson")
+    return int(binom.ppf(0.001, RUNS, low))
+
+
+def test_a_threshold_leaves_room_for_chance_and_none_for_a_break():
+    assert fewest(100) == 5
+    assert fewest(94) == 3
+    assert binom.sf(fewest(94) - 1, RUNS, 0.07) < 0.02  # a method broken as the proposed one at 120° is caught
+
+
+@pytest.mark.parametrize(("plant", "scenario", "controller"), CASES)
+def test_methods_settle_in_worse_worlds_as_often_as_they_did(plant, scenario, controller):
+    settings = Settings({"random": {"duration": scenario.duration}})
+    settled = 0
+    for seed in range(700, 700 + RUNS):
+        request = RunRequest(plant, controller, "random", scenario.mismatch, seed, latency_periods=scenario.latency)
+        settled += not math.isnan(run_experiment(request, settings).row["settling_time_s"])
+    assert settled >= fewest(scenario.settled[controller])
