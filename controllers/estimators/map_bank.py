@@ -18,7 +18,9 @@ All functions are pure; the leading axis runs over the candidates.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dgesdd, dposv
 
+from controllers.controller import FilterDiverged
 from plant.signals import FloatArray
 
 
@@ -47,21 +49,32 @@ def map_update(
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
     """Return the rotation R, (m, m), nearest to M, (m, m), in the Frobenius norm: it maximises trace(RᵀM)."""
-    left, _, right = np.linalg.svd(M)
-    R = np.asarray(left @ right)
-    if np.linalg.det(R) < 0.0:
+    left, _, right, failed = dgesdd(M)
+    if failed:
+        raise FilterDiverged(f"map has no nearest rotation: {M.tolist()}")
+    R: FloatArray = left.dot(right)
+    if _determinant(R) < 0.0:
         left[:, -1] = -left[:, -1]
-        R = np.asarray(left @ right)
+        R = left.dot(right)
     return R
+
+
+def _determinant(R: FloatArray) -> float:
+    if len(R) != 3:
+        return float(np.linalg.det(R))
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
 def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:
     """Complete a map by the belief that it is nearly a rotation: where P is large, M says little.
 
-        R = the rotation nearest to M P⁻¹: directions count by what is known of them
-        M̄ = M + (R − M) P (P + ς² I)⁻¹: what M and the belief M ~ N(R, ς²) an entry make together
+    With the belief that an entry of the map is N(R, ς²) what is measured is M ~ N(R, P + ς² I) by rows, so that
 
-    Two known directions of three give the third.
+        R = argmin ‖(M − R) (P + ς² I)^(−½)‖_F, the rotation nearest to M (P + ς² I)⁻¹
+        M̄ = R + (M − R) ς² (P + ς² I)⁻¹
+
+    Directions count by what is known of them: two known directions of three give the third.
 
     Args:
         M: (m, m).
@@ -70,9 +83,18 @@ def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[Float
 
     Returns:
         M̄ and R.
+
+    Raises:
+        FilterDiverged: P is not positive definite.
     """
-    R = nearest_rotation(M @ np.linalg.inv(P))
+    m = len(P)
+    believed = P.copy()
+    believed.flat[:: m + 1] += deviation**2
+    _, weighted, failed = dposv(believed, M.T)
+    if failed:
+        raise FilterDiverged(f"covariance of the map is not positive definite: {P.tolist()}")
+    R = nearest_rotation(weighted.T)
     if deviation == 0.0:
         return R, R
-    share = P @ np.linalg.inv(P + deviation**2 * np.eye(len(P)))
-    return M + (R - M) @ share, R
+    _, kept, _ = dposv(believed, deviation**2 * (M - R).T)
+    return np.asarray(R + kept.T), R

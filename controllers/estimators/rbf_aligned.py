@@ -83,7 +83,6 @@ class RbfAlignedEstimator(Estimator):
         self._eye = np.eye(network.m)
         self._n, self._m = network.n, network.m
         self._candidates = 1 + (config.longest_delay if config.find_delay else 0)
-        self._ends = self._candidates + ROOM - np.arange(self._candidates)  # row of instant k − d in the past
         self._forget()
 
     def _forget(self) -> None:
@@ -123,15 +122,19 @@ class RbfAlignedEstimator(Estimator):
         if periods > ROOM:
             self._past = None
             return
-        past, ends = self._extended_past(motion, periods), self._ends
-        passed = past[ends] - past[ends - periods]
-        if config.detect_moves and self._jumped(passed[:, n:], motion.feature_step):
+        past, last = self._extended_past(motion, periods), self._candidates + ROOM
+        passed = (
+            past[last : last - self._candidates : -1] - past[last - periods : last - periods - self._candidates : -1]
+        )
+        x = passed[:, n:]
+        square = np.add.reduce(x * x, axis=1)
+        if config.detect_moves and self._jumped(square, motion.feature_step):
             self._expect_any_map()
             return
         if config.align or config.find_delay:
-            self._learn_map(passed[:, n:], motion.feature_step)
-        if config.learn and np.trace(self._P[self._delay]) < self._m * config.confidence**2:
-            begin = past[ends[self._delay] - periods, :n]
+            self._learn_map(x, square, motion.feature_step)
+        if config.learn and self._P[self._delay].trace() < self._m * config.confidence**2:
+            begin = past[last - self._delay - periods, :n]
             step, seen = passed[self._delay, :n], self._rotation.T @ motion.feature_step
             self._network.update(Motion(begin, step, seen, motion.error, motion.duration))
 
@@ -158,28 +161,29 @@ class RbfAlignedEstimator(Estimator):
             self._past = np.zeros((self._candidates + ROOM + 1, n + self._m))
             self._past[:, :n] = q
         begin = np.concatenate([q, self._past[-1, n:]])
-        step = np.concatenate([dq, self._network.jacobian(q) @ dq])
-        added = begin + step * (np.arange(1, periods + 1)[:, None] / periods)
+        step = np.concatenate([dq, self._network.jacobian(q).dot(dq)])
+        share = np.arange(1, periods + 1)[:, None] / periods if periods > 1 else 1.0
+        added = np.atleast_2d(begin + step * share)
         self._past = np.concatenate([self._past[periods:], added])
         return self._past
 
-    def _jumped(self, x: FloatArray, feature_step: FloatArray) -> bool:
-        reach = math.sqrt(max(np.add.reduce(x * x, axis=1).tolist()))
+    def _jumped(self, square: FloatArray, feature_step: FloatArray) -> bool:
+        reach = math.sqrt(max(square.tolist()))
         seen = math.sqrt(float(feature_step @ feature_step))
         return seen > JUMP_SHARE * reach + JUMP_NOISE * self._config.feature_noise
 
     def _expect_any_map(self) -> None:
         self._P, self._strikes, self._moves = self._P0.copy(), 0, self._moves + 1
 
-    def _learn_map(self, x: FloatArray, feature_step: FloatArray) -> None:
+    def _learn_map(self, x: FloatArray, square: FloatArray, feature_step: FloatArray) -> None:
         """Update map, covariance and score of every delay, and choose among them."""
         config, m = self._config, self._m
-        square = np.add.reduce(x * x, axis=1)
         variance = 2.0 * config.feature_noise**2 + config.model_error**2 * square
         if config.align:
             self._P = self._P + (config.walk**2 * np.sqrt(square))[:, None, None] * self._eye
-            mean = np.trace(self._P, axis1=1, axis2=2) / m
-            self._P *= np.minimum(1.0, config.initial_deviation**2 / mean)[:, None, None]
+            excess = self._P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
+            if max(excess.tolist()) > 1.0:
+                self._P /= np.maximum(excess, 1.0)[:, None, None]
         M, P, surprise, s = map_update(self._M, self._P, x, feature_step, variance)
         self._surprise = float(surprise[self._delay]) / m
         self._strikes = self._strikes + 1 if self._surprise > config.gate else 0

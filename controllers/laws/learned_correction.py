@@ -18,10 +18,11 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 
-from controllers.laws.law import scale_to_limit
+from controllers.laws.pid import damped_inverse
 from controllers.laws.roll_out import RollOut, descent_direction, update_step
-from controllers.networks import ControllerNetwork, controller_output
+from controllers.networks import ControllerNetwork
 from plant.signals import FloatArray
 
 
@@ -65,7 +66,9 @@ class LearnedCorrection:
                 "error_history and position_history must be 1 for base 'jacobian', got "
                 f"{network.error_history} and {network.position_history}"
             )
-        self._gains, self._network, self._posture, self._limit = gains, network, posture, limit
+        self._gains, self._network, self._posture = gains, network, posture
+        self._reach: FloatArray = 1.0 / limit
+        self._eye = np.eye(network.n)
         self.forget()
 
     def forget(self) -> None:
@@ -74,51 +77,69 @@ class LearnedCorrection:
         self.step_size = 0.0
         self.ahead: RollOut | None = None
 
-    def step(self, jacobian: FloatArray, error: FloatArray, joint_position: FloatArray, learn: bool) -> FloatArray:
+    def step(
+        self, jacobian: FloatArray, error: FloatArray, joint_position: FloatArray, forward: FloatArray, learn: bool
+    ) -> FloatArray:
         """Return the joint step that is wanted, before any limit.
 
         Args:
             jacobian: Ĵ, (m, n), m/rad.
             error: e, (m,), m.
             joint_position: q, (n,), rad.
+            forward: feature step that is made besides, (m,), m: that of the reference, which it leaves the error as is.
             learn: whether the weights may be updated.
 
         Returns:
             dq, (n,), rad.
         """
-        gains = self._gains
-        pinv = np.linalg.solve(jacobian @ jacobian.T + gains.damping**2 * np.eye(len(jacobian)), jacobian).T
-        K, row_space = gains.error_share * pinv, pinv @ jacobian
-        N = gains.posture_share * (np.eye(len(row_space)) - row_space)
+        gains, m = self._gains, len(jacobian)
+        pinv = fast_damped_inverse(jacobian, gains.damping)
+        row_space = pinv.dot(jacobian)
+        following = pinv.dot(forward)
+        linear = np.concatenate([gains.error_share * pinv, gains.posture_share * (row_space - self._eye)], axis=1)
+        constant = -linear[:, m:].dot(self._posture)
         if gains.k == 0.0:
-            return np.asarray(K @ error + N @ (self._posture - joint_position))
+            return np.asarray(linear.dot(np.concatenate([error, joint_position])) + constant + following)
         n, p, hidden = self.weights.shape
-        self.weights = (((1.0 - gains.leak) * row_space) @ self.weights.reshape(n, -1)).reshape(n, p, hidden)
-        ahead = self.ahead = self._predict(jacobian, np.hstack([K, -N]), N @ self._posture, error, joint_position)
+        row_space *= 1.0 - gains.leak
+        self.weights = row_space.dot(self.weights.reshape(n, p * hidden)).reshape(n, p, hidden)
+        ahead = self.ahead = self._predict(jacobian, linear, constant, np.concatenate([error, joint_position]))
         self.step_size = 0.0
-        if not learn or np.maximum.reduce(np.abs(ahead.wanted) / self._limit) > 1.0:
-            return ahead.wanted
+        if not learn or excess_of(ahead.wanted, self._reach) > 1.0:
+            return np.asarray(ahead.wanted + following)
         direction = descent_direction(jacobian, ahead)
         self.step_size = update_step(direction, ahead, gains.k, gains.epsilon)
-        self.weights = self.weights + self.step_size * direction
-        return ahead.wanted + self.step_size * controller_output(direction, ahead.xi[0], ahead.h[0])
+        direction *= self.step_size
+        self.weights += direction
+        learned: FloatArray = direction.reshape(n * p, hidden).dot(ahead.h[0]).reshape(n, p).dot(ahead.xi[0])
+        return np.asarray(ahead.wanted + learned + following)
 
-    def _predict(
-        self, jacobian: FloatArray, linear: FloatArray, constant: FloatArray, error: FloatArray, q: FloatArray
-    ) -> RollOut:
+    def _predict(self, jacobian: FloatArray, linear: FloatArray, constant: FloatArray, xi: FloatArray) -> RollOut:
         """Predict the loop with dq = linear ξ + constant + Σ_j W_j h ξ_j, (n, p), (n,), everything frozen."""
-        (n, p, hidden), m, horizon = self.weights.shape, len(error), self._gains.horizon
-        flat = self.weights.reshape(n * p, hidden)
-        xis, hs, errors = np.empty((horizon, p)), np.empty((horizon, hidden)), np.empty((horizon, m))
-        xi, wanted = np.concatenate([error, q]), constant
+        (n, p, hidden), m, horizon = self.weights.shape, len(jacobian), self._gains.horizon
+        flat, moves = self.weights.reshape(n * p, hidden), np.concatenate([-jacobian, self._eye])
+        xis, hs, wanted = np.empty((horizon + 1, p)), np.empty((horizon, hidden)), constant
+        xis[0] = xi
         for t in range(horizon):
-            xis[t] = xi
-            h = hs[t] = self._network.features(xi)
-            dq = (flat.dot(h).reshape(n, p) + linear).dot(xi) + constant
+            h = hs[t] = self._network.features(xis[t])
+            dq = (flat.dot(h).reshape(n, p) + linear).dot(xis[t]) + constant
             if t == 0:
                 wanted = dq
-            dq = scale_to_limit(dq, self._limit)
-            xi[:m] -= jacobian.dot(dq)
-            xi[m:] += dq
-            errors[t] = xi[:m]
-        return RollOut(errors, xis, hs, wanted)
+            excess = excess_of(dq, self._reach)
+            xis[t + 1] = xis[t] + moves.dot(dq if excess <= 1.0 else dq / excess)
+        return RollOut(xis[1:, :m], xis[:-1], hs, wanted)
+
+
+def excess_of(joint_step: FloatArray, reach: FloatArray) -> float:
+    """Return by which factor a joint step (n,), rad, exceeds its limits, `reach` (n,), 1/rad, being their inverses."""
+    return float(max(map(abs, (joint_step * reach).tolist())))
+
+
+def fast_damped_inverse(J: FloatArray, damping: float) -> FloatArray:
+    """Return Jᵀ (JJᵀ + δ²I)⁻¹, (n, m), by a Cholesky factor: `damped_inverse`, sooner, up to rounding."""
+    square = J.dot(J.T)
+    square.flat[:: len(J) + 1] += damping**2
+    _, solution, failed = dposv(square, J)
+    if failed:  # δ is lost in the rounding of a Jacobian with fewer joints than features
+        return damped_inverse(J, damping)
+    return np.asarray(solution).T

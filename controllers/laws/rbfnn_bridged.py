@@ -40,7 +40,7 @@ class RbfnnBridgedConfig:
     """Settings of the law; each addition to `rbfnn` can be switched off."""
 
     base: Base = "jacobian"  # what is learned upon: Ĵ⁺ as estimated; "network": the offline network, as in `rbfnn`
-    horizon: int = 3  # T, predicted periods; take 8 with base "network"
+    horizon: int = 2  # T, predicted periods; take 8 with base "network"
     k: float = 0.1  # share of the predicted error that one update removes, 0 ≤ k < 2; 0 learns nothing
     epsilon: float = 1e-3  # ε, m⁴
     leak: float = 0.02  # l, share of what was learned that is forgotten a period; base "jacobian" only
@@ -112,6 +112,7 @@ class RbfnnBridgedLaw(Law):
             )
             middle = networks.jacobian.centres.mean(axis=(0, 1))
             self._law = LearnedCorrection(gains, networks.controller, middle, self._limit)
+        self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
         self._delay = 0
         self._forget()
 
@@ -145,10 +146,11 @@ class RbfnnBridgedLaw(Law):
             delay, flight, lead = self._delay, self._response.flight(), self._response.lead
         seen = self._seen(jacobian, past, delay, observation)
         ahead, q = seen + jacobian @ (past[0] - past[delay] + flight), past[0] + flight
-        wanted = self._wanted_step(jacobian, ahead, q, shifted(reference, lead), observation)
-        self._wanted = wanted
-        shared = redistribute(wanted, jacobian, self._limit, config.damping) if config.redistribute else wanted
-        dq = scale_to_limit(shared, self._limit)
+        wanted = self._wanted = self._wanted_step(jacobian, ahead, q, shifted(reference, lead, self._rows), observation)
+        if config.redistribute:
+            dq = redistribute(wanted, jacobian, self._limit, config.damping)
+        else:
+            dq = scale_to_limit(wanted, self._limit)
         self._response.command(dq)
         return dq / self._period
 
@@ -192,16 +194,17 @@ class RbfnnBridgedLaw(Law):
         self, jacobian: FloatArray, y: FloatArray, q: FloatArray, reference: FloatArray, observation: Observation
     ) -> FloatArray:
         """Return the joint step before it is limited, (n,), rad, for predicted feature and joints."""
-        config, forward = self._config, np.zeros(self._n)
+        config, law, forward = self._config, self._law, np.zeros(self._m)
         if config.feedforward:
-            forward = damped_inverse(jacobian, config.damping) @ (reference[1] - reference[0])
+            forward = reference[1] - reference[0]
+        if isinstance(law, LearnedCorrection):
+            return law.step(jacobian, reference[0] - y, q, forward, observation.feature_valid)
+        if config.feedforward:
             reference = np.repeat(reference[:1], len(reference), axis=0)
-        if isinstance(self._law, LearnedCorrection):
-            return self._law.step(jacobian, reference[0] - y, q, observation.feature_valid) + forward
         F = self._frame(jacobian, q)
         predicted = Observation(observation.time, q, F @ y, observation.feature_valid)
-        self._law.command(F @ jacobian, predicted, reference @ F.T)
-        return self._law.wanted + forward
+        law.command(F @ jacobian, predicted, reference @ F.T)
+        return np.asarray(law.wanted + damped_inverse(jacobian, config.damping) @ forward)
 
     def _frame(self, jacobian: FloatArray, q: FloatArray) -> FloatArray:
         """Return the rotation from the camera's frame into that of the model, (m, m): the nearest of Ĵ to the model."""
@@ -213,17 +216,20 @@ class RbfnnBridgedLaw(Law):
 LEARNED = ("criterion", "step_size", "predicted_error", "learned_weight_norm")
 
 
-def shifted(reference: FloatArray, lead: float) -> FloatArray:
-    """Return the reference `lead` periods later, (1 + preview, m): interpolated, and extrapolated beyond its end.
+def shifted(reference: FloatArray, lead: float, rows: int) -> FloatArray:
+    """Return the reference `lead` periods later, (rows, m): interpolated, and extrapolated beyond its end.
 
     Args:
         reference: (1 + preview, m), m.
         lead: periods, at least 0.
+        rows: how many instants are wanted, at most 1 + preview.
     """
-    last = len(reference) - 1
-    if lead == 0.0 or last == 0:
-        return reference
-    time = lead + np.arange(last + 1)
-    before = np.minimum(time.astype(np.intp), last - 1)
-    share = (time - before)[:, None]
-    return np.asarray(reference[before] + share * (reference[before + 1] - reference[before]))
+    if lead == 0.0 or len(reference) == 1:
+        return reference[:rows]
+    whole = int(lead)
+    missing = whole + rows + 1 - len(reference)
+    if missing > 0:
+        further = np.arange(1, missing + 1)[:, None] * (reference[-1] - reference[-2])
+        reference = np.concatenate([reference, reference[-1] + further])
+    before = reference[whole : whole + rows]
+    return np.asarray(before + (lead - whole) * (reference[whole + 1 : whole + 1 + rows] - before))
