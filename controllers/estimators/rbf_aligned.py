@@ -25,7 +25,8 @@ ROOM = 16  # periods that a motion over lost frames may span; after a longer gap
 JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm
 JUMP_NOISE = 10.0  # σ, beyond which it is no noise either
 LARGEST_SURPRISE = 50.0  # ‖ν‖²/s beyond which a single motion counts no more against a delay
-STRIKES = 2  # surprising motions in a row after which the map counts as unknown
+USUAL_SURPRISE = 3.0  # ‖ν‖²/(s m) of a motion up to which nothing is suspected; 1 is expected
+LARGEST_SUSPICION = 10.0  # of one motion, so that one outlier alone is below the gate
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class RbfAlignedConfig:
     forgetting: float = 0.97  # γ, of a candidate's score a motion
     margin: float = 6.0  # by how much a delay must be the better one, in −2 log likelihood
     detect_moves: bool = True  # forget what is known of the map when the camera seems to have been moved
-    gate: float = 16.0  # ‖ν‖²/(s m) beyond which a motion is a surprise
+    gate: float = 12.0  # sum of surprises (CUSUM) beyond which it does
 
     def __post_init__(self) -> None:
         """Check the numbers; the network's are checked by `RbfConfig`."""
@@ -72,7 +73,8 @@ class RbfAlignedEstimator(Estimator):
     with x_d = Ĵ_net Δq(k−d). Symbols: M map (m, m); P its covariance (m, m); R rotation (m, m); d delay, periods; σ m.
 
     P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
-    explains, from which nothing is learned, or `STRIKES` surprising motions in a row. M stays, as the best guess.
+    explains, from which nothing is learned, or surprises that add up, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
+    gate. M stays, as the best guess.
     """
 
     def __init__(self, config: RbfAlignedConfig, network: JacobianNetwork, period: float) -> None:
@@ -94,8 +96,8 @@ class RbfAlignedEstimator(Estimator):
         self._delay = 0
         self._map, self._rotation = eye, eye
         self._past: FloatArray | None = None  # rows [q, Σ x], a row a period, the newest last
-        self._strikes = self._moves = 0
-        self._surprise = 0.0
+        self._moves = 0
+        self._surprise = self._suspicion = 0.0
 
     @property
     def map(self) -> FloatArray:
@@ -173,7 +175,7 @@ class RbfAlignedEstimator(Estimator):
         return seen > JUMP_SHARE * reach + JUMP_NOISE * self._config.feature_noise
 
     def _expect_any_map(self) -> None:
-        self._P, self._strikes, self._moves = self._P0.copy(), 0, self._moves + 1
+        self._P, self._suspicion, self._moves = self._P0.copy(), 0.0, self._moves + 1
 
     def _learn_map(self, x: FloatArray, square: FloatArray, feature_step: FloatArray) -> None:
         """Update map, covariance and score of every delay, and choose among them."""
@@ -186,8 +188,8 @@ class RbfAlignedEstimator(Estimator):
                 self._P /= np.maximum(excess, 1.0)[:, None, None]
         M, P, surprise, s = map_update(self._M, self._P, x, feature_step, variance)
         self._surprise = float(surprise[self._delay]) / m
-        self._strikes = self._strikes + 1 if self._surprise > config.gate else 0
-        if config.detect_moves and self._strikes >= STRIKES:
+        self._suspicion = max(0.0, self._suspicion + min(self._surprise, LARGEST_SUSPICION) - USUAL_SURPRISE)
+        if config.detect_moves and self._suspicion > config.gate:
             self._expect_any_map()
             M, P, _, _ = map_update(self._M, self._P, x, feature_step, variance)
         self._M, self._P = M, P

@@ -87,7 +87,11 @@ class RbfnnBridgedLaw(Law):
         Raises:
             ValueError: networks that do not fit, a preview that is too short.
         """
-        spec = knowledge.spec
+        spec, network = knowledge.spec, networks.controller
+        if (network.n, network.m) != (spec.n, spec.m):
+            raise ValueError(
+                f"network must be of {spec.n} joints and {spec.m} features, got {network.n} and {network.m}"
+            )
         if config.feedforward and knowledge.preview < 1:
             raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
         self._config, self._period = config, spec.period
