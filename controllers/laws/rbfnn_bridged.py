@@ -98,6 +98,8 @@ class RbfnnBridgedLaw(Law):
         self._n, self._m = spec.n, spec.m
         self._limit: FloatArray = spec.joint_velocity_limit * spec.period
         self._model = networks.jacobian
+        centres = networks.jacobian.centres
+        self._region = centres.min(axis=(0, 1)), centres.max(axis=(0, 1))  # where the networks were trained
         self._law: LearnedCorrection | RbfnnLaw
         if config.base == "network":
             preview = not config.feedforward
@@ -114,7 +116,7 @@ class RbfnnBridgedLaw(Law):
                 1.0 - math.exp(-config.posture_gain * spec.period),
                 config.damping,
             )
-            middle = networks.jacobian.centres.mean(axis=(0, 1))
+            middle = centres.mean(axis=(0, 1))
             self._law = LearnedCorrection(gains, networks.controller, middle, self._limit)
         self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
         self._delay = 0
@@ -152,7 +154,9 @@ class RbfnnBridgedLaw(Law):
         ahead, q = seen + jacobian @ (past[0] - past[delay] + flight), past[0] + flight
         wanted = self._wanted = self._wanted_step(jacobian, ahead, q, shifted(reference, lead, self._rows), observation)
         if config.redistribute:
-            dq = redistribute(wanted, jacobian, self._limit, config.damping)
+            lower, upper = self._region
+            further = np.maximum(q - lower, 0.0), np.maximum(upper - q, 0.0)
+            dq = redistribute(wanted, jacobian, self._limit, config.damping, further)
         else:
             dq = scale_to_limit(wanted, self._limit)
         self._response.command(dq)
