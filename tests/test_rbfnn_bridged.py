@@ -39,7 +39,7 @@ def test_the_first_step_by_hand():
     q, e, r = np.full(N, 0.1), np.array([0.01, -0.02, 0.005]), np.array([0.001, 0.0, 0.002])
     reference = still(e) + np.arange(1 + PREVIEW)[:, None] * r
     pinv = np.linalg.pinv(A)
-    posture = (1.0 - np.exp(-0.5 * PERIOD)) * (np.eye(N) - pinv @ A) @ (np.zeros(N) - q)
+    posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (np.zeros(N) - q)
     expected = (1.0 - np.exp(-14.0 * PERIOD)) * pinv @ e + pinv @ r + posture
     np.testing.assert_allclose(made.command(A, seen(q, np.zeros(M)), reference), expected / PERIOD, atol=1e-7)
 

@@ -43,7 +43,7 @@ class RbfAlignedConfig:
     model_error: float = 0.1  # c, share of a step that the model does not explain
     rotation_deviation: float = 0.2  # ς, of an entry of M from the nearest rotation; 0: M is the rotation
     feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis
-    confidence: float = 0.3  # deviation of an entry of M below which the network learns
+    confidence: float = 0.5  # deviation of an entry of M below which the network learns
     find_delay: bool = True  # estimate the delay; False: 0
     longest_delay: int = 5  # D, periods
     forgetting: float = 0.97  # γ, of a candidate's score a motion

@@ -45,7 +45,7 @@ class RbfnnBridgedConfig:
     epsilon: float = 1e-3  # ε, m⁴
     leak: float = 0.02  # l, share of what was learned that is forgotten a period; base "jacobian" only
     gain: float = 14.0  # K_p, 1/s: the error shrinks by exp(−K_p dt) a period; base "jacobian" only
-    posture_gain: float = 0.5  # K_n, 1/s, towards the middle of the training region; base "jacobian" only
+    posture_gain: float = 0.2  # K_n, 1/s, towards the middle of the training region; base "jacobian" only
     damping: float = 0.02  # δ, m/rad, of every inverse of Ĵ
     frame: bool = True  # take the law into the frame of the networks' model; base "network" only
     bridge: bool = True  # predict past the camera's delay and past what was commanded and not yet done
