@@ -23,9 +23,10 @@ KNOWLEDGE = RobotKnowledge(SPEC, PREVIEW, lambda q: np.broadcast_to(A, (*np.shap
 
 
 def networks():
-    """Networks as after training: one unit so wide that Ĵ_net = A everywhere, and any controller network."""
+    """Networks as after training within ±2 rad: units so wide that Ĵ_net = A everywhere; any controller network."""
     rng = np.random.default_rng(2)
-    jacobian = JacobianNetwork(np.zeros((N, 1, N)), np.full((N, 1), 1e9), A.T[:, :, None].copy())
+    centres = np.broadcast_to(np.array([[-2.0], [2.0]]), (N, 2, N))
+    jacobian = JacobianNetwork(centres, np.full((N, 2), 1e9), np.repeat(A.T[:, :, None] / 2.0, 2, axis=2))
     centres = rng.normal(size=(8, M + N))
     weights = 0.02 * rng.normal(size=(N, M + N, 8))
     weights[:, M:] += np.eye(N)[:, :, None] / 8
