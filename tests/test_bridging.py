@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controllers.estimators.noise_level import NoiseLevel
 from controllers.laws.feature_filter import FeatureFilter
 from controllers.laws.joint_response import JointResponse
 from controllers.laws.law import scale_to_limit
@@ -67,7 +68,7 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
 
 def test_the_filter_is_a_kalman_filter_by_hand():
     """σ = 0.1, c = 0.5: p = 0.01 + 0.25·0.04 + 0.0001 = 0.0201, L = 0.0201/0.0301, z = 1.2 + L·0.1."""
-    made = FeatureFilter(0.1, 0.5, np.array([1.0]))
+    made = FeatureFilter(NoiseLevel(0.1), 0.5, np.array([1.0]), find_noise=False)
     made.advance(np.array([0.2]), np.array([1.3]))
     share = 0.0201 / 0.0301
     np.testing.assert_allclose(made.feature, [1.2 + share * 0.1])
@@ -75,7 +76,11 @@ def test_the_filter_is_a_kalman_filter_by_hand():
 
 
 def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints():
-    rng, made, errors = np.random.default_rng(5), FeatureFilter(0.001, 0.2, np.zeros(3)), []
+    rng, made, errors = (
+        np.random.default_rng(5),
+        FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(3), find_noise=True),
+        [],
+    )
     for _ in range(600):
         made.advance(np.zeros(3), rng.normal(scale=0.001, size=3))
         errors.append(made.feature)
@@ -85,8 +90,32 @@ def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints()
     np.testing.assert_allclose(made.feature, before + [0.01, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("true", [0.0003, 0.001, 0.004])
+def test_the_noise_is_found_whatever_the_first_guess(true):
+    rng, level, found = np.random.default_rng(6), NoiseLevel(0.001), []
+    for k in range(800):
+        other = 1e-6 * (k % 3)  # variance that is not noise, and known
+        nu = rng.normal(scale=np.sqrt(2.0 * true**2 + other), size=3)
+        level.learn(float(nu @ nu) / 3.0, 2.0, other)
+        found.append(level.variance)
+    assert np.sqrt(np.mean(found[200:])) == pytest.approx(true, rel=0.15)
+
+
+def test_one_sample_of_noise_by_hand():
+    """σ² = 1 counts 10 times: weight (2/(2 + 2))² = 0.25, sample (8 − 2)/2 = 3: (9.9 + 0.75)/(9.9 + 0.25)."""
+    level = NoiseLevel(1.0)
+    level.learn(8.0, 2.0, 2.0)
+    assert level.variance == pytest.approx(10.65 / 10.15)
+
+
+def test_a_jump_counts_no_more_than_nine_times_the_noise():
+    level = NoiseLevel(1.0)
+    level.learn(1e6, 1.0, 0.0)
+    assert level.variance == pytest.approx((9.9 + 9.0) / 10.9)
+
+
 def test_a_feature_far_off_starts_the_filter_anew():
-    made = FeatureFilter(0.001, 0.2, np.zeros(2))
+    made = FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(2), find_noise=True)
     made.advance(np.zeros(2), np.array([0.3, 0.1]))
     np.testing.assert_array_equal(made.feature, [0.3, 0.1])
 

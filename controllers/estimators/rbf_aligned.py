@@ -17,6 +17,7 @@ import numpy as np
 from controllers.controller import Diagnostics
 from controllers.estimators.estimator import Estimator, Motion
 from controllers.estimators.map_bank import map_update, near_rotation
+from controllers.estimators.noise_level import NoiseLevel
 from controllers.estimators.rbf import RbfConfig, RbfEstimator
 from controllers.networks import JacobianNetwork
 from plant.signals import FloatArray, check_number
@@ -42,7 +43,8 @@ class RbfAlignedConfig:
     walk: float = 0.3  # w, 1/√m: deviation of an entry of M after the feature has moved by a metre
     model_error: float = 0.1  # c, share of a step that the model does not explain
     rotation_deviation: float = 0.2  # ς, of an entry of M from the nearest rotation; 0: M is the rotation
-    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis
+    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
+    find_noise: bool = True  # estimate σ; False: it is as given
     confidence: float = 0.5  # deviation of an entry of M below which the network learns
     find_delay: bool = True  # estimate the delay; False: 0
     longest_delay: int = 5  # D, periods
@@ -93,6 +95,7 @@ class RbfAlignedEstimator(Estimator):
         self._P0 = (config.initial_deviation**2 if config.align else 0.0) * self._M
         self._P = self._P0.copy()
         self._scores = np.zeros(self._candidates)
+        self._noise = NoiseLevel(config.feature_noise)
         self._delay = 0
         self._map, self._rotation = eye, eye
         self._past: FloatArray | None = None  # rows [q, Σ x], a row a period, the newest last
@@ -132,6 +135,8 @@ class RbfAlignedEstimator(Estimator):
         square = np.add.reduce(x * x, axis=1)
         if config.detect_moves and self._jumped(square, motion.feature_step):
             self._expect_any_map()
+            if config.find_noise:
+                self._noise.learn(float(motion.feature_step @ motion.feature_step) / self._m, 2.0, 0.0)
             return
         if config.align or config.find_delay:
             self._learn_map(x, square, motion.feature_step)
@@ -154,6 +159,7 @@ class RbfAlignedEstimator(Estimator):
             "map_deviation": math.sqrt(float(np.trace(self._P[self._delay])) / self._m),
             "map_surprise": self._surprise,
             "camera_moves": float(self._moves),
+            "noise_level": math.sqrt(self._noise.variance),
         }
 
     def _extended_past(self, motion: Motion, periods: int) -> FloatArray:
@@ -172,7 +178,7 @@ class RbfAlignedEstimator(Estimator):
     def _jumped(self, square: FloatArray, feature_step: FloatArray) -> bool:
         reach = math.sqrt(max(square.tolist()))
         seen = math.sqrt(float(feature_step @ feature_step))
-        return seen > JUMP_SHARE * reach + JUMP_NOISE * self._config.feature_noise
+        return seen > JUMP_SHARE * reach + JUMP_NOISE * math.sqrt(self._noise.variance)
 
     def _expect_any_map(self) -> None:
         self._P, self._suspicion, self._moves = self._P0.copy(), 0.0, self._moves + 1
@@ -180,14 +186,16 @@ class RbfAlignedEstimator(Estimator):
     def _learn_map(self, x: FloatArray, square: FloatArray, feature_step: FloatArray) -> None:
         """Update map, covariance and score of every delay, and choose among them."""
         config, m = self._config, self._m
-        variance = 2.0 * config.feature_noise**2 + config.model_error**2 * square
+        variance = 2.0 * self._noise.variance + config.model_error**2 * square
         if config.align:
             self._P = self._P + (config.walk**2 * np.sqrt(square))[:, None, None] * self._eye
             excess = self._P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
             if max(excess.tolist()) > 1.0:
                 self._P /= np.maximum(excess, 1.0)[:, None, None]
         M, P, surprise, s = map_update(self._M, self._P, x, feature_step, variance)
-        self._surprise = float(surprise[self._delay]) / m
+        self._surprise, expected = float(surprise[self._delay]) / m, float(s[self._delay])
+        if config.find_noise:
+            self._noise.learn(self._surprise * expected, 2.0, expected - 2.0 * self._noise.variance)
         self._suspicion = max(0.0, self._suspicion + min(self._surprise, LARGEST_SUSPICION) - USUAL_SURPRISE)
         if config.detect_moves and self._suspicion > config.gate:
             self._expect_any_map()

@@ -13,6 +13,7 @@ from typing import final
 
 import numpy as np
 
+from controllers.estimators.noise_level import NoiseLevel
 from plant.signals import FloatArray
 
 REST_SHARE = 0.1  # of σ: how far z may drift a period at rest
@@ -23,20 +24,21 @@ OUTLIER = 25.0  # ‖y − z‖² over its expectation from which on the camera 
 class FeatureFilter:
     """z and its variance p."""
 
-    def __init__(self, noise: float, model_error: float, feature: FloatArray) -> None:
+    def __init__(self, noise: NoiseLevel, model_error: float, feature: FloatArray, *, find_noise: bool) -> None:
         """Start at a feature.
 
         Args:
             noise: σ, m, standard deviation of the feature an axis.
             model_error: c, share of a feature step that the Jacobian gets wrong.
             feature: y, (m,), m.
+            find_noise: learn σ from y − z.
         """
-        self._noise, self._model_error = noise, model_error
+        self._noise, self._model_error, self._find_noise = noise, model_error, find_noise
         self._restart(feature)
 
     def _restart(self, feature: FloatArray) -> None:
         self.feature = feature
-        self.variance = self._noise**2
+        self.variance = self._noise.variance
 
     def advance(self, predicted_step: FloatArray, feature: FloatArray | None) -> None:
         """Go on by a period.
@@ -45,14 +47,17 @@ class FeatureFilter:
             predicted_step: Ĵ Δq, (m,), m.
             feature: y, (m,), m; None where no valid one came.
         """
-        sigma2 = self._noise**2
+        sigma2 = self._noise.variance
         z = self.feature + predicted_step
         p = self.variance + self._model_error**2 * float(predicted_step @ predicted_step) + REST_SHARE**2 * sigma2
         if feature is None:
             self.feature, self.variance = z, p
             return
         error = feature - z
-        if float(error @ error) > OUTLIER * len(z) * (p + sigma2):
+        square = float(error @ error) / len(z)
+        if self._find_noise:
+            self._noise.learn(square, 1.0, p)
+        if square > OUTLIER * (p + sigma2):
             self._restart(feature)
             return
         share = p / (p + sigma2)

@@ -20,6 +20,7 @@ import numpy as np
 
 from controllers.controller import Diagnostics, RobotKnowledge
 from controllers.estimators.map_bank import nearest_rotation
+from controllers.estimators.noise_level import NoiseLevel
 from controllers.laws.feature_filter import FeatureFilter
 from controllers.laws.joint_response import JointResponse
 from controllers.laws.law import Law, scale_to_limit
@@ -51,7 +52,8 @@ class RbfnnBridgedConfig:
     bridge: bool = True  # predict past the camera's delay and past what was commanded and not yet done
     response_length: int = 6  # N, periods within which joints answer a command
     observe: bool = True  # filter the feature by the joints' motion
-    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis
+    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
+    find_noise: bool = True  # estimate σ; False: it is as given
     model_error: float = 0.2  # c, share of a feature step that Ĵ gets wrong
     feedforward: bool = True  # add the reference's own motion; needs a preview of at least 1
     redistribute: bool = True  # let joints with room make up for those at their limit
@@ -125,6 +127,7 @@ class RbfnnBridgedLaw(Law):
     def _forget(self) -> None:
         self._response = JointResponse(self._config.response_length, self._n)
         self._filter: FeatureFilter | None = None
+        self._noise = NoiseLevel(self._config.feature_noise)
         self._filtered_delay = 0
         self._past: FloatArray | None = None  # q(k), q(k−1), …
         self._wanted = np.zeros(self._n)
@@ -192,7 +195,8 @@ class RbfnnBridgedLaw(Law):
         if not config.observe:
             return y
         if self._filter is None or delay != self._filtered_delay:
-            self._filter, self._filtered_delay = FeatureFilter(config.feature_noise, config.model_error, y), delay
+            self._filter = FeatureFilter(self._noise, config.model_error, y, find_noise=config.find_noise)
+            self._filtered_delay = delay
         else:
             step = jacobian @ (past[delay] - past[delay + 1])
             self._filter.advance(step, y if observation.feature_valid else None)
