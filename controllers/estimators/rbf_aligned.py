@@ -100,6 +100,7 @@ class RbfAlignedEstimator(Estimator):
         self._map, self._rotation = eye, eye
         self._past: FloatArray | None = None  # rows [q, Σ x], a row a period, the newest last
         self._moves = 0
+        self._key, self._latest = b"", np.zeros((self._m, self._n))
         self._surprise = self._suspicion = 0.0
 
     @property
@@ -143,11 +144,12 @@ class RbfAlignedEstimator(Estimator):
         if config.learn and self._P[self._delay].trace() < self._m * config.confidence**2:
             begin = past[last - self._delay - periods, :n]
             step, seen = passed[self._delay, :n], self._rotation.T @ motion.feature_step
+            self._key = b""
             self._network.update(Motion(begin, step, seen, motion.error, motion.duration))
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return M̄ Ĵ_net at `joint_position` (n,), rad."""
-        return np.asarray(self._map @ self._network.jacobian(joint_position))
+        return np.asarray(self._map.dot(self._network_jacobian(joint_position)))
 
     def diagnostics(self) -> Diagnostics:
         """Return what the network tells, and delay, rotation (rad), deviation and surprise of the map, moves."""
@@ -162,6 +164,13 @@ class RbfAlignedEstimator(Estimator):
             "noise_level": math.sqrt(self._noise.variance),
         }
 
+    def _network_jacobian(self, q: FloatArray) -> FloatArray:
+        """Return Ĵ_net, (m, n), at q; it is asked for several times at the same place between two updates."""
+        key = q.tobytes()
+        if key != self._key:
+            self._key, self._latest = key, self._network.jacobian(q)
+        return self._latest
+
     def _extended_past(self, motion: Motion, periods: int) -> FloatArray:
         """Return the past up to now, (candidates + ROOM + 1, n + m): in a gap the joints moved evenly."""
         q, dq, n = motion.joint_position, motion.joint_step, self._n
@@ -169,7 +178,7 @@ class RbfAlignedEstimator(Estimator):
             self._past = np.zeros((self._candidates + ROOM + 1, n + self._m))
             self._past[:, :n] = q
         begin = np.concatenate([q, self._past[-1, n:]])
-        step = np.concatenate([dq, self._network.jacobian(q).dot(dq)])
+        step = np.concatenate([dq, self._network_jacobian(q).dot(dq)])
         share = np.arange(1, periods + 1)[:, None] / periods if periods > 1 else 1.0
         added = np.atleast_2d(begin + step * share)
         self._past = np.concatenate([self._past[periods:], added])
