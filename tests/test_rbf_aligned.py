@@ -175,7 +175,7 @@ def test_the_weighted_error_of_the_map_falls_by_each_innovation():
         ("model_error", -0.1, "model_error must be at least 0"),
         ("rotation_deviation", -0.1, "rotation_deviation must be at least 0"),
         ("margin", -0.1, "margin must be at least 0"),
-        ("longest_delay", -1, "longest_delay must be at least 0"),
+        ("longest_delay", -1, "longest_delay must be at least 0 and at most 14"),
         ("forgetting", 1.1, "forgetting must be above 0 and at most 1"),
     ],
 )

@@ -20,10 +20,11 @@ from typing import final
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from controllers.controller import Diagnostics
 from controllers.laws.pid import damped_inverse
 from controllers.laws.roll_out import RollOut, descent_direction, update_step
 from controllers.networks import ControllerNetwork
-from plant.signals import FloatArray
+from plant.signals import FloatArray, Observation
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,13 @@ class LearnedCorrection:
         self._gains, self._network, self._posture = gains, network, posture
         self._reach: FloatArray = 1.0 / limit
         self._eye = np.eye(network.n)
-        self.forget()
+        self._forget()
 
-    def forget(self) -> None:
+    def reset(self, observation: Observation) -> None:
         """Set all weights to zero."""
+        self._forget()
+
+    def _forget(self) -> None:
         self.weights: FloatArray = np.zeros(self._network.weights.shape)
         self.step_size = 0.0
         self.ahead: RollOut | None = None
@@ -113,6 +117,15 @@ class LearnedCorrection:
         self.weights += direction
         learned: FloatArray = direction.reshape(n * p, hidden).dot(ahead.h[0]).reshape(n, p).dot(ahead.xi[0])
         return np.asarray(ahead.wanted + learned + following)
+
+    def diagnostics(self) -> Diagnostics:
+        """Return criterion I_c (m²), step size α, predicted error ‖e(k+T)‖ (m) and norm of the weights."""
+        return {
+            "criterion": self.ahead.criterion if self.ahead else 0.0,
+            "step_size": self.step_size,
+            "predicted_error": float(np.linalg.norm(self.ahead.errors[-1])) if self.ahead else 0.0,
+            "learned_weight_norm": float(np.linalg.norm(self.weights)),
+        }
 
     def _predict(self, jacobian: FloatArray, linear: FloatArray, constant: FloatArray, xi: FloatArray) -> RollOut:
         """Predict the loop with dq = linear ξ + constant + Σ_j W_j h ξ_j, (n, p), (n,), everything frozen."""

@@ -33,6 +33,7 @@ from plant.signals import FloatArray, Observation, check_number
 
 Base = Literal["jacobian", "network"]
 BASES: tuple[str, ...] = get_args(Base)
+LEARNED = ("criterion", "step_size", "predicted_error", "learned_weight_norm")  # diagnostics that both bases have
 PAST = 16  # instants of joint positions that are kept, more than any delay
 
 
@@ -73,6 +74,18 @@ class RbfnnBridgedConfig:
         if self.base == "network" and self.k == 0.0:
             raise ValueError("k must be above 0 for base 'network', got 0")
 
+    def gains(self, period: float) -> CorrectionGains:
+        """Return what the base "jacobian" needs, for a control period, s."""
+        return CorrectionGains(
+            self.horizon,
+            self.k,
+            self.epsilon,
+            self.leak,
+            1.0 - math.exp(-self.gain * period),
+            1.0 - math.exp(-self.posture_gain * period),
+            self.damping,
+        )
+
 
 @final
 class RbfnnBridgedLaw(Law):
@@ -102,24 +115,12 @@ class RbfnnBridgedLaw(Law):
         self._model = networks.jacobian
         centres = networks.jacobian.centres
         self._region = centres.min(axis=(0, 1)), centres.max(axis=(0, 1))  # where the networks were trained
-        self._law: LearnedCorrection | RbfnnLaw
         if config.base == "network":
-            preview = not config.feedforward
-            self._law = RbfnnLaw(
-                RbfnnConfig(config.horizon, config.k, config.epsilon, preview), networks.controller, knowledge
-            )
+            settings = RbfnnConfig(config.horizon, config.k, config.epsilon, preview=not config.feedforward)
+            self._law: LearnedCorrection | RbfnnLaw = RbfnnLaw(settings, network, knowledge)
         else:
-            gains = CorrectionGains(
-                config.horizon,
-                config.k,
-                config.epsilon,
-                config.leak,
-                1.0 - math.exp(-config.gain * spec.period),
-                1.0 - math.exp(-config.posture_gain * spec.period),
-                config.damping,
-            )
-            middle = centres.mean(axis=(0, 1))
-            self._law = LearnedCorrection(gains, networks.controller, middle, self._limit)
+            posture = centres.mean(axis=(0, 1))
+            self._law = LearnedCorrection(config.gains(spec.period), network, posture, self._limit)
         self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
         self._delay = 0
         self._forget()
@@ -134,10 +135,7 @@ class RbfnnBridgedLaw(Law):
 
     def reset(self, observation: Observation) -> None:
         """Forget everything that was learned and seen."""
-        if isinstance(self._law, RbfnnLaw):
-            self._law.reset(observation)
-        else:
-            self._law.forget()
+        self._law.reset(observation)
         self._delay = 0
         self._forget()
 
@@ -167,20 +165,10 @@ class RbfnnBridgedLaw(Law):
 
     def diagnostics(self) -> Diagnostics:
         """Return criterion, α, predicted error, norm of what was learned, lead (periods), saturation."""
-        law = self._law
-        if isinstance(law, RbfnnLaw):
-            told = law.diagnostics()
-            learned = {name: told[name] for name in LEARNED}
-        else:
-            ahead = law.ahead
-            learned = {
-                "criterion": ahead.criterion if ahead else 0.0,
-                "step_size": law.step_size,
-                "predicted_error": float(np.linalg.norm(ahead.errors[-1])) if ahead else 0.0,
-                "learned_weight_norm": float(np.linalg.norm(law.weights)),
-            }
+        told = self._law.diagnostics()
         saturated = float(np.max(np.abs(self._wanted) / self._limit) > 1.0)
-        return {**learned, "lead": self._response.lead if self._config.bridge else 0.0, "saturated": saturated}
+        lead = self._response.lead if self._config.bridge else 0.0
+        return {**{name: told[name] for name in LEARNED}, "lead": lead, "saturated": saturated}
 
     def _extended_past(self, joint_position: FloatArray) -> FloatArray:
         if self._past is None:  # the arm was at rest
@@ -223,9 +211,6 @@ class RbfnnBridgedLaw(Law):
         if not self._config.frame:
             return np.eye(self._m)
         return nearest_rotation(self._model.jacobian(q) @ jacobian.T)
-
-
-LEARNED = ("criterion", "step_size", "predicted_error", "learned_weight_norm")
 
 
 def shifted(reference: FloatArray, lead: float, rows: int) -> FloatArray:
