@@ -144,7 +144,7 @@ def test_without_the_map_the_delay_is_still_found():
 
 
 def test_the_weighted_error_of_the_map_falls_by_each_innovation():
-    """V = tr(M̃ P⁻¹ M̃ᵀ) with the filter's own P: V(k+1) ≤ V(k) − ‖ν‖²/s, with the walk, forgetting and moves as well."""
+    """V = tr(M̃ P⁻¹ M̃ᵀ) with P as it is, its walk and bound included: V(k+1) ≤ V(k) − ‖ν‖²/s."""
     net, q = network(), path(80)
     y = features(net, q, TURN, 0)
     made, moved = estimator(net, find_delay=False, learn=False), 0.0
