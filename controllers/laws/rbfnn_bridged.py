@@ -51,7 +51,7 @@ class RbfnnBridgedConfig:
     damping: float = 0.02  # δ, m/rad, of every inverse of Ĵ
     frame: bool = True  # take the law into the frame of the networks' model; base "network" only
     bridge: bool = True  # predict past the camera's delay and past what was commanded and not yet done
-    response_length: int = 6  # N, periods within which joints answer a command
+    response_length: int = 12  # N, periods within which joints answer a command
     observe: bool = True  # filter the feature by the joints' motion
     feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
     find_noise: bool = True  # estimate σ; False: it is as given
