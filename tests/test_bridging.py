@@ -61,7 +61,8 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
         past = np.array([command, *past[:-1]])
         made.command(np.array([command]))
     U, prior = np.array(rows), np.array([1.0, 0.0, 0.0])
-    expected = np.linalg.solve(U.T @ U + 1e-4 * np.eye(3), U.T @ np.array(answers) + 1e-4 * prior)
+    rho = 1e-5 * np.diag([1.0, 1.5, 2.25])
+    expected = np.linalg.solve(U.T @ U + rho, U.T @ np.array(answers) + rho @ prior)
     assert (expected > 0.0).all()
     np.testing.assert_allclose(made.response, expected, rtol=1e-9)
 

@@ -5,7 +5,7 @@ One finite response g, (N,), holds for all joints:
     Δq(k) = Σ_{i=1..N} g_i dq(k−i)
 
 where Δq(k) = q(k) − q(k−1) and dq(k−i) is the joint step that was commanded i periods ago. It covers the delay of a
-command and the lag of the joints. g minimises Σ ‖Δq − Σ g_i dq‖² + ρ ‖g − g₀‖², g₀ = (1, 0, …): at once.
+command and the lag of the joints. g minimises Σ ‖Δq − Σ g_i dq‖² + Σ ρ_i (g_i − g₀_i)², g₀ = (1, 0, …): at once.
 What is still to come of the commands up to now, and how long the arm needs for it at constant speed:
 
     flight = Σ_i (g_{i+1} + … + g_N) dq(k−i),   lead = Σ_i (g_{i+1} + … + g_N) / Σ_i g_i periods
@@ -19,7 +19,8 @@ import numpy as np
 
 from plant.signals import FloatArray
 
-PRIOR = 1e-4  # ρ, rad²: outweighed by one step of 0.01 rad
+PRIOR = 1e-5  # ρ_1, rad²: outweighed by one step of some milliradians
+GROWTH = 1.5  # of ρ_i from one period to the next: the later, the less is expected
 MEMORY = 1.0  # rad², of excitation; older one is forgotten in proportion
 KNOWN = 5e-4  # rad, of a step's prediction: a third of a millimetre at the ball
 LARGEST = 1.5  # of a g_i, which lies between 0 and 1 for a joint that does not overshoot
@@ -36,7 +37,7 @@ class JointResponse:
             length: N, periods.
             joints: n.
         """
-        self._A = PRIOR * np.eye(length)
+        self._A = np.diag(PRIOR * GROWTH ** np.arange(length))
         self._b: FloatArray = PRIOR * np.eye(length)[0]
         self._commands: FloatArray = np.zeros((length, joints))  # dq(k−1) … dq(k−N), rad
         self.response: FloatArray = self._b / PRIOR
