@@ -3,8 +3,8 @@
 Every method drives a plant of its own and the methods take turns of some steps each, so that a disturbance meets all
 alike while each finds its data in the caches as in a run of its own. What is timed is `Controller.step` with one
 thread; the first steps, in which solvers are made, do not count, and processor time leaves out waiting for a processor.
-The paper claims that the proposed method's update costs less than an optimising controller: the last line is that
-claim.
+The paper claims that the proposed method's update costs less than an optimising controller: the last lines are that
+claim, for its method and for the better one.
 Run it from an installed checkout: `python benchmarks/controller_steps.py`.
 """
 
@@ -22,7 +22,7 @@ from harness.experiment import RunRequest, build_experiment
 from harness.registry import CONTROLLERS
 from plant.seeds import named_seed
 
-PROPOSED, OPTIMISING, FACTOR = "rbfnn_mfac", "ukf_mpc", 1.0
+PROPOSED, OPTIMISING, FACTOR = ("rbfnn_mfac", "rbfnn_mfac_plus"), "ukf_mpc", 1.0
 WARM_UP = 20  # steps
 TURN = 20  # steps
 
@@ -58,7 +58,7 @@ def main() -> None:
     """Print medians, 95th percentiles and ratios to the optimising method.
 
     Raises:
-        SystemExit: the proposed method's step is not the cheaper one.
+        SystemExit: a proposed method's step is not the cheaper one.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--mismatch", default="moderate")
@@ -68,7 +68,7 @@ def main() -> None:
         name: Loop(RunRequest("kinematic", name, "circle", options.mismatch, options.seed)) for name in CONTROLLERS
     }
     with threadpool_limits(1):
-        while not loops[PROPOSED].finished:
+        while not loops[OPTIMISING].finished:
             for loop in loops.values():
                 for _ in range(TURN):
                     loop.advance()
@@ -78,10 +78,12 @@ def main() -> None:
         ratio = medians[name] / medians[OPTIMISING]
         late = float(np.percentile(steps, 95))
         print(f"{name:16} median {medians[name]:6.1f} µs   95 % {late:6.1f} µs   {ratio:5.2f} × {OPTIMISING}")
-    ratio = medians[PROPOSED] / medians[OPTIMISING]
-    print(f"{PROPOSED} / {OPTIMISING}: {ratio:.2f} (wanted below {FACTOR:g})")
-    if ratio >= FACTOR:
-        sys.exit(f"controller_steps: a step of {PROPOSED} costs {ratio:.2f} times one of {OPTIMISING}")
+    ratios = {name: medians[name] / medians[OPTIMISING] for name in PROPOSED}
+    for name, ratio in ratios.items():
+        print(f"{name} / {OPTIMISING}: {ratio:.2f} (wanted below {FACTOR:g})")
+    dear = [f"{name} costs {ratio:.2f} times" for name, ratio in ratios.items() if ratio >= FACTOR]
+    if dear:
+        sys.exit(f"controller_steps: a step of {', of '.join(dear)} one of {OPTIMISING}")
 
 
 if __name__ == "__main__":

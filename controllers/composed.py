@@ -18,6 +18,7 @@ from controllers.estimators.constant import ConstantConfig, ConstantEstimator
 from controllers.estimators.estimator import Estimator
 from controllers.estimators.kalman import KalmanConfig, KalmanEstimator
 from controllers.estimators.rbf import RbfConfig, RbfEstimator
+from controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
 from controllers.estimators.rls import RlsConfig, RlsEstimator
 from controllers.estimators.true import TrueConfig, TrueEstimator
@@ -28,6 +29,7 @@ from controllers.laws.mfac import MfacConfig, MfacLaw
 from controllers.laws.mpc import MpcConfig, MpcLaw
 from controllers.laws.pid import PidConfig, PidLaw
 from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
 from controllers.network_file import TrainedNetworks
 from controllers.servo import ServoController
 from controllers.training import obtain_networks
@@ -81,6 +83,12 @@ ESTIMATORS: dict[str, EstimatorEntry] = {
         RbfLyapunovConfig,
         lambda config, knowledge: RbfLyapunovEstimator(config, _default_networks(knowledge).jacobian),
     ),
+    "rbf_aligned": EstimatorEntry(
+        RbfAlignedConfig,
+        lambda config, knowledge: RbfAlignedEstimator(
+            config, _default_networks(knowledge).jacobian, knowledge.spec.period
+        ),
+    ),
     "cfdl": EstimatorEntry(CfdlConfig, lambda config, _knowledge: CfdlEstimator(config)),
 }
 
@@ -90,6 +98,9 @@ LAWS: dict[str, LawEntry] = {
     "mpc": LawEntry(MpcConfig, MpcLaw),
     "rbfnn": LawEntry(
         RbfnnConfig, lambda config, knowledge: RbfnnLaw(config, _default_networks(knowledge).controller, knowledge)
+    ),
+    "rbfnn_bridged": LawEntry(
+        RbfnnBridgedConfig, lambda config, knowledge: RbfnnBridgedLaw(config, _default_networks(knowledge), knowledge)
     ),
 }
 

@@ -80,6 +80,7 @@ class ServoController(Controller):
         J = self._jacobian = self.estimator.jacobian(observation.joint_position)
         if not np.isfinite(J).all():
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
+        self.law.expect_delay(self.estimator.delay())
         u = self.law.command(J, observation, reference)
         if not np.isfinite(u).all():
             raise ControllerDiverged(

@@ -27,6 +27,7 @@ PLANTS = {
 MAPPED = "fmu:"
 CONTROLLERS = {
     "rbfnn_mfac": "controllers.rbfnn_mfac:ENTRY",
+    "rbfnn_mfac_plus": "controllers.rbfnn_mfac_plus:ENTRY",
     "ukf_mfac": "controllers.ukf_mfac:ENTRY",
     "ukf_mpc": "controllers.ukf_mpc:ENTRY",
     "rbf_pid": "controllers.rbf_pid:ENTRY",

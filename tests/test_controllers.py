@@ -7,7 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controllers import broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rbf_pid, rbfnn_mfac, rls, ukf_mfac
+from controllers import (
+    broyden,
+    calibrated,
+    cfdl_mfac,
+    constant,
+    kalman_mfac,
+    rbf_pid,
+    rbfnn_mfac,
+    rbfnn_mfac_plus,
+    rls,
+    ukf_mfac,
+)
 from controllers.composed import ESTIMATORS, LAWS, compose, servo_entry
 from controllers.controller import RobotKnowledge
 from controllers.initial import InitialConfig
@@ -17,7 +28,18 @@ from controllers.training_config import ControllerTraining, JacobianTraining
 from harness.defaults import default_config
 from plant.signals import Observation, PlantSpec
 
-MODULES = (broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rbf_pid, rbfnn_mfac, rls, ukf_mfac)
+MODULES = (
+    broyden,
+    calibrated,
+    cfdl_mfac,
+    constant,
+    kalman_mfac,
+    rbf_pid,
+    rbfnn_mfac,
+    rbfnn_mfac_plus,
+    rls,
+    ukf_mfac,
+)
 PRESETS = [module.ENTRY for module in MODULES]
 PAIRS = [compose(law, estimator) for law in sorted(LAWS) for estimator in sorted(ESTIMATORS)]
 ENTRIES = [pytest.param(entry, id=entry.name) for entry in PRESETS + PAIRS]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from controllers import rbf_pid, rbfnn_mfac
+from controllers import rbf_pid, rbfnn_mfac, rbfnn_mfac_plus
 from controllers.controller import RobotKnowledge
 from controllers.network_file import FORMAT, TrainedNetworks, load_networks, save_networks
 from controllers.networks import ControllerNetwork, JacobianNetwork, jacobian_features, jacobian_output
@@ -256,16 +256,16 @@ def test_an_empty_region_means_the_one_in_which_the_robot_works(networks):
         obtain_networks(CONFIG, knowledge(nominal_jacobian=None))
 
 
-def test_both_presets_take_their_networks_from_the_harness(networks):
+def test_all_presets_take_their_networks_from_the_harness(networks):
     asked = []
 
     def source(config):
         asked.append(config)
         return networks
 
-    for preset in (rbfnn_mfac, rbf_pid):
+    for preset in (rbfnn_mfac, rbfnn_mfac_plus, rbf_pid):
         preset.ENTRY.build(preset.ENTRY.config(), knowledge(train=source))
-    assert asked[0] == asked[1]
+    assert asked[0] == asked[1] == asked[2]
     assert asked[0].lower == (0.5,) * N
 
 
@@ -273,7 +273,7 @@ def test_networks_of_another_robot_are_refused_at_construction(networks):
     names = tuple("abcdef"), tuple("xyz")
     other = PlantSpec(*names, np.ones(6), np.full(6, -6.0), np.full(6, 6.0), PERIOD)
     told = knowledge(spec=other, train=lambda config: networks)
-    for preset in (rbfnn_mfac, rbf_pid):
+    for preset in (rbfnn_mfac, rbfnn_mfac_plus, rbf_pid):
         with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
             preset.ENTRY.build(preset.ENTRY.config(), told)
 

@@ -43,6 +43,10 @@ class Estimator(ABC):
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad, as an (m, n) array in m/rad that the caller may keep."""
 
+    def delay(self) -> int:
+        """Return by how many periods features are older than joint positions, as far as it is estimated; 0 if not."""
+        return 0
+
     @abstractmethod
     def diagnostics(self) -> Diagnostics:
         """Return named numbers about the last update; for the log only."""

@@ -30,6 +30,9 @@ class Law(ABC):
             (n,), rad/s, within the joint-speed limits.
         """
 
+    def expect_delay(self, delay: int) -> None:  # noqa: B027 - most laws bridge no delay
+        """Be told before a command by how many periods features are late; a law that bridges no delay ignores it."""
+
     @abstractmethod
     def diagnostics(self) -> Diagnostics:
         """Return named numbers about the last command; for the log only."""

@@ -89,6 +89,11 @@ class RbfnnLaw(Law):
         """W as it is now, (n, p, N_h); a copy."""
         return np.asarray(self._network.weights + self._learned)
 
+    @property
+    def wanted(self) -> FloatArray:
+        """The joint step of the last command before it was limited, (n,), rad."""
+        return self._wanted
+
     def _forget(self) -> None:
         self._learned = np.zeros(self._network.weights.shape)
         self._errors: FloatArray | None = None

@@ -1,0 +1,100 @@
+"""How what is seen relates to what a model says: a linear map and a delay, both estimated online.
+
+For each candidate delay d = 0 … D a filter of its own holds a map M, (m, m), and a covariance P, (m, m), that the rows
+of M share. x_d is the feature step that the model predicts for the joint motion d periods ago:
+
+    Δy = M x_d + v,   v ~ N(0, r I),   r = 2σ² + c² ‖x_d‖²             noise of two frames, and error of the model
+    ν = Δy − M x_d,   s = r + x_dᵀ P x_d
+    M ← M + ν (P x_d)ᵀ / s,   P ← P − (P x_d)(P x_d)ᵀ / s
+
+This is recursive least squares; with P⁻¹ = 0 at first, constant r and no walk of P it is batch least squares. The
+candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
+
+    ℓ_d = Σ ‖ν‖² / s + m ln s
+
+All functions are pure; the leading axis runs over the candidates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dgesdd, dposv
+
+from controllers.controller import FilterDiverged
+from plant.signals import FloatArray
+
+
+def map_update(
+    M: FloatArray, P: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Learn from one motion under every candidate delay.
+
+    Args:
+        M: maps, (D, m, m).
+        P: covariances, (D, m, m).
+        x: feature steps that the model predicts, (D, m), m.
+        feature_step: Δy, (m,), m.
+        variance: r, (D,), m², positive.
+
+    Returns:
+        The new M and P; ‖ν‖²/s, (D,), what was seen against what was expected; and s, (D,), m².
+    """
+    Px = np.matmul(P, x[:, :, None])[:, :, 0]
+    s = variance + np.add.reduce(x * Px, axis=1)
+    nu = feature_step - np.matmul(M, x[:, :, None])[:, :, 0]
+    gain = Px / s[:, None]
+    renewed = M + nu[:, :, None] * gain[:, None, :]
+    return renewed, P - Px[:, :, None] * gain[:, None, :], np.add.reduce(nu * nu, axis=1) / s, s
+
+
+def nearest_rotation(M: FloatArray) -> FloatArray:
+    """Return the rotation R, (m, m), nearest to M, (m, m), in the Frobenius norm: it maximises trace(RᵀM)."""
+    left, _, right, failed = dgesdd(M)
+    if failed:
+        raise FilterDiverged(f"map has no nearest rotation: {M.tolist()}")
+    R: FloatArray = left.dot(right)
+    if _determinant(R) < 0.0:
+        left[:, -1] = -left[:, -1]
+        R = left.dot(right)
+    return R
+
+
+def _determinant(R: FloatArray) -> float:
+    if len(R) != 3:
+        return float(np.linalg.det(R))
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+
+
+def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:
+    """Complete a map by the belief that it is nearly a rotation: where P is large, M says little.
+
+    With the belief that an entry of the map is N(R, ς²) what is measured is M ~ N(R, P + ς² I) by rows, so that
+
+        R = argmin ‖(M − R) (P + ς² I)^(−½)‖_F, the rotation nearest to M (P + ς² I)⁻¹
+        M̄ = R + (M − R) ς² (P + ς² I)⁻¹
+
+    Directions count by what is known of them: two known directions of three give the third.
+
+    Args:
+        M: (m, m).
+        P: (m, m), positive definite.
+        deviation: ς, of an entry of the map from the rotation; 0 for the rotation itself.
+
+    Returns:
+        M̄ and R.
+
+    Raises:
+        FilterDiverged: P is not positive definite.
+    """
+    m = len(P)
+    believed = P.copy()
+    believed.flat[:: m + 1] += deviation**2
+    _, weighted, failed = dposv(believed, M.T)
+    if failed:
+        raise FilterDiverged(f"covariance of the map is not positive definite: {P.tolist()}")
+    R = nearest_rotation(weighted.T)
+    if deviation == 0.0:
+        return R, R
+    _, kept, _ = dposv(believed, deviation**2 * (M - R).T)
+    return np.asarray(R + kept.T), R

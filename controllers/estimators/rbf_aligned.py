@@ -1,0 +1,220 @@
+"""Estimator of `rbfnn_mfac_plus`: the Jacobian network seen through an estimated map and with an estimated delay.
+
+    Ĵ(q) = M̄ Ĵ_net(q),   Δy(k) ≈ M̄ Ĵ_net Δq(k − d)
+
+The network knows the arm, the map M the camera: a turned camera is a rotation in front of the whole Jacobian, which a
+map learns from two motions and a network not at all. Not in the paper.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from controllers.controller import Diagnostics
+from controllers.estimators.estimator import Estimator, Motion
+from controllers.estimators.map_bank import map_update, near_rotation
+from controllers.estimators.noise_level import NoiseLevel
+from controllers.estimators.rbf import RbfConfig, RbfEstimator
+from controllers.networks import JacobianNetwork
+from plant.signals import FloatArray, check_number
+
+LONGEST = 14  # periods of latency that a law remembers joint positions for
+ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
+JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm
+JUMP_NOISE = 10.0  # σ, beyond which it is no noise either
+LARGEST_SURPRISE = 50.0  # ‖ν‖²/s beyond which a single motion counts no more against a delay
+USUAL_SURPRISE = 3.0  # ‖ν‖²/(s m) of a motion up to which nothing is suspected; 1 is expected
+LARGEST_SUSPICION = 10.0  # of one motion, so that one outlier alone is below the gate
+
+
+@dataclass(frozen=True)
+class RbfAlignedConfig:
+    """Settings of the network's update, of the map and of the delay."""
+
+    window: int = 8  # T, motions that the network learns from at once
+    k2: float = 0.5  # k₂, step size of the network, 0 < k₂ < 2
+    epsilon: float = 1e-3  # ε, rad², as for `rbf`
+    learn: bool = True  # let the network learn online, from what the map's rotation takes into its frame
+    align: bool = True  # estimate the map; False: M = I
+    initial_deviation: float = 1.0  # of an entry of M = I at first: any camera is possible
+    walk: float = 0.3  # w, 1/√m: deviation of an entry of M after the feature has moved by a metre
+    model_error: float = 0.1  # c, share of a step that the model does not explain
+    rotation_deviation: float = 0.2  # ς, of an entry of M from the nearest rotation; 0: M is the rotation
+    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
+    find_noise: bool = True  # estimate σ; False: it is as given
+    confidence: float = 0.5  # deviation of an entry of M below which the network learns
+    find_delay: bool = True  # estimate the delay; False: 0
+    longest_delay: int = 5  # D, periods
+    forgetting: float = 0.97  # γ, of a candidate's score a motion
+    margin: float = 6.0  # by how much a delay must be the better one, in −2 log likelihood
+    detect_moves: bool = True  # forget what is known of the map when the camera seems to have been moved
+    gate: float = 12.0  # sum of surprises (CUSUM) beyond which it does
+
+    def __post_init__(self) -> None:
+        """Check the numbers; the network's are checked by `RbfConfig`."""
+        RbfConfig(self.window, self.k2, self.epsilon)
+        for name in ("initial_deviation", "feature_noise", "confidence", "gate"):
+            check_number(name, getattr(self, name), above=0.0)
+        for name in ("walk", "model_error", "rotation_deviation", "margin"):
+            check_number(name, getattr(self, name), at_least=0.0)
+        check_number("longest_delay", self.longest_delay, at_least=0, at_most=LONGEST)
+        check_number("forgetting", self.forgetting, above=0.0, at_most=1.0)
+
+
+@final
+class RbfAlignedEstimator(Estimator):
+    """Jacobian network, map and delay.
+
+        P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← map_update(x_d, Δy)   for each delay d   (`map_bank`)
+        d = argmin ℓ_d with forgetting γ, once it is the better one by a margin
+        M̄, R = near_rotation(M_d, P_d);   the network learns from (Δq(k−d), RᵀΔy) as in `rbf`
+
+    with x_d = Ĵ_net Δq(k−d). Symbols: M map (m, m); P its covariance (m, m); R rotation (m, m); d delay, periods; σ m.
+
+    P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
+    explains, from which nothing is learned, or surprises that add up, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
+    gate. M stays, as the best guess.
+    """
+
+    def __init__(self, config: RbfAlignedConfig, network: JacobianNetwork, period: float) -> None:
+        """Start from the offline `network`; `period` is the control period, s."""
+        self._config = config
+        self._network = RbfEstimator(RbfConfig(config.window, config.k2, config.epsilon), network)
+        self._period = period
+        self._eye = np.eye(network.m)
+        self._n, self._m = network.n, network.m
+        self._candidates = 1 + (config.longest_delay if config.find_delay else 0)
+        self._forget()
+
+    def _forget(self) -> None:
+        eye, config = self._eye, self._config
+        self._M: FloatArray = np.repeat(eye[None], self._candidates, axis=0)
+        self._P0 = (config.initial_deviation**2 if config.align else 0.0) * self._M
+        self._P = self._P0.copy()
+        self._scores = np.zeros(self._candidates)
+        self._noise = NoiseLevel(config.feature_noise)
+        self._delay = 0
+        self._map, self._rotation = eye, eye
+        self._past: FloatArray | None = None  # rows [q, Σ x], a row a period, the newest last
+        self._moves = 0
+        self._key, self._latest = b"", np.zeros((self._m, self._n))
+        self._surprise = self._suspicion = 0.0
+
+    @property
+    def map(self) -> FloatArray:
+        """M̄ as it is now, (m, m); a copy."""
+        return self._map.copy()
+
+    @property
+    def covariance(self) -> FloatArray:
+        """P of the present delay, (m, m); a copy."""
+        return np.array(self._P[self._delay])
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Forget everything and restore the offline network; see `RbfEstimator.reset`."""
+        self._network.reset(jacobian)
+        self._forget()
+
+    def delay(self) -> int:
+        """Return d, periods."""
+        return self._delay
+
+    def update(self, motion: Motion) -> None:
+        """Learn map, delay and network from one motion."""
+        config, n, periods = self._config, self._n, max(1, round(motion.duration / self._period))
+        if periods > ROOM:
+            self._past = None
+            return
+        past, last = self._extended_past(motion, periods), self._candidates + ROOM
+        passed = (
+            past[last : last - self._candidates : -1] - past[last - periods : last - periods - self._candidates : -1]
+        )
+        x = passed[:, n:]
+        square = np.add.reduce(x * x, axis=1)
+        if config.detect_moves and self._jumped(square, motion.feature_step):
+            self._expect_any_map()
+            if config.find_noise:
+                self._noise.learn(float(motion.feature_step @ motion.feature_step) / self._m, 2.0, 0.0)
+            return
+        if config.align or config.find_delay:
+            self._learn_map(x, square, motion.feature_step)
+        if config.learn and self._P[self._delay].trace() < self._m * config.confidence**2:
+            begin = past[last - self._delay - periods, :n]
+            step, seen = passed[self._delay, :n], self._rotation.T @ motion.feature_step
+            self._key = b""
+            self._network.update(Motion(begin, step, seen, motion.error, motion.duration))
+
+    def jacobian(self, joint_position: FloatArray) -> FloatArray:
+        """Return M̄ Ĵ_net at `joint_position` (n,), rad."""
+        return np.asarray(self._map.dot(self._network_jacobian(joint_position)))
+
+    def diagnostics(self) -> Diagnostics:
+        """Return what the network tells, and delay, rotation (rad), deviation and surprise of the map, moves."""
+        cosine = min(1.0, max(-1.0, 1.0 - 0.25 * float(np.sum((self._rotation - self._eye) ** 2))))
+        return {
+            **self._network.diagnostics(),
+            "delay": float(self._delay),
+            "map_rotation": math.acos(cosine),
+            "map_deviation": math.sqrt(float(np.trace(self._P[self._delay])) / self._m),
+            "map_surprise": self._surprise,
+            "camera_moves": float(self._moves),
+            "noise_level": math.sqrt(self._noise.variance),
+        }
+
+    def _network_jacobian(self, q: FloatArray) -> FloatArray:
+        """Return Ĵ_net, (m, n), at q; it is asked for several times at the same place between two updates."""
+        key = q.tobytes()
+        if key != self._key:
+            self._key, self._latest = key, self._network.jacobian(q)
+        return self._latest
+
+    def _extended_past(self, motion: Motion, periods: int) -> FloatArray:
+        """Return the past up to now, (candidates + ROOM + 1, n + m): in a gap the joints moved evenly."""
+        q, dq, n = motion.joint_position, motion.joint_step, self._n
+        if self._past is None:  # the arm was at rest
+            self._past = np.zeros((self._candidates + ROOM + 1, n + self._m))
+            self._past[:, :n] = q
+        begin = np.concatenate([q, self._past[-1, n:]])
+        step = np.concatenate([dq, self._network_jacobian(q).dot(dq)])
+        share = np.arange(1, periods + 1)[:, None] / periods if periods > 1 else 1.0
+        added = np.atleast_2d(begin + step * share)
+        self._past = np.concatenate([self._past[periods:], added])
+        return self._past
+
+    def _jumped(self, square: FloatArray, feature_step: FloatArray) -> bool:
+        reach = math.sqrt(max(square.tolist()))
+        seen = math.sqrt(float(feature_step @ feature_step))
+        return seen > JUMP_SHARE * reach + JUMP_NOISE * math.sqrt(self._noise.variance)
+
+    def _expect_any_map(self) -> None:
+        self._P, self._suspicion, self._moves = self._P0.copy(), 0.0, self._moves + 1
+
+    def _learn_map(self, x: FloatArray, square: FloatArray, feature_step: FloatArray) -> None:
+        """Update map, covariance and score of every delay, and choose among them."""
+        config, m = self._config, self._m
+        variance = 2.0 * self._noise.variance + config.model_error**2 * square
+        if config.align:
+            self._P = self._P + (config.walk**2 * np.sqrt(square))[:, None, None] * self._eye
+            excess = self._P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
+            if max(excess.tolist()) > 1.0:
+                self._P /= np.maximum(excess, 1.0)[:, None, None]
+        M, P, surprise, s = map_update(self._M, self._P, x, feature_step, variance)
+        self._surprise, expected = float(surprise[self._delay]) / m, float(s[self._delay])
+        if config.find_noise:
+            self._noise.learn(self._surprise * expected, 2.0, expected - 2.0 * self._noise.variance)
+        self._suspicion = max(0.0, self._suspicion + min(self._surprise, LARGEST_SUSPICION) - USUAL_SURPRISE)
+        if config.detect_moves and self._suspicion > config.gate:
+            self._expect_any_map()
+            M, P, _, _ = map_update(self._M, self._P, x, feature_step, variance)
+        self._M, self._P = M, P
+        self._scores = config.forgetting * self._scores + np.minimum(surprise, LARGEST_SURPRISE) + m * np.log(s)
+        best = int(self._scores.argmin())
+        if self._scores[best] < self._scores[self._delay] - config.margin:
+            self._delay = best
+        if config.align:
+            d = self._delay
+            self._map, self._rotation = near_rotation(self._M[d], self._P[d], config.rotation_deviation)

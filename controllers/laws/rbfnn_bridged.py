@@ -1,0 +1,232 @@
+"""Law of `rbfnn_mfac_plus`: the proposed law on a feature that is predicted past all delays. Not in the paper.
+
+    ŷ = z + Ĵ (q(k) − q(k−d) + flight)              where the feature will be when all commands are done
+    q̂ = q(k) + flight                               and the joints
+    e = y_ref(k + lead) − ŷ                         against the reference of that time
+    dq = law(e, q̂) + Ĵ⁺ (y_ref(k + lead + 1) − y_ref(k + lead))
+
+z is the feature at its exposure, d periods ago (`feature_filter`); flight and lead are what commands have not yet done
+(`joint_response`); the law is that of `learned_correction`, or the unchanged one of `rbfnn_mfac` in the frame of the
+model that its networks were trained on. What exceeds the limits of joint speed is redistributed (`redistribution`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, final, get_args
+
+import numpy as np
+
+from controllers.controller import Diagnostics, RobotKnowledge
+from controllers.estimators.map_bank import nearest_rotation
+from controllers.estimators.noise_level import NoiseLevel
+from controllers.laws.feature_filter import FeatureFilter
+from controllers.laws.joint_response import JointResponse
+from controllers.laws.law import Law, scale_to_limit
+from controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
+from controllers.laws.pid import damped_inverse
+from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from controllers.laws.redistribution import redistribute
+from controllers.network_file import TrainedNetworks
+from plant.signals import FloatArray, Observation, check_number
+
+Base = Literal["jacobian", "network"]
+BASES: tuple[str, ...] = get_args(Base)
+LEARNED = ("criterion", "step_size", "predicted_error", "learned_weight_norm")  # diagnostics that both bases have
+PAST = 16  # instants of joint positions that are kept, more than any delay
+
+
+@dataclass(frozen=True)
+class RbfnnBridgedConfig:
+    """Settings of the law; each addition to `rbfnn` can be switched off."""
+
+    base: Base = "jacobian"  # what is learned upon: Ĵ⁺ as estimated; "network": the offline network, as in `rbfnn`
+    horizon: int = 2  # T, predicted periods; take 8 with base "network"
+    k: float = 0.1  # share of the predicted error that one update removes, 0 ≤ k < 2; 0 learns nothing
+    epsilon: float = 1e-3  # ε, m⁴
+    leak: float = 0.02  # l, share of what was learned that is forgotten a period; base "jacobian" only
+    gain: float = 14.0  # K_p, 1/s: the error shrinks by exp(−K_p dt) a period; base "jacobian" only
+    posture_gain: float = 0.2  # K_n, 1/s, towards the middle of the training region; base "jacobian" only
+    damping: float = 0.02  # δ, m/rad, of every inverse of Ĵ
+    frame: bool = True  # take the law into the frame of the networks' model; base "network" only
+    bridge: bool = True  # predict past the camera's delay and past what was commanded and not yet done
+    response_length: int = 12  # N, periods within which joints answer a command
+    observe: bool = True  # filter the feature by the joints' motion
+    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
+    find_noise: bool = True  # estimate σ; False: it is as given
+    model_error: float = 0.2  # c, share of a feature step that Ĵ gets wrong
+    feedforward: bool = True  # add the reference's own motion; needs a preview of at least 1
+    redistribute: bool = True  # let joints with room make up for those at their limit
+
+    def __post_init__(self) -> None:
+        """Check the numbers and the choice."""
+        check_number("horizon", self.horizon, at_least=1)
+        check_number("k", self.k, at_least=0.0, below=2.0)
+        check_number("response_length", self.response_length, at_least=1)
+        check_number("leak", self.leak, at_least=0.0, at_most=1.0)
+        for name in ("gain", "damping", "feature_noise"):
+            check_number(name, getattr(self, name), above=0.0)
+        for name in ("epsilon", "posture_gain", "model_error"):
+            check_number(name, getattr(self, name), at_least=0.0)
+        if self.base not in BASES:
+            raise ValueError(f"base must be one of {', '.join(BASES)}, got {self.base!r}")
+        if self.base == "network" and self.k == 0.0:
+            raise ValueError("k must be above 0 for base 'network', got 0")
+
+    def gains(self, period: float) -> CorrectionGains:
+        """Return what the base "jacobian" needs, for a control period, s."""
+        return CorrectionGains(
+            self.horizon,
+            self.k,
+            self.epsilon,
+            self.leak,
+            1.0 - math.exp(-self.gain * period),
+            1.0 - math.exp(-self.posture_gain * period),
+            self.damping,
+        )
+
+
+@final
+class RbfnnBridgedLaw(Law):
+    """u = dq / dt with dq as above, limited such that the feature's direction stays.
+
+    Symbols: e error (m,) m; q joint position (n,) rad; Ĵ (m, n) m/rad; z, ŷ feature (m,) m; d delay of the camera,
+    periods, as the estimator tells it; lead, periods, a fraction: between two instants the reference is interpolated,
+    beyond the preview it goes on as in its last period.
+    """
+
+    def __init__(self, config: RbfnnBridgedConfig, networks: TrainedNetworks, knowledge: RobotKnowledge) -> None:
+        """Take the settings, the offline networks, limits, period and preview.
+
+        Raises:
+            ValueError: networks that do not fit, a preview that is too short.
+        """
+        spec, network = knowledge.spec, networks.controller
+        if (network.n, network.m) != (spec.n, spec.m):
+            raise ValueError(
+                f"network must be of {spec.n} joints and {spec.m} features, got {network.n} and {network.m}"
+            )
+        if config.feedforward and knowledge.preview < 1:
+            raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
+        self._config, self._period = config, spec.period
+        self._n, self._m = spec.n, spec.m
+        self._limit: FloatArray = spec.joint_velocity_limit * spec.period
+        self._model = networks.jacobian
+        centres = networks.jacobian.centres
+        self._region = centres.min(axis=(0, 1)), centres.max(axis=(0, 1))  # where the networks were trained
+        if config.base == "network":
+            settings = RbfnnConfig(config.horizon, config.k, config.epsilon, preview=not config.feedforward)
+            self._law: LearnedCorrection | RbfnnLaw = RbfnnLaw(settings, network, knowledge)
+        else:
+            posture = centres.mean(axis=(0, 1))
+            self._law = LearnedCorrection(config.gains(spec.period), network, posture, self._limit)
+        self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
+        self._delay = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._response = JointResponse(self._config.response_length, self._n)
+        self._filter: FeatureFilter | None = None
+        self._noise = NoiseLevel(self._config.feature_noise)
+        self._filtered_delay = 0
+        self._past: FloatArray | None = None  # q(k), q(k−1), …
+        self._wanted = np.zeros(self._n)
+
+    def reset(self, observation: Observation) -> None:
+        """Forget everything that was learned and seen."""
+        self._law.reset(observation)
+        self._delay = 0
+        self._forget()
+
+    def expect_delay(self, delay: int) -> None:
+        """Take the camera's delay, periods, for the next command."""
+        self._delay = min(delay, PAST - 2)
+
+    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+        """Return u, (n,), rad/s; see `Law.command`."""
+        config = self._config
+        past = self._extended_past(observation.joint_position)
+        delay, flight, lead = 0, np.zeros(self._n), 0.0
+        if config.bridge:
+            self._response.learn(past[0] - past[1])
+            delay, flight, lead = self._delay, self._response.flight(), self._response.lead
+        seen = self._seen(jacobian, past, delay, observation)
+        ahead, q = seen + jacobian @ (past[0] - past[delay] + flight), past[0] + flight
+        wanted = self._wanted = self._wanted_step(jacobian, ahead, q, shifted(reference, lead, self._rows), observation)
+        if config.redistribute:
+            lower, upper = self._region
+            further = np.maximum(q - lower, 0.0), np.maximum(upper - q, 0.0)
+            dq = redistribute(wanted, jacobian, self._limit, config.damping, further)
+        else:
+            dq = scale_to_limit(wanted, self._limit)
+        self._response.command(dq)
+        return dq / self._period
+
+    def diagnostics(self) -> Diagnostics:
+        """Return criterion, α, predicted error, norm of what was learned, lead (periods), saturation."""
+        told = self._law.diagnostics()
+        saturated = float(np.max(np.abs(self._wanted) / self._limit) > 1.0)
+        lead = self._response.lead if self._config.bridge else 0.0
+        return {**{name: told[name] for name in LEARNED}, "lead": lead, "saturated": saturated}
+
+    def _extended_past(self, joint_position: FloatArray) -> FloatArray:
+        if self._past is None:  # the arm was at rest
+            self._past = np.repeat(joint_position[None], PAST, axis=0)
+        else:
+            self._past = np.concatenate([joint_position[None], self._past[:-1]])
+        return self._past
+
+    def _seen(self, jacobian: FloatArray, past: FloatArray, delay: int, observation: Observation) -> FloatArray:
+        """Return z, (m,), m: where the feature was at its exposure, `delay` periods ago."""
+        config, y = self._config, observation.feature
+        if not config.observe:
+            return y
+        if self._filter is None or delay != self._filtered_delay:
+            self._filter = FeatureFilter(self._noise, config.model_error, y, find_noise=config.find_noise)
+            self._filtered_delay = delay
+        else:
+            step = jacobian @ (past[delay] - past[delay + 1])
+            self._filter.advance(step, y if observation.feature_valid else None)
+        return self._filter.feature
+
+    def _wanted_step(
+        self, jacobian: FloatArray, y: FloatArray, q: FloatArray, reference: FloatArray, observation: Observation
+    ) -> FloatArray:
+        """Return the joint step before it is limited, (n,), rad, for predicted feature and joints."""
+        config, law, forward = self._config, self._law, np.zeros(self._m)
+        if config.feedforward:
+            forward = reference[1] - reference[0]
+        if isinstance(law, LearnedCorrection):
+            return law.step(jacobian, reference[0] - y, q, forward, observation.feature_valid)
+        if config.feedforward:
+            reference = np.repeat(reference[:1], len(reference), axis=0)
+        F = self._frame(jacobian, q)
+        predicted = Observation(observation.time, q, F @ y, observation.feature_valid)
+        law.command(F @ jacobian, predicted, reference @ F.T)
+        return np.asarray(law.wanted + damped_inverse(jacobian, config.damping) @ forward)
+
+    def _frame(self, jacobian: FloatArray, q: FloatArray) -> FloatArray:
+        """Return the rotation from the camera's frame into that of the model, (m, m): the nearest of Ĵ to the model."""
+        if not self._config.frame:
+            return np.eye(self._m)
+        return nearest_rotation(self._model.jacobian(q) @ jacobian.T)
+
+
+def shifted(reference: FloatArray, lead: float, rows: int) -> FloatArray:
+    """Return the reference `lead` periods later, (rows, m): interpolated, and extrapolated beyond its end.
+
+    Args:
+        reference: (1 + preview, m), m.
+        lead: periods, at least 0.
+        rows: how many instants are wanted, at most 1 + preview.
+    """
+    if lead == 0.0 or len(reference) == 1:
+        return reference[:rows]
+    whole = int(lead)
+    missing = whole + rows + 1 - len(reference)
+    if missing > 0:
+        further = np.arange(1, missing + 1)[:, None] * (reference[-1] - reference[-2])
+        reference = np.concatenate([reference, reference[-1] + further])
+    before = reference[whole : whole + rows]
+    return np.asarray(before + (lead - whole) * (reference[whole + 1 : whole + 1 + rows] - before))
