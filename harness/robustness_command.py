@@ -18,6 +18,7 @@ from harness.registry import controller_names, find_controller, find_plant, plan
 from harness.robustness import TASK, draw_map, map_cells, moved_settings, number_of
 from harness.sweep_command import carry_out_sweep
 
+FIVE = "rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
 USUAL, MOVED, FIGURES = "usual", "moved", "figures"
 
 console = Console()
@@ -26,7 +27,7 @@ console = Console()
 def robustness(
     out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to go on with.")],
     plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
-    controllers: Annotated[str, typer.Option(help="Names by comma, or all.")] = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
+    controllers: Annotated[str, typer.Option(help="Names by comma, or all.")] = FIVE,
     seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "40",
     workers: Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler to send the runs to.")] = None,

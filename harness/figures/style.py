@@ -24,6 +24,7 @@ BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY, YELLOW, GREY, BLACK = (
     "#7F7F7F",
     "#000000",
 )
+WINE = "#882255"  # of Tol's palette, which goes with it
 
 
 MARKS = 8  # on each line
@@ -68,6 +69,7 @@ class MethodStyle:
 
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILLION, "-", "o"),
+    "rbfnn_mfac_plus": MethodStyle(WINE, "-", "*"),
     "ukf_mfac": MethodStyle(BLUE, "--", "s"),
     "ukf_mpc": MethodStyle(GREEN, "-.", "^"),
     "rbf_pid": MethodStyle(ORANGE, (0, (5, 1)), "D"),
