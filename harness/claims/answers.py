@@ -9,7 +9,7 @@ The rules, fixed before the runs were made:
 | 3 alike | in all tasks the interval of the paired difference in settling time lies within ±10 % of the median |
 | 4 leaving the region | it costs both RBF methods more time than it costs `ukf_mfac`, and the proposed one most |
 | 5 circle | the second lap stays within 10 mm RMS in more than 80 % of robots, lower end of the interval |
-| 6 cheaper | its median step is shorter than that of `ukf_mpc` in more than half of the moves |
+| 6 cheaper | its median step is shorter than that of `ukf_mpc` by a factor of 1.5, in the moves and on the circle |
 | 7 keeps up | learning online lowers the mean Jacobian error (p < 0.05 after Holm) in all five tasks |
 
 A rule that holds in none of its cases is *not reproduced*, one that holds in some *depends on* them. A run that never
@@ -60,6 +60,7 @@ from harness.statistics import (
 )
 
 ALIKE: Final = 0.10  # of the median settling time
+CLEARLY: Final = 1.5  # times: a ratio of times that is seen on every machine
 GOOD_CIRCLE: Final = 0.010  # m
 MOST: Final = 0.8
 
@@ -163,14 +164,23 @@ def _circle(tables: Tables, plant: str) -> Answer:
 
 
 def _cheaper(tables: Tables, plant: str) -> Answer:
-    runs = tables[MAIN][tables[MAIN]["task"].isin(MOVES)]
-    times = runs.pivot_table(index=["task", "seed"], columns="controller", values="controller_time_median_us")
-    ratio = times[PROPOSED] / times["ukf_mpc"]
-    cheaper = bool(ratio.median() < 1.0)
-    measured = Measurement("step time, proposed over ukf_mpc", "moves", PROPOSED, median_with_interval(ratio), cheaper)
-    word = "shorter" if cheaper else "longer"
-    evidence = f"its median step is {word} than that of ukf_mpc (the ratio on this machine is in measurements.csv)"
-    return answer("6", "its update costs less time than an optimising MPC", plant, [measured], evidence)
+    measured = []
+    for place, tasks in (("moves", MOVES), (CIRCLE, (CIRCLE,))):
+        runs = tables[MAIN][tables[MAIN]["task"].isin(tasks)]
+        times = runs.pivot_table(index=["task", "seed"], columns="controller", values="controller_time_median_us")
+        ratio = median_with_interval(times[PROPOSED] / times["ukf_mpc"])
+        holds = ratio.value < 1.0 / CLEARLY
+        measured.append(Measurement("step time, proposed over ukf_mpc", place, PROPOSED, ratio, holds))
+    words = ", ".join(f"{_in_words(m.estimate.value)} {m.place}" for m in measured)
+    evidence = f"its median step is {words} (a factor of {CLEARLY} counts; the ratios are in measurements.csv)"
+    return answer("6", "its update costs less time than an optimising MPC", plant, measured, evidence)
+
+
+def _in_words(ratio: float) -> str:
+    """Return a ratio of times in words that do not change from machine to machine."""
+    if ratio < 1.0 / CLEARLY:
+        return "clearly shorter than that of ukf_mpc in"
+    return "clearly longer than that of ukf_mpc in" if ratio > CLEARLY else "about as long as that of ukf_mpc in"
 
 
 def _keeps_up(tables: Tables, plant: str) -> Answer:
