@@ -20,12 +20,12 @@ from harness.replay import logged_run
 
 BATCH = Batch(
     plants=("bullet",),
-    controllers=("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid", "calibrated"),
+    controllers=("rbfnn_mfac_plus", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid", "calibrated"),
     tasks=("exp1", "exp2", "exp3", "exp4", "circle"),
     mismatches=("moderate",),
     seeds=(0,),
 )
-SHOWN = "bullet-rbfnn_mfac-circle-moderate-0"
+SHOWN = "bullet-rbfnn_mfac_plus-circle-moderate-0"
 PERIOD = 150  # of the run shown: three quarters of a lap
 FILES = {"errors": "errors", "tracking": "circle", "paths": "paths"}  # kind of figure -> name of its file
 COLOURS = 128  # of the rendered picture's palette

@@ -68,6 +68,19 @@ def write_rows(folder: Path, index: int, rows: list[dict[str, Any]]) -> None:
     _write_table(pa.Table.from_pandas(pd.DataFrame(rows), preserve_index=False), folder / PARTS / f"{index:08d}.{RUNS}")
 
 
+def write_summary(folder: Path, tables: dict[str, pd.DataFrame], manifest: dict[str, Any]) -> None:
+    """Make a folder that holds several sweeps a results folder itself: one table of all their runs.
+
+    Args:
+        folder: the folder.
+        tables: tables of runs by the name of the sweep; it becomes the column `part`.
+        manifest: of the whole.
+    """
+    runs = pd.concat([table.assign(part=name) for name, table in tables.items()], ignore_index=True)
+    _write_table(pa.Table.from_pandas(runs, preserve_index=False), folder / RUNS)
+    write_manifest(folder, manifest)
+
+
 def finished_parts(folder: Path) -> set[int]:
     """Return the indices of the parts that are there."""
     return {int(path.name.split(".")[0]) for path in _part_files(folder, RUNS)}

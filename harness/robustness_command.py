@@ -42,6 +42,8 @@ def robustness(
     for folder, cells, chosen in ((USUAL, usual, settings), (MOVED, moved, moved_settings(settings))):
         going_on = resume and (out / folder).exists()
         carry_out_sweep(cells, chosen, out / folder, workers, scheduler, resume=going_on)
+    tables = {part: results.load_runs(out / part) for part in (USUAL, MOVED)}
+    results.write_summary(out, tables, results.read_manifest(out / USUAL))
     files = draw_map(load_map(out), out / FIGURES)
     console.print(f"the map is in {files[0]}; tables in {out / USUAL} and {out / MOVED}", soft_wrap=True)
 

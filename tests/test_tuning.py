@@ -60,7 +60,8 @@ def flatten_nested(values):
 
 
 def test_every_controller_of_this_package_is_tuned_or_takes_the_values_of_one_that_is():
-    assert set(SPACES) | set(SAME_AS) == set(controller_names())
+    never = {"nmpc_calibrated"}  # a bound that does not look at the camera
+    assert set(SPACES) | set(SAME_AS) | never == set(controller_names())
     assert set(SAME_AS.values()) <= set(SPACES)
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from harness import results
 from harness.claims.answers import answer_all
 from harness.claims.figures import draw_answers
-from harness.claims.studies import studies
+from harness.claims.studies import MAIN, studies
 from harness.claims.table import ANSWERS, differences, markdown_table, read_answers, write_tables
 from harness.configuration import ConfigurationError
 from harness.options import split_names
@@ -50,6 +50,7 @@ def claims(
         (answer for plant in names for answer in answer_all(tables, plant)),
         key=lambda a: (not a.claim.isdigit(), a.claim),
     )
+    results.write_summary(out, {MAIN: tables[MAIN]}, results.read_manifest(out / MAIN))
     write_tables(answers, out)
     (out / "answers.md").write_text(markdown_table(answers), encoding="utf-8")
     figures = draw_answers(answers, out / "figures")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from harness.figures.panels import Styles, add_legend
 from harness.statistics import success_rate
 
-MAGNITUDE = re.compile(r"^(?P<axis>[a-z_]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
+MAGNITUDE = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}
 
 
@@ -50,21 +50,35 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
 
 
 def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return for each condition with at least two sizes the runs concerned, with the column `size`."""
+    """Return for each condition with at least two sizes the runs concerned, with the column `size`.
+
+    Where a sweep says along which axis a run stands, the axes are its own; else the mismatches are read.
+    """
+    axes = runs["axis"].fillna("") if "axis" in runs else pd.Series("", index=runs.index)
+    if (axes != "").any():
+        own = runs[axes != ""]
+        words = own["axis"].str.replace("_", " ") + "=" + own["magnitude"]
+        return _along_axes(own, words)
     sweeps = {
-        label: runs.assign(size=runs[name].astype(float))
+        label: runs[runs[name].notna()].assign(size=runs[name].dropna().astype(float))
         for name, label in NUMBERS.items()
         if name in runs and runs[name].nunique() > 1
     }
-    matches = runs["mismatch"].map(MAGNITUDE.match)
+    return sweeps | _along_axes(runs, runs["mismatch"])
+
+
+def _along_axes(runs: pd.DataFrame, words: pd.Series[str]) -> dict[str, pd.DataFrame]:
+    """Return the runs of each axis with at least two sizes; `words` say axis and size of each run, `links=10%`."""
+    matches = words.map(MAGNITUDE.match)
     found = runs[matches.notna()].assign(
         axis=[match["axis"] for match in matches if match],
         unit=[match["unit"] for match in matches if match],
         size=[float(match["size"]) for match in matches if match],
     )
-    none = runs[runs["mismatch"] == "none"].assign(size=0.0)
+    none = runs[words == "none"].assign(size=0.0)
+    sweeps = {}
     for (axis, unit), group in found.groupby(["axis", "unit"], sort=False):
         part = pd.concat([none, group]) if len(none) else group
         if part["size"].nunique() > 1:
-            sweeps[f"{str(axis).replace('_', ' ')} [{unit}]"] = part
+            sweeps[f"{str(axis).replace('_', ' ')} [{unit}]" if unit else str(axis)] = part
     return sweeps

@@ -57,6 +57,14 @@ SPACES: Final[Mapping[str, Space]] = {
         "estimator.epsilon": _log(1e-5, 1e-2),  # rad²
         "training.controller.gain": FloatDistribution(2.0, 5.0, step=1.0),  # 1/s; each value is a training of its own
     },
+    "rbfnn_mfac_plus": {
+        "law.gain": _log(4.0, 30.0),  # 1/s
+        "law.k": _log(0.01, 1.0),
+        "law.leak": FloatDistribution(0.0, 0.1),
+        "law.posture_gain": FloatDistribution(0.0, 1.0),  # 1/s
+        "estimator.walk": _log(0.03, 3.0),
+        "estimator.model_error": _log(0.01, 0.5),
+    },
     "ukf_mfac": {
         **_MFAC,
         "estimator.process_deviation": _log(0.001, 0.3),  # m/rad
