@@ -23,7 +23,7 @@ from harness.experiment import known_sections, train_networks
 from harness.figures import draw_figures
 from harness.fmu_commands import fmu_app
 from harness.manifest import describe_batch
-from harness.options import ConfigOption, SetOption, default_workers, split_names
+from harness.options import INTERRUPTED, ConfigOption, SetOption, split_names, split_words
 from harness.progress import run_progress
 from harness.record_command import record
 from harness.registry import controller_names, find_controller, find_plant, plant_names
@@ -35,8 +35,7 @@ from harness.sweep_command import sweep
 from harness.tasks import find_task, task_names
 from harness.training import cache_folder
 from harness.tune_command import tune
-
-INTERRUPTED = 130
+from harness.workers import default_workers
 
 app = typer.Typer(
     help="The bench on which uncalibrated visual-servoing controllers are compared.",
@@ -124,7 +123,7 @@ def compare(
         split_names("plants", plants, plant_names(), find_plant),
         split_names("controllers", controllers, controller_names(), find_controller),
         split_names("tasks", tasks, task_names(), find_task),
-        tuple(part.strip() for part in mismatch.split(",")),
+        split_words(mismatch),
         parse_seeds(seeds),
     )
     count = workers or default_workers()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -19,6 +18,7 @@ from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest, build_experiment, known_sections
 from harness.run import run_experiment
 from harness.seed_ranges import refuse_tuning_seeds
+from harness.workers import leave_interrupts_to_parent
 
 PICTURES = "pictures"
 
@@ -134,7 +134,7 @@ def _carry_out(
     index: int, request: RunRequest, settings: Settings, folder: Path, picture: bool, in_worker: bool
 ) -> dict[str, Any]:
     if in_worker:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+        leave_interrupts_to_parent()
     result = run_experiment(request, settings, picture=picture, keep=folder)
     results.write_part(folder, index, result.row, result.steps)
     if result.picture is not None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +10,7 @@ import typer
 
 from harness.configuration import ConfigurationError
 
-MAX_DEFAULT_WORKERS = 8
+INTERRUPTED = 130  # exit code after Ctrl-C
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
 SetOption = Annotated[
@@ -19,16 +18,16 @@ SetOption = Annotated[
 ]
 
 
-def default_workers() -> int:
-    """Return how many worker processes there are unless the user says otherwise."""
-    return min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
+def split_words(text: str) -> tuple[str, ...]:
+    """Return the words in a list by comma, each once."""
+    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
 
 
-def split_names(kind: str, text: str, known: list[str], find: Callable[[str], Any]) -> tuple[str, ...]:
-    """Return the names in a list by comma, each of which `find` knows."""
+def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
+    """Return the names in a list by comma, each of which `find` knows; `all` for those in `known`."""
     if text.strip() == "all":
         return tuple(known)
-    names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    names = split_words(text)
     if not names:
         raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:

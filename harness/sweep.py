@@ -10,7 +10,6 @@ then carried out alone, run by run, each in a process of its own; the culprit be
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -28,6 +27,7 @@ from harness.compare import Batch
 from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest
 from harness.run import crashed_row, run_experiment
+from harness.workers import leave_interrupts_to_parent
 from plant.mismatch import magnitude_texts
 
 CHUNK = 8  # runs; small enough to lose little, large enough that files and messages cost nothing
@@ -145,13 +145,15 @@ def run_sweep(cells: Sequence[Cell], settings: Settings, folder: Path, backend: 
     while missing:
         try:
             for index, rows in _run_together(missing, under_way, settings, backend):
-                yield _keep(folder, index, rows)
+                results.write_rows(folder, index, rows)
                 del missing[index]
+                yield rows
         except backend.lost:  # a run killed its worker
             for index in sorted(under_way & missing.keys()):
                 rows = [_carry_out_alone(cell, settings) for cell in missing[index].cells]
-                yield _keep(folder, index, rows)
+                results.write_rows(folder, index, rows)
                 del missing[index]
+                yield rows
 
 
 def _run_together(
@@ -169,22 +171,10 @@ def _run_together(
         yield from parallel(jobs())
 
 
-def _keep(folder: Path, index: int, rows: list[Row]) -> list[Row]:
-    results.write_rows(folder, index, rows)
-    return rows
-
-
 def _carry_out(chunk: Chunk, settings: Settings, in_worker: bool) -> tuple[int, list[Row]]:
     if in_worker:
-        _leave_interrupts_to_parent()
+        leave_interrupts_to_parent()
     return chunk.index, [_row(cell, settings) for cell in chunk.cells]
-
-
-def _leave_interrupts_to_parent() -> None:
-    try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # a cluster's worker runs this in a thread; it is not stopped from this terminal
-        return
 
 
 def _row(cell: Cell, settings: Settings) -> Row:

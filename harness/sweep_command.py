@@ -12,17 +12,20 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from controllers.training import Progress
 from harness import results
 from harness.cluster import Backend, open_backend
 from harness.compare import Batch, check_batch, parse_seeds
 from harness.configuration import ConfigurationError, Settings, read_settings
+from harness.experiment import RunRequest
 from harness.manifest import describe_batch
-from harness.options import ConfigOption, SetOption, default_workers, split_names
+from harness.options import ConfigOption, SetOption, split_names, split_words
 from harness.progress import sweep_progress
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.sweep import CHUNK, Cell, SweepPlan, check_cells, parse_variation, run_sweep
 from harness.sweep_summary import sweep_tables
 from harness.tasks import find_task, task_names
+from harness.workers import default_workers
 
 console = Console()
 
@@ -52,7 +55,7 @@ def sweep(
             split_names("plants", plants, plant_names(), find_plant),
             split_names("controllers", controllers, controller_names(), find_controller),
             split_names("tasks", tasks, task_names(), find_task),
-            tuple(part.strip() for part in mismatch.split(",")),
+            split_words(mismatch),
             parse_seeds(seeds),
         ),
         tuple(parse_variation(text) for text in vary or []),
@@ -115,13 +118,14 @@ def _run(
         raise
 
 
-def check_sweep(cells: Sequence[Cell], settings: Settings, progress: Any = None) -> None:  # noqa: ANN401
-    """Build everything once; see `check_batch`."""
-    requests = [cell.request for cell in cells]
-    unusual = {(request.noise_factor, request.latency_periods) for request in requests}
-    for noise, latency in unusual:
-        some = [request for request in requests if (request.noise_factor, request.latency_periods) == (noise, latency)]
-        check_batch(Batch.around(some), settings, progress, noise, latency)
+def check_sweep(cells: Sequence[Cell], settings: Settings, progress: Progress | None = None) -> None:
+    """Build everything once in each condition of sensing; see `check_batch`."""
+    by_condition: dict[tuple[float, int | None], list[RunRequest]] = {}
+    for cell in cells:
+        condition = cell.request.noise_factor, cell.request.latency_periods
+        by_condition.setdefault(condition, []).append(cell.request)
+    for (noise, latency), requests in by_condition.items():
+        check_batch(Batch.around(requests), settings, progress, noise, latency)
 
 
 def describe_sweep(cells: Sequence[Cell], settings: Settings) -> dict[str, Any]:

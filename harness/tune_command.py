@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import TextColumn
 from rich.table import Table
 
 from harness.configuration import ConfigurationError
+from harness.options import INTERRUPTED, split_names, split_words
+from harness.progress import run_progress
+from harness.workers import default_workers
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from harness.tuning.files import TunedValues
     from harness.tuning.study import MethodStudy, TuningPlan
-
-INTERRUPTED = 130
-MAX_DEFAULT_WORKERS = 8
 
 console = Console()
 
@@ -44,9 +43,9 @@ def tune(
 
     if workers is not None and workers < 1:
         raise ConfigurationError(f"workers must be at least 1, got {workers}")
-    plan = TuningPlan(_controllers(controllers), trials, TuningSet(_words(plants), seeds, offset), study_seed)
+    plan = TuningPlan(_controllers(controllers), trials, TuningSet(split_words(plants), seeds, offset), study_seed)
     studies = open_studies(out, plan)
-    count = workers or min(MAX_DEFAULT_WORKERS, len(os.sched_getaffinity(0)))
+    count = workers or default_workers()
     interrupted = not _carry_out(studies, plan, count)
     console.print(_table(write_outcomes(out, studies)))
     console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
@@ -60,16 +59,7 @@ def _carry_out(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -
     from harness.tuning.study import advance  # noqa: PLC0415 - as above
 
     runs = len(plan.runs.runs())
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("runs, best {task.fields[best]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=console,
-    ) as progress:
+    with run_progress(console, TextColumn("runs, best {task.fields[best]}")) as progress:
         bars = {
             study.controller: progress.add_task(
                 study.controller, total=plan.trials * runs, completed=len(study.finished()) * runs, best="–"
@@ -95,13 +85,6 @@ def _table(outcomes: Mapping[str, TunedValues]) -> Table:
 
 
 def _controllers(text: str) -> tuple[str, ...]:
-    from harness.tuning.spaces import SPACES  # noqa: PLC0415 - as above
+    from harness.tuning.spaces import SPACES, find_tunable  # noqa: PLC0415 - as above
 
-    names = tuple(SPACES) if text.strip() == "all" else _words(text)
-    if not names:
-        raise ConfigurationError(f"--controllers is empty; valid: {', '.join(SPACES)}")
-    return names
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    return split_names("controllers", text, tuple(SPACES), find_tunable)

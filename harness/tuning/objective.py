@@ -16,7 +16,6 @@ and a method's character is not to be tuned away before it is compared.
 from __future__ import annotations
 
 import math
-import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final, TypeAlias
@@ -30,6 +29,7 @@ from harness.registry import find_plant
 from harness.run import COMPLETED, run_experiment
 from harness.seed_ranges import tuning_seeds
 from harness.tasks import find_task
+from harness.workers import leave_interrupts_to_parent
 
 MOVE: Final = "random"
 CURVE: Final = "circle"
@@ -167,5 +167,5 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: int) -
 
 def _evaluate_one(trial_index: int, run_index: int, trial: Trial, run: TuningRun, in_worker: bool) -> Cost:
     if in_worker:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+        leave_interrupts_to_parent()
     return trial_index, run_index, carry_out(trial, run)
