@@ -19,15 +19,15 @@ SetOption = Annotated[
 
 
 def split_words(text: str) -> tuple[str, ...]:
-    """Return the words in a list by comma, each once."""
-    return tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
+    """Return the words in a list by comma."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
     """Return the names in a list by comma, each of which `find` knows; `all` for those in `known`."""
     if text.strip() == "all":
         return tuple(known)
-    names = split_words(text)
+    names = tuple(dict.fromkeys(split_words(text)))
     if not names:
         raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:

@@ -27,6 +27,7 @@ CORNERS = 64
 SMALL = TuningSet(seeds=4)
 TUNED = sorted((Path(controllers.__file__).parent / "tuned").glob("*.toml"))
 PERIOD_IN_ONE_RUN = 0.05 / 10.0 / objective.CHECKED  # what one period more in one checked move adds to the score
+ROUNDING = 4 * PERIOD_IN_ONE_RUN  # networks fitted elsewhere differ by rounding: some periods, or half a mm of a circle
 
 
 def ends(distribution):
@@ -223,10 +224,9 @@ def checked_score(tuned, settings):
 
 
 def assert_checked_scores(tuned):
-    """Settling times are whole periods: another machine's last digits may move one run by one period."""
     again, default = checked_score(tuned, tuned.settings), checked_score(tuned, {})
-    assert again == pytest.approx(tuned.checked_score, abs=1.1 * PERIOD_IN_ONE_RUN)
-    assert default == pytest.approx(tuned.checked_score_of_defaults, abs=1.1 * PERIOD_IN_ONE_RUN)
+    assert again == pytest.approx(tuned.checked_score, abs=ROUNDING)
+    assert default == pytest.approx(tuned.checked_score_of_defaults, abs=ROUNDING)
     assert again <= default
     assert tuned.score <= tuned.score_of_defaults
 
