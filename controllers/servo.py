@@ -7,6 +7,7 @@ Any estimator works with any law. Which of them are known by name is written in 
 
 from __future__ import annotations
 
+import math
 from typing import final
 
 import numpy as np
@@ -117,7 +118,8 @@ class ServoController(Controller):
             duration=observation.time - last.time,
         )
         J = self.estimator.jacobian(motion.joint_position)
-        self._prediction_error = float(np.linalg.norm(motion.feature_step - J @ motion.joint_step))
+        unexplained = motion.feature_step - J @ motion.joint_step
+        self._prediction_error = math.sqrt(float(unexplained @ unexplained))
         self.estimator.update(motion)
 
     def _check_observation(self, observation: Observation) -> None:

@@ -68,26 +68,35 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
 
 
 def test_the_filter_is_a_kalman_filter_by_hand():
-    """σ = 0.1, c = 0.5: p = 0.01 + 0.25·0.04 + 0.0001 = 0.0201, L = 0.0201/0.0301, z = 1.2 + L·0.1."""
+    """σ = 0.1, c = 0.5, ‖Ĵ‖² = 5, ‖Δq‖² = 0.01, r² = 1e-8: p = 0.01 + 0.25·5·0.01/2 = 0.01625, z = 1.2 + L·0.1."""
     made = FeatureFilter(NoiseLevel(0.1), 0.5, np.array([1.0]), find_noise=False)
-    made.advance(np.array([0.2]), np.array([1.3]))
-    share = 0.0201 / 0.0301
-    np.testing.assert_allclose(made.feature, [1.2 + share * 0.1])
-    assert made.variance == pytest.approx((1.0 - share) * 0.0201)
+    made.advance(np.array([[2.0, 1.0]]), np.array([0.1, 0.0]), np.array([1.3]))
+    p = 0.01625 + 1e-8
+    np.testing.assert_allclose(made.feature, [1.2 + p / (p + 0.01) * 0.1])
+    assert made.variance == pytest.approx(p * 0.01 / (p + 0.01))
 
 
-def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints():
+def test_a_motion_of_which_the_jacobian_sees_nothing_makes_the_filter_unsure_too():
+    made = FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(1), find_noise=False)
+    before = made.variance
+    made.advance(np.array([[1.0, 0.0]]), np.array([0.0, 0.1]), None)
+    np.testing.assert_array_equal(made.feature, [0.0])
+    assert made.variance > 100.0 * before
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.008])
+def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints(noise):
     rng, made, errors = (
         np.random.default_rng(5),
         FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(3), find_noise=True),
         [],
     )
-    for _ in range(600):
-        made.advance(np.zeros(3), rng.normal(scale=0.001, size=3))
+    for _ in range(900):
+        made.advance(np.eye(3), np.zeros(3), rng.normal(scale=noise, size=3))
         errors.append(made.feature)
-    assert np.sqrt(np.mean(np.square(errors[50:]))) < 0.35 * 0.001
+    assert np.sqrt(np.mean(np.square(errors[300:]))) < 1.3 * np.sqrt(0.5 * 1e-4 * noise)  # L = r/σ: σ √(L/2)
     before = made.feature
-    made.advance(np.array([0.01, 0.0, 0.0]), None)
+    made.advance(np.eye(3), np.array([0.01, 0.0, 0.0]), None)
     np.testing.assert_allclose(made.feature, before + [0.01, 0.0, 0.0])
 
 
@@ -103,21 +112,38 @@ def test_the_noise_is_found_whatever_the_first_guess(true):
 
 
 def test_one_sample_of_noise_by_hand():
-    """σ² = 1 counts 10 times: weight (2/(2 + 2))² = 0.25, sample (8 − 2)/2 = 3: (9.9 + 0.75)/(9.9 + 0.25)."""
+    """σ² = 1 counts once: weight (2/(2 + 2))² = 0.25, sample (8 − 2)/2 = 3: (0.99 + 0.75)/(0.99 + 0.25)."""
     level = NoiseLevel(1.0)
     level.learn(8.0, 2.0, 2.0)
-    assert level.variance == pytest.approx(10.65 / 10.15)
+    assert level.variance == pytest.approx(1.74 / 1.24)
 
 
-def test_a_jump_counts_no_more_than_nine_times_the_noise():
+def test_a_jump_counts_no_more_than_nine_times_the_noise_and_at_first_ninety_times():
     level = NoiseLevel(1.0)
     level.learn(1e6, 1.0, 0.0)
-    assert level.variance == pytest.approx((9.9 + 9.0) / 10.9)
+    assert level.variance == pytest.approx((0.99 + 90.0) / 1.99)
+    for _ in range(1000):
+        level.learn(1.0, 1.0, 0.0)
+    before = level.variance
+    level.learn(1e6, 1.0, 0.0)
+    assert before == pytest.approx(1.0, rel=0.01)
+    assert level.variance == pytest.approx((99.0 * before + 9.0 * before) / 100.0, rel=0.01)
+
+
+def test_eight_times_the_noise_is_known_after_three_samples():
+    rng, known = np.random.default_rng(7), []
+    for _ in range(200):
+        level = NoiseLevel(0.001)
+        for _ in range(3):
+            nu = rng.normal(scale=np.sqrt(2.0) * 0.008, size=3)
+            level.learn(float(nu @ nu) / 3.0, 2.0, 0.0)
+        known.append(np.sqrt(level.variance))
+    assert 0.005 < np.median(known) < 0.011
 
 
 def test_a_feature_far_off_starts_the_filter_anew():
     made = FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(2), find_noise=True)
-    made.advance(np.zeros(2), np.array([0.3, 0.1]))
+    made.advance(np.eye(2), np.zeros(2), np.array([0.3, 0.1]))
     np.testing.assert_array_equal(made.feature, [0.3, 0.1])
 
 

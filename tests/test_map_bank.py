@@ -16,10 +16,11 @@ def motions(count, m, seed=0):
 
 
 def filtered(x, dy, r, P0):
-    M, P = np.eye(len(P0))[None], P0[None]
+    m = len(P0)
+    bank = np.concatenate([np.eye(m), P0])[None]
     for k in range(len(x)):
-        M, P, surprise, s = map_update(M, P, x[k][None], dy[k], r[k : k + 1])
-    return M[0], P[0], surprise, s
+        bank, surprise, s = map_update(bank, x[k][None], dy[k], r[k : k + 1])
+    return bank[0, :m], bank[0, m:], surprise, s
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4])
@@ -40,10 +41,10 @@ def test_without_a_prior_worth_the_name_the_filter_is_the_least_squares_of_numpy
 
 def test_one_update_by_hand_and_every_candidate_on_its_own():
     """s = 1 + 4·2² = 17, gain = 4·2/17, ν = 5 − 2 = 3: M = 1 + 24/17, P = 4 − 64/17; the other sees x = 0."""
-    M, P = np.ones((2, 1, 1)), np.full((2, 1, 1), 4.0)
-    M, P, surprise, s = map_update(M, P, np.array([[2.0], [0.0]]), np.array([5.0]), np.ones(2))
-    np.testing.assert_allclose(M.ravel(), [1.0 + 24.0 / 17.0, 1.0])
-    np.testing.assert_allclose(P.ravel(), [4.0 - 64.0 / 17.0, 4.0])
+    bank = np.array([[[1.0], [4.0]], [[1.0], [4.0]]])
+    bank, surprise, s = map_update(bank, np.array([[2.0], [0.0]]), np.array([5.0]), np.ones(2))
+    np.testing.assert_allclose(bank[:, 0, 0], [1.0 + 24.0 / 17.0, 1.0])
+    np.testing.assert_allclose(bank[:, 1, 0], [4.0 - 64.0 / 17.0, 4.0])
     np.testing.assert_allclose(surprise, [9.0 / 17.0, 25.0])
     np.testing.assert_allclose(s, [17.0, 1.0])
 
@@ -73,15 +74,13 @@ def test_the_nearest_rotation_is_proper_and_no_other_is_nearer(m):
 def test_two_known_directions_of_a_rotation_give_the_third():
     R = Rotation.from_rotvec([0.4, -0.3, 2.0]).as_matrix()
     x = np.array([[0.03, 0.0, 0.01], [0.0, 0.02, -0.02]])
-    M, P = np.eye(3)[None], np.eye(3)[None]
-    for step in x:
-        M, P, _, _ = map_update(M, P, step[None], R @ step, np.full(1, 1e-10))
+    M, P, _, _ = filtered(x, x @ R.T, np.full(2, 1e-10), np.eye(3))
     unknown = np.cross(*x) / np.linalg.norm(np.cross(*x))
-    assert np.linalg.norm(M[0] @ unknown - R @ unknown) > 0.5
-    completed, rotation = near_rotation(M[0], P[0], 0.2)
+    assert np.linalg.norm(M @ unknown - R @ unknown) > 0.5
+    completed, rotation = near_rotation(M, P, 0.2)
     np.testing.assert_allclose(rotation, R, atol=0.05)
     np.testing.assert_allclose(completed @ unknown, R @ unknown, atol=0.1)
-    np.testing.assert_allclose(near_rotation(M[0], P[0], 0.0)[1], R, atol=1e-3)
+    np.testing.assert_allclose(near_rotation(M, P, 0.0)[1], R, atol=1e-3)
 
 
 def test_what_is_known_of_a_map_stays_and_what_is_not_comes_from_the_rotation():

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from controllers.controller import RobotKnowledge
-from controllers.laws.pid import PidConfig, PidLaw, damped_inverse
+from controllers.laws.damped_inverse import damped_inverse, damped_inverse_by_svd
+from controllers.laws.pid import PidConfig, PidLaw
 from plant.signals import Observation, PlantSpec
 
 J = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
@@ -136,6 +139,14 @@ def test_the_damped_inverse_is_the_ridge_solution_at_any_size_of_the_jacobian(si
     stacked = np.vstack([J, 0.02 * np.eye(6)])
     wanted = np.linalg.lstsq(stacked, np.concatenate([e, np.zeros(6)]), rcond=None)[0]
     np.testing.assert_allclose(damped_inverse(J, 0.02) @ e, wanted, rtol=1e-9)
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 10**6), exponent=st.floats(-4.0, 8.0), damping=st.floats(1e-3, 1.0))
+def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
+    J = 10.0**exponent * np.random.default_rng(seed).normal(size=(3, 6))
+    wanted = damped_inverse_by_svd(J, damping)
+    np.testing.assert_allclose(damped_inverse(J, damping), wanted, rtol=1e-7, atol=1e-7 * np.abs(wanted).max())
 
 
 def test_the_damped_inverse_exists_where_the_jacobian_is_huge_and_singular():

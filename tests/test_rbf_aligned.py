@@ -126,7 +126,7 @@ def test_the_network_learns_in_its_own_frame_what_the_rotation_does_not_explain(
 def test_with_all_additions_off_it_is_the_estimator_of_the_paper():
     net, q = network(), path(50)
     y = features(net, q, TURN, 0)
-    off = estimator(net, align=False, find_delay=False, detect_moves=False)
+    off = estimator(net, window=8, epsilon=1e-3, align=False, find_delay=False, detect_moves=False, find_noise=False)
     plain = RbfEstimator(RbfConfig(), net)
     plain.reset(np.zeros((M, N)))
     feed(off, q, y)
@@ -150,8 +150,8 @@ def test_the_weighted_error_of_the_map_falls_by_each_innovation():
     made, moved = estimator(net, find_delay=False, learn=False), 0.0
 
     def weighted():
-        error = TURN - made._M[0]
-        return float(np.trace(error @ np.linalg.solve(made._P[0], error.T)))
+        error = TURN - made._bank[0, :M]
+        return float(np.trace(error @ np.linalg.solve(made.covariance, error.T)))
 
     for k in range(80):
         before = weighted()

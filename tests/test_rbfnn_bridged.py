@@ -9,9 +9,10 @@ from toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, SPEC, A, M, N, ToyArm, networ
 
 from controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from controllers.initial import InitialConfig, initial_jacobian
+from controllers.laws.damped_inverse import damped_inverse
 from controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
-from controllers.laws.pid import damped_inverse
 from controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
+from controllers.laws.roll_out import RollOut, descent_direction, update_step
 from controllers.networks import ControllerNetwork
 from controllers.servo import ServoController
 from plant.signals import Observation
@@ -55,7 +56,7 @@ def test_without_redistribution_a_command_that_exceeds_the_limit_is_scaled_as_a_
 
 
 def gains(**changes):
-    settings = {"horizon": 1, "k": 0.3, "epsilon": 0.0, "leak": 0.0, "error_share": 0.4, "posture_share": 0.0}
+    settings = {"k": 0.3, "epsilon": 0.0, "leak": 0.0, "error_share": 0.4, "posture_share": 0.0}
     return CorrectionGains(**{**settings, "damping": 1e-9, **changes})
 
 
@@ -68,8 +69,26 @@ def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself():
     made, e, q = correction(), np.array([0.2, -0.1, 0.3]), np.full(N, 0.2)
     dq = made.step(A, e, q, np.zeros(M), learn=True)
     predicted = 0.6 * e  # by the law without what is learned
-    np.testing.assert_allclose(made.ahead.errors[0], predicted, atol=1e-9)
+    assert made.diagnostics()["predicted_error"] == pytest.approx(np.linalg.norm(predicted), rel=1e-9)
     assert (e - A @ dq) @ predicted == pytest.approx((1.0 - 0.3) * predicted @ predicted, rel=1e-9)
+
+
+def test_the_update_is_that_of_the_paper_with_a_horizon_of_one():
+    """Eqs. 18, 19 and 23 by the functions of `rbfnn`, for the loop with all three terms."""
+    made, rng = correction(epsilon=1e-3), np.random.default_rng(1)
+    before = made.weights = rng.normal(scale=0.05, size=made.weights.shape)
+    e, q = np.array([0.2, -0.1, 0.3]), rng.normal(scale=0.3, size=N)
+    dq = made.step(A, e, q, np.zeros(M), learn=True)
+    projected = np.einsum("ij,jpl->ipl", np.linalg.pinv(A) @ A, before)
+    xi = np.concatenate([e, q])
+    h = networks().controller.features(xi)
+    first = 0.4 * np.linalg.pinv(A) @ e + np.einsum("npl,l,p->n", projected, h, xi)
+    ahead = RollOut((e - A @ first)[None], xi[None], h[None], first)
+    direction = descent_direction(A, ahead)
+    wanted = projected + update_step(direction, ahead, 0.3, 1e-3) * direction
+    np.testing.assert_allclose(made.weights, wanted, atol=1e-9)
+    learned = np.einsum("npl,l,p->n", wanted, h, xi)
+    np.testing.assert_allclose(dq, 0.4 * np.linalg.pinv(A) @ e + learned, atol=1e-9)
 
 
 def test_what_was_learned_leaks_and_stays_out_of_the_null_space():
@@ -97,11 +116,11 @@ def test_nothing_is_learned_from_an_invalid_feature_or_at_the_limit():
 
 def test_what_is_learned_stays_within_the_bound_of_the_leak():
     """‖W‖ ≤ k E_max / (2 l √ε), whatever the errors and Jacobians are."""
-    made, rng, largest = correction(horizon=2, epsilon=1e-3, leak=0.02, k=0.5), np.random.default_rng(8), 0.0
+    made, rng, largest = correction(epsilon=1e-3, leak=0.02, k=0.5), np.random.default_rng(8), 0.0
     for _ in range(300):
         J = rng.normal(size=(M, N))
         made.step(J, rng.normal(scale=0.3, size=M), rng.normal(size=N), np.zeros(M), learn=True)
-        largest = max(largest, 2.0 * made.ahead.criterion)
+        largest = max(largest, 2.0 * made.diagnostics()["criterion"])
         assert np.linalg.norm(made.weights) <= 0.5 * largest / (2.0 * 0.02 * np.sqrt(1e-3))
     assert made.weights.any()
 

@@ -24,7 +24,9 @@ PLUS, PAPER = rbfnn_mfac_plus.ENTRY.name, rbfnn_mfac.ENTRY.name
 MODEL = nominal_ur5()
 SPEC = hand_eye_spec(MODEL, PERIOD, KinematicConfig().max_joint_speed, KinematicConfig().joint_range)
 ALL_OFF = rbfnn_mfac_plus.RbfnnMfacPlusConfig(
-    estimator=RbfAlignedConfig(align=False, find_delay=False, detect_moves=False),
+    estimator=RbfAlignedConfig(
+        window=8, epsilon=1e-3, align=False, find_delay=False, detect_moves=False, find_noise=False
+    ),
     law=RbfnnBridgedConfig(
         base="network", horizon=8, frame=False, bridge=False, observe=False, feedforward=False, redistribute=False
     ),
@@ -66,7 +68,9 @@ def test_it_is_sooner_there_with_less_overshoot_and_tracks_better_than_the_metho
 
 
 def test_the_settings_reach_the_parts():
-    slow, fast = (row(PLUS, "random", "none", 0, *changed) for changed in ([f"{PLUS}.law.gain=2.0"], []))
+    slow, fast = (
+        row(PLUS, "random", "none", 0, f"{PLUS}.law.k=0.0", f"{PLUS}.law.gain={gain}") for gain in (2.0, 20.0)
+    )
     assert slow["settling_time_s"] > 1.3 * fast["settling_time_s"]
 
 

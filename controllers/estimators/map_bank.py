@@ -25,26 +25,27 @@ from plant.signals import FloatArray
 
 
 def map_update(
-    M: FloatArray, P: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    bank: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Learn from one motion under every candidate delay.
 
     Args:
-        M: maps, (D, m, m).
-        P: covariances, (D, m, m).
+        bank: each map M above its covariance P, (D, 2m, m): what multiplies x in both is one product.
         x: feature steps that the model predicts, (D, m), m.
         feature_step: Δy, (m,), m.
         variance: r, (D,), m², positive.
 
     Returns:
-        The new M and P; ‖ν‖²/s, (D,), what was seen against what was expected; and s, (D,), m².
+        The new bank; ‖ν‖²/s, (D,), what was seen against what was expected; and s, (D,), m².
     """
-    Px = np.matmul(P, x[:, :, None])[:, :, 0]
+    m = len(feature_step)
+    known = np.matmul(bank, x[:, :, None])[:, :, 0]
+    Px = known[:, m:]
     s = variance + np.add.reduce(x * Px, axis=1)
-    nu = feature_step - np.matmul(M, x[:, :, None])[:, :, 0]
-    gain = Px / s[:, None]
-    renewed = M + nu[:, :, None] * gain[:, None, :]
-    return renewed, P - Px[:, :, None] * gain[:, None, :], np.add.reduce(nu * nu, axis=1) / s, s
+    known[:, :m] -= feature_step  # −ν above P x: minus their products with the gain is what both change by
+    nu = known[:, :m]
+    surprise = np.add.reduce(nu * nu, axis=1) / s
+    return bank - known[:, :, None] * (Px / s[:, None])[:, None, :], surprise, s
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:

@@ -4,14 +4,16 @@
     sample = (‖ν‖²/m − b)/a,   weight = (a σ²/(a σ² + b))²:   where b is large, ν says little about σ
     σ² = Σ weight · sample / Σ weight, with forgetting, from a first guess that counts as `GUESS` samples
 
-A sample counts at most `LARGEST` σ², so that a camera that is moved does not make all that follows look like noise.
+A sample counts at most `LARGEST` σ², so that a camera that is moved does not make all that follows look like noise;
+while less than `TRUSTED` samples are known, more in proportion, so that a wrong guess is left at once.
 """
 
 from __future__ import annotations
 
 from typing import final
 
-GUESS = 10.0  # samples that the first guess is worth
+GUESS = 1.0  # samples that the first guess is worth
+TRUSTED = 10.0  # samples, the guess included
 FORGETTING = 0.99  # of the sums, a sample
 LARGEST = 9.0  # of a sample, in σ²
 SMALLEST = 1e-2  # of σ² against the first guess: a perfect feature is none
@@ -37,7 +39,8 @@ class NoiseLevel:
         """
         own = multiple * self.variance
         weight = (own / (own + other)) ** 2
-        sample = min((square - other) / multiple, LARGEST * self.variance)
+        largest = LARGEST * max(1.0, TRUSTED / self._weights) * self.variance
+        sample = min((square - other) / multiple, largest)
         self._sum = FORGETTING * self._sum + weight * sample
         self._weights = FORGETTING * self._weights + weight
         self.variance = max(self._sum / self._weights, self._floor)

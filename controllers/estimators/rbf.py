@@ -81,7 +81,6 @@ class RbfEstimator(Estimator):
         self._config = config
         self._network = network
         self._features = LatestFeatures(network)
-        self._weights = network.weights
         self._count = 0
         self._restore()
 
@@ -115,8 +114,13 @@ class RbfEstimator(Estimator):
         self._count += 1
         filled = slice(min(self._count, self._config.window))
         gradient, self._error = window_gradient(self._weights, self._moved[filled], self._feature_steps[filled])
-        self._step = window_step(self._squares, self._config.k2, self._config.epsilon)
-        self._weights = self._weights + self._step * gradient
+        self._step = window_step(self._squares, self._config.k2, self._epsilon)
+        gradient *= self._step
+        self._weights += gradient
+
+    def expect_noise(self, factor: float) -> None:
+        """Learn as fits a feature whose variance is `factor` times the one that ε is set for."""
+        self._epsilon = factor * self._config.epsilon
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad."""
@@ -137,10 +141,11 @@ class RbfEstimator(Estimator):
 
     def _restore(self) -> None:
         network, window = self._network, self._config.window
-        self._weights = network.weights.swapaxes(0, 1).reshape(network.m, -1)
+        self._weights = network.weights.swapaxes(0, 1).reshape(network.m, -1).copy()
         self._moved: FloatArray = np.empty((window, self._weights.shape[1]))  # μ_t; the oldest row is overwritten
         self._feature_steps: FloatArray = np.empty((window, network.m))
         self._squares: deque[tuple[float, float]] = deque(maxlen=window)
         self._count = 0
+        self._epsilon = self._config.epsilon
         self._error = np.zeros((1, network.m))
         self._step = 0.0

@@ -35,9 +35,9 @@ LARGEST_SUSPICION = 10.0  # of one motion, so that one outlier alone is below th
 class RbfAlignedConfig:
     """Settings of the network's update, of the map and of the delay."""
 
-    window: int = 8  # T, motions that the network learns from at once
+    window: int = 1  # T, motions that the network learns from at once
     k2: float = 0.5  # k₂, step size of the network, 0 < k₂ < 2
-    epsilon: float = 1e-3  # ε, rad², as for `rbf`
+    epsilon: float = 0.03  # ε, rad², as for `rbf`, at the first guess of the noise; it grows with σ²
     learn: bool = True  # let the network learn online, from what the map's rotation takes into its frame
     align: bool = True  # estimate the map; False: M = I
     initial_deviation: float = 1.0  # of an entry of M = I at first: any camera is possible
@@ -75,6 +75,8 @@ class RbfAlignedEstimator(Estimator):
 
     with x_d = Ĵ_net Δq(k−d). Symbols: M map (m, m); P its covariance (m, m); R rotation (m, m); d delay, periods; σ m.
 
+    The network's ε is in proportion to σ²: the noisier the feature, the more motion a lesson takes.
+
     P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
     explains, from which nothing is learned, or surprises that add up, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
     gate. M stays, as the best guess.
@@ -92,9 +94,8 @@ class RbfAlignedEstimator(Estimator):
 
     def _forget(self) -> None:
         eye, config = self._eye, self._config
-        self._M: FloatArray = np.repeat(eye[None], self._candidates, axis=0)
-        self._P0 = (config.initial_deviation**2 if config.align else 0.0) * self._M
-        self._P = self._P0.copy()
+        self._P0 = (config.initial_deviation**2 if config.align else 0.0) * eye
+        self._bank: FloatArray = np.repeat(np.concatenate([eye, self._P0])[None], self._candidates, axis=0)  # M above P
         self._scores = np.zeros(self._candidates)
         self._noise = NoiseLevel(config.feature_noise)
         self._delay = 0
@@ -112,7 +113,7 @@ class RbfAlignedEstimator(Estimator):
     @property
     def covariance(self) -> FloatArray:
         """P of the present delay, (m, m); a copy."""
-        return np.array(self._P[self._delay])
+        return self._bank[self._delay, self._m :].copy()
 
     def reset(self, jacobian: FloatArray) -> None:
         """Forget everything and restore the offline network; see `RbfEstimator.reset`."""
@@ -142,10 +143,11 @@ class RbfAlignedEstimator(Estimator):
             return
         if config.align or config.find_delay:
             self._learn_map(x, square, motion.feature_step)
-        if config.learn and self._P[self._delay].trace() < self._m * config.confidence**2:
+        if config.learn and self._deviation() < config.confidence:
             begin = past[last - self._delay - periods, :n]
             step, seen = passed[self._delay, :n], self._rotation.T @ motion.feature_step
             self._key = b""
+            self._network.expect_noise(self._noise.variance / config.feature_noise**2)
             self._network.update(Motion(begin, step, seen, motion.error, motion.duration))
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
@@ -159,7 +161,7 @@ class RbfAlignedEstimator(Estimator):
             **self._network.diagnostics(),
             "delay": float(self._delay),
             "map_rotation": math.acos(cosine),
-            "map_deviation": math.sqrt(float(np.trace(self._P[self._delay])) / self._m),
+            "map_deviation": self._deviation(),
             "map_surprise": self._surprise,
             "camera_moves": float(self._moves),
             "noise_level": math.sqrt(self._noise.variance),
@@ -191,30 +193,35 @@ class RbfAlignedEstimator(Estimator):
         return seen > JUMP_SHARE * reach + JUMP_NOISE * math.sqrt(self._noise.variance)
 
     def _expect_any_map(self) -> None:
-        self._P, self._suspicion, self._moves = self._P0.copy(), 0.0, self._moves + 1
+        self._bank[:, self._m :] = self._P0
+        self._suspicion, self._moves = 0.0, self._moves + 1
+
+    def _deviation(self) -> float:
+        return math.sqrt(float(self._bank[self._delay, self._m :].trace()) / self._m)
 
     def _learn_map(self, x: FloatArray, square: FloatArray, feature_step: FloatArray) -> None:
         """Update map, covariance and score of every delay, and choose among them."""
         config, m = self._config, self._m
         variance = 2.0 * self._noise.variance + config.model_error**2 * square
         if config.align:
-            self._P = self._P + (config.walk**2 * np.sqrt(square))[:, None, None] * self._eye
-            excess = self._P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
+            P = self._bank[:, m:]
+            P += (config.walk**2 * np.sqrt(square))[:, None, None] * self._eye
+            excess = P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
             if max(excess.tolist()) > 1.0:
-                self._P /= np.maximum(excess, 1.0)[:, None, None]
-        M, P, surprise, s = map_update(self._M, self._P, x, feature_step, variance)
+                P /= np.maximum(excess, 1.0)[:, None, None]
+        bank, surprise, s = map_update(self._bank, x, feature_step, variance)
         self._surprise, expected = float(surprise[self._delay]) / m, float(s[self._delay])
         if config.find_noise:
             self._noise.learn(self._surprise * expected, 2.0, expected - 2.0 * self._noise.variance)
         self._suspicion = max(0.0, self._suspicion + min(self._surprise, LARGEST_SUSPICION) - USUAL_SURPRISE)
         if config.detect_moves and self._suspicion > config.gate:
             self._expect_any_map()
-            M, P, _, _ = map_update(self._M, self._P, x, feature_step, variance)
-        self._M, self._P = M, P
+            bank, _, _ = map_update(self._bank, x, feature_step, variance)
+        self._bank = bank
         self._scores = config.forgetting * self._scores + np.minimum(surprise, LARGEST_SURPRISE) + m * np.log(s)
         best = int(self._scores.argmin())
         if self._scores[best] < self._scores[self._delay] - config.margin:
             self._delay = best
         if config.align:
-            d = self._delay
-            self._map, self._rotation = near_rotation(self._M[d], self._P[d], config.rotation_deviation)
+            now = bank[self._delay]
+            self._map, self._rotation = near_rotation(now[:m], now[m:], config.rotation_deviation)

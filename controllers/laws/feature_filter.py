@@ -1,10 +1,11 @@
 """Where the feature is: what the camera tells, and what the joints' motion says between its frames.
 
-    z ← z + Ĵ Δq(k−d),   p ← p + c² ‖Ĵ Δq(k−d)‖² + (σ/10)²             as far as the arm moved until the exposure
+    z ← z + Ĵ Δq(k−d),   p ← p + c² ‖Ĵ‖² ‖Δq(k−d)‖²/n + r²        as far as the arm moved until the exposure
     L = p / (p + σ²),   z ← z + L (y − z),   p ← (1 − L) p               with a valid feature y
 
-A Kalman filter with one variance p for all axes. In motion the Jacobian's error c makes it believe the camera, at rest
-it averages: L tends to 0.1. A frame further away than its variance allows (a camera that was moved) starts it anew.
+A Kalman filter with one variance p for all axes. In motion the Jacobian's error c makes it believe the camera, whether
+or not Ĵ says that the feature moves; at rest it averages: L tends to r/σ. A frame further away than its variance allows
+(a camera that was moved) starts it anew.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from controllers.estimators.noise_level import NoiseLevel
 from plant.signals import FloatArray
 
-REST_SHARE = 0.1  # of σ: how far z may drift a period at rest
+REST_DRIFT = 1e-4  # r, m: how far z may drift a period at rest
 OUTLIER = 25.0  # ‖y − z‖² over its expectation from which on the camera is right and z wrong
 
 
@@ -29,7 +30,7 @@ class FeatureFilter:
 
         Args:
             noise: σ, m, standard deviation of the feature an axis.
-            model_error: c, share of a feature step that the Jacobian gets wrong.
+            model_error: c, error of the Jacobian as a share of ‖Ĵ‖.
             feature: y, (m,), m.
             find_noise: learn σ from y − z.
         """
@@ -40,16 +41,18 @@ class FeatureFilter:
         self.feature = feature
         self.variance = self._noise.variance
 
-    def advance(self, predicted_step: FloatArray, feature: FloatArray | None) -> None:
+    def advance(self, jacobian: FloatArray, joint_step: FloatArray, feature: FloatArray | None) -> None:
         """Go on by a period.
 
         Args:
-            predicted_step: Ĵ Δq, (m,), m.
+            jacobian: Ĵ, (m, n), m/rad.
+            joint_step: Δq, (n,), rad.
             feature: y, (m,), m; None where no valid one came.
         """
         sigma2 = self._noise.variance
-        z = self.feature + predicted_step
-        p = self.variance + self._model_error**2 * float(predicted_step @ predicted_step) + REST_SHARE**2 * sigma2
+        z = self.feature + jacobian @ joint_step
+        unsure = float(np.vdot(jacobian, jacobian)) * float(joint_step @ joint_step) / len(joint_step)
+        p = self.variance + self._model_error**2 * unsure + REST_DRIFT**2
         if feature is None:
             self.feature, self.variance = z, p
             return

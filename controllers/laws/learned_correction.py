@@ -5,11 +5,13 @@
 
 The first two terms are what the offline controller network of `rbfnn_mfac` imitates at the nominal Jacobian, written
 down with the estimated one. The third is the network of the paper (eqs. 11–17), from zero weights, learned by the
-paper's update (eqs. 18, 19, 23) from the predicted errors of the loop with all three terms:
+paper's update (eqs. 18, 19, 23) with a horizon of one, from the predicted error of the loop with all three terms:
 
-    e(k+t) = e(k+t−1) − Ĵ limited(dq(k+t−1)),   W_j ← (1 − l) Ĵ⁺Ĵ W_j + α Σ_t [Ĵᵀ e(k+t)] ξ_j h(ξ)ᵀ
+    e(k+1) = e − Ĵ limited(dq),   G_j = [Ĵᵀ e(k+1)] ξ_j hᵀ,   W_j ← (1 − l) Ĵ⁺Ĵ W_j + α G_j
 
-The leak l makes it forget what is not learned again. Nothing is learned while the command is limited.
+One predicted period is enough where delays are bridged, and the update is then of rank one, so that its norm and what
+it adds to the command are products of three norms. The leak l makes it forget what is not learned again. Nothing is
+learned while the command is limited.
 """
 
 from __future__ import annotations
@@ -18,11 +20,9 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from controllers.controller import Diagnostics
-from controllers.laws.pid import damped_inverse
-from controllers.laws.roll_out import RollOut, descent_direction, update_step
+from controllers.laws.damped_inverse import damped_inverse
 from controllers.networks import ControllerNetwork
 from plant.signals import FloatArray, Observation
 
@@ -32,7 +32,6 @@ class CorrectionGains:
     """What the correction needs to know besides the present Jacobian.
 
     Attributes:
-        horizon: T, predicted periods.
         k: step size, 0 ≤ k < 2; 0 learns nothing.
         epsilon: ε, m⁴.
         leak: l, share of the weights that is forgotten a period.
@@ -41,7 +40,6 @@ class CorrectionGains:
         damping: δ, m/rad.
     """
 
-    horizon: int
     k: float
     epsilon: float
     leak: float
@@ -69,7 +67,6 @@ class LearnedCorrection:
             )
         self._gains, self._network, self._posture = gains, network, posture
         self._reach: FloatArray = 1.0 / limit
-        self._eye = np.eye(network.n)
         self._forget()
 
     def reset(self, observation: Observation) -> None:
@@ -79,7 +76,7 @@ class LearnedCorrection:
     def _forget(self) -> None:
         self.weights: FloatArray = np.zeros(self._network.weights.shape)
         self.step_size = 0.0
-        self.ahead: RollOut | None = None
+        self._predicted: FloatArray = np.zeros(0)  # e(k+1), m
 
     def step(
         self, jacobian: FloatArray, error: FloatArray, joint_position: FloatArray, forward: FloatArray, learn: bool
@@ -96,63 +93,37 @@ class LearnedCorrection:
         Returns:
             dq, (n,), rad.
         """
-        gains, m = self._gains, len(jacobian)
-        pinv = fast_damped_inverse(jacobian, gains.damping)
+        gains = self._gains
+        pinv = damped_inverse(jacobian, gains.damping)
         row_space = pinv.dot(jacobian)
+        away = self._posture - joint_position
+        wanted = pinv.dot(gains.error_share * error) + gains.posture_share * (away - row_space.dot(away))
         following = pinv.dot(forward)
-        linear = np.concatenate([gains.error_share * pinv, gains.posture_share * (row_space - self._eye)], axis=1)
-        constant = -linear[:, m:].dot(self._posture)
         if gains.k == 0.0:
-            return np.asarray(linear.dot(np.concatenate([error, joint_position])) + constant + following)
+            return np.asarray(wanted + following)
         n, p, hidden = self.weights.shape
         row_space *= 1.0 - gains.leak
         self.weights = row_space.dot(self.weights.reshape(n, p * hidden)).reshape(n, p, hidden)
-        ahead = self.ahead = self._predict(jacobian, linear, constant, np.concatenate([error, joint_position]))
+        xi = np.concatenate([error, joint_position])
+        h = self._network.features(xi)
+        wanted += self.weights.reshape(n * p, hidden).dot(h).reshape(n, p).dot(xi)
+        excess = max(1.0, float(max(map(abs, (wanted * self._reach).tolist()))))
+        ahead = self._predicted = error - jacobian.dot(wanted) / excess
         self.step_size = 0.0
-        if not learn or excess_of(ahead.wanted, self._reach) > 1.0:
-            return np.asarray(ahead.wanted + following)
-        direction = descent_direction(jacobian, ahead)
-        self.step_size = update_step(direction, ahead, gains.k, gains.epsilon)
-        direction *= self.step_size
-        self.weights += direction
-        learned: FloatArray = direction.reshape(n * p, hidden).dot(ahead.h[0]).reshape(n, p).dot(ahead.xi[0])
-        return np.asarray(ahead.wanted + learned + following)
+        if not learn or excess > 1.0:
+            return np.asarray(wanted + following)
+        pull = ahead.dot(jacobian)
+        others = float(xi.dot(xi)) * float(h.dot(h))  # ‖G‖² without what Ĵᵀe adds
+        self.step_size = gains.k * float(ahead.dot(ahead)) / (gains.epsilon + float(pull.dot(pull)) * others)
+        pull *= self.step_size
+        self.weights += (pull[:, None] * xi)[:, :, None] * h
+        return np.asarray(wanted + others * pull + following)
 
     def diagnostics(self) -> Diagnostics:
-        """Return criterion I_c (m²), step size α, predicted error ‖e(k+T)‖ (m) and norm of the weights."""
+        """Return criterion I_c (m²), step size α, predicted error ‖e(k+1)‖ (m) and norm of the weights."""
         return {
-            "criterion": self.ahead.criterion if self.ahead else 0.0,
+            "criterion": 0.5 * float(self._predicted.dot(self._predicted)),
             "step_size": self.step_size,
-            "predicted_error": float(np.linalg.norm(self.ahead.errors[-1])) if self.ahead else 0.0,
+            "predicted_error": float(np.linalg.norm(self._predicted)),
             "learned_weight_norm": float(np.linalg.norm(self.weights)),
         }
-
-    def _predict(self, jacobian: FloatArray, linear: FloatArray, constant: FloatArray, xi: FloatArray) -> RollOut:
-        """Predict the loop with dq = linear ξ + constant + Σ_j W_j h ξ_j, (n, p), (n,), everything frozen."""
-        (n, p, hidden), m, horizon = self.weights.shape, len(jacobian), self._gains.horizon
-        flat, moves = self.weights.reshape(n * p, hidden), np.concatenate([-jacobian, self._eye])
-        xis, hs, wanted = np.empty((horizon + 1, p)), np.empty((horizon, hidden)), constant
-        xis[0] = xi
-        for t in range(horizon):
-            h = hs[t] = self._network.features(xis[t])
-            dq = (flat.dot(h).reshape(n, p) + linear).dot(xis[t]) + constant
-            if t == 0:
-                wanted = dq
-            excess = excess_of(dq, self._reach)
-            xis[t + 1] = xis[t] + moves.dot(dq if excess <= 1.0 else dq / excess)
-        return RollOut(xis[1:, :m], xis[:-1], hs, wanted)
-
-
-def excess_of(joint_step: FloatArray, reach: FloatArray) -> float:
-    """Return by which factor a joint step (n,), rad, exceeds its limits, `reach` (n,), 1/rad, being their inverses."""
-    return float(max(map(abs, (joint_step * reach).tolist())))
-
-
-def fast_damped_inverse(J: FloatArray, damping: float) -> FloatArray:
-    """Return Jᵀ (JJᵀ + δ²I)⁻¹, (n, m), by a Cholesky factor: `damped_inverse`, sooner, up to rounding."""
-    square = J.dot(J.T)
-    square.flat[:: len(J) + 1] += damping**2
-    _, solution, failed = dposv(square, J)
-    if failed:  # δ is lost in the rounding of a Jacobian with fewer joints than features
-        return damped_inverse(J, damping)
-    return np.asarray(solution).T

@@ -17,6 +17,7 @@ from typing import final
 import numpy as np
 
 from controllers.controller import Diagnostics, RobotKnowledge
+from controllers.laws.damped_inverse import damped_inverse
 from controllers.laws.law import Law, scale_to_limit
 from plant.signals import FloatArray, Observation, check_number
 
@@ -37,19 +38,6 @@ class PidConfig:
         check_number("proportional_gain", self.proportional_gain, above=0.0)
         for name in ("integral_gain", "derivative_gain", "derivative_filter", "damping"):
             check_number(name, getattr(self, name), at_least=0.0)
-
-
-def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
-    """Return Jᵀ (JJᵀ + δ²I)⁻¹, (n, m), rad/m, for J (m, n); the pseudo-inverse where δ = 0.
-
-    Args:
-        J: (m, n), m/rad.
-        damping: δ, m/rad: directions in which J is weaker than this are not chased.
-    """
-    if damping == 0.0:
-        return np.asarray(np.linalg.pinv(J))
-    U, sigma, Vt = np.linalg.svd(J, full_matrices=False)  # JJᵀ + δ²I may be singular to rounding where J is huge
-    return np.asarray((Vt.T * (sigma / (sigma**2 + damping**2))) @ U.T)
 
 
 def reference_velocity(reference: FloatArray, period: float) -> FloatArray:

@@ -21,11 +21,11 @@ import numpy as np
 from controllers.controller import Diagnostics, RobotKnowledge
 from controllers.estimators.map_bank import nearest_rotation
 from controllers.estimators.noise_level import NoiseLevel
+from controllers.laws.damped_inverse import damped_inverse
 from controllers.laws.feature_filter import FeatureFilter
 from controllers.laws.joint_response import JointResponse
 from controllers.laws.law import Law, scale_to_limit
 from controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
-from controllers.laws.pid import damped_inverse
 from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from controllers.laws.redistribution import redistribute
 from controllers.network_file import TrainedNetworks
@@ -42,7 +42,7 @@ class RbfnnBridgedConfig:
     """Settings of the law; each addition to `rbfnn` can be switched off."""
 
     base: Base = "jacobian"  # what is learned upon: Ĵ⁺ as estimated; "network": the offline network, as in `rbfnn`
-    horizon: int = 2  # T, predicted periods; take 8 with base "network"
+    horizon: int = 8  # T, predicted periods; base "network" only
     k: float = 0.1  # share of the predicted error that one update removes, 0 ≤ k < 2; 0 learns nothing
     epsilon: float = 1e-3  # ε, m⁴
     leak: float = 0.02  # l, share of what was learned that is forgotten a period; base "jacobian" only
@@ -55,7 +55,7 @@ class RbfnnBridgedConfig:
     observe: bool = True  # filter the feature by the joints' motion
     feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
     find_noise: bool = True  # estimate σ; False: it is as given
-    model_error: float = 0.2  # c, share of a feature step that Ĵ gets wrong
+    model_error: float = 0.2  # c, error of Ĵ as a share of its size
     feedforward: bool = True  # add the reference's own motion; needs a preview of at least 1
     redistribute: bool = True  # let joints with room make up for those at their limit
 
@@ -77,7 +77,6 @@ class RbfnnBridgedConfig:
     def gains(self, period: float) -> CorrectionGains:
         """Return what the base "jacobian" needs, for a control period, s."""
         return CorrectionGains(
-            self.horizon,
             self.k,
             self.epsilon,
             self.leak,
@@ -186,8 +185,8 @@ class RbfnnBridgedLaw(Law):
             self._filter = FeatureFilter(self._noise, config.model_error, y, find_noise=config.find_noise)
             self._filtered_delay = delay
         else:
-            step = jacobian @ (past[delay] - past[delay + 1])
-            self._filter.advance(step, y if observation.feature_valid else None)
+            step = past[delay] - past[delay + 1]
+            self._filter.advance(jacobian, step, y if observation.feature_valid else None)
         return self._filter.feature
 
     def _wanted_step(

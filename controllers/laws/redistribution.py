@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from controllers.laws.damped_inverse import damped_inverse
 from plant.signals import FloatArray
 
 NONE = 1e-9  # of its limit: a joint with less room than that has none
@@ -46,7 +47,7 @@ def redistribute(
     free = np.abs(dq) < limit - none
     while left > DONE and np.count_nonzero(free) >= m:
         J = np.where(free, jacobian, 0.0)
-        more = left * (J.T @ np.linalg.solve(J @ J.T + damping**2 * np.eye(m), wanted))
+        more = left * (damped_inverse(J, damping) @ wanted)
         room = np.where(more > 0.0, up - dq, down + dq)
         stuck = free & (room <= none)
         if stuck.any():
