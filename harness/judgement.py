@@ -16,8 +16,8 @@ from harness.statistics import (
     compare_pairs,
     median_with_interval,
     outcomes,
+    settled_share,
     settling_times,
-    success_rate,
     tail_mean,
 )
 
@@ -54,13 +54,12 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
-        rate = success_rate(int((ended == SETTLED).sum()), len(own))
         failed = ended[ended != SETTLED].value_counts()
         rows.append(
             {
                 "controller": name,
                 "runs": str(len(own)),
-                "settled, %": _text(Estimate(100 * rate.value, 100 * rate.low, 100 * rate.high, rate.count), 1),
+                "settled, %": _text(settled_share(own), 1),
                 "settling time, s": _median(settling_times(own), 1.0, 2),
                 "overshoot, %": _median(own.get("overshoot"), 100.0, 1),
                 "RMS end, mm": _median(own.get("rms_error_evaluated_m"), 1000.0, 1),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ from rich.console import Console
 from harness import results
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
 from harness.experiment import RunRequest, known_sections
+from harness.options import split_words
 from harness.record import KINDS, write_recording
 from harness.replay import LoggedRun, logged_run
 from harness.run import run_experiment
@@ -43,7 +43,7 @@ def record(
     ] = None,
 ) -> None:
     """Show a run: film (MP4, GIF) and snapshots of the rendered arm, its camera's view and the error."""
-    wanted = tuple(dict.fromkeys(part.strip() for part in kinds.split(",") if part.strip()))
+    wanted = tuple(dict.fromkeys(split_words(kinds)))
     for kind in wanted or (kinds,):
         if kind not in KINDS:
             raise ConfigurationError(f"--kinds: unknown {kind!r}: {suggest(kind, KINDS)}")
@@ -80,8 +80,7 @@ def _from_folder(folder: Path, run_id: str | None) -> LoggedRun:
     if chosen not in names:
         raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
     row = {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
-    manifest = json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))
-    configuration = manifest.get("configuration", {})
+    configuration = results.read_manifest(folder).get("configuration", {})
     return logged_run(row, results.load_steps(folder, [chosen]), configuration.get("bullet", {}))
 
 

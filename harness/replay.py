@@ -59,6 +59,8 @@ class LoggedRun:
         row: its row in the table of runs.
         track: its steps.
         model: the true arm and camera.
+        moved: the same after the camera was moved in the middle of the run; None if it was not.
+        moved_from: first period that the moved camera sees; the number of periods if none.
         config: the rendered plant's settings, for its camera.
         joint_position: (k, n), rad, as reported.
         ball: (k, 3), m, base frame.
@@ -68,6 +70,8 @@ class LoggedRun:
     row: dict[str, Any]
     track: Track
     model: HandEyeModel
+    moved: HandEyeModel | None
+    moved_from: int
     config: BulletConfig
     joint_position: FloatArray
     ball: FloatArray
@@ -97,21 +101,21 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame, settings: dict[str, Any
     missing = [name for name in names if name not in steps]
     if missing:
         raise ConfigurationError(f"run {run_id} has no column {missing[0]}; wanted the joint positions of a UR5")
-    model = _true_model(row)
+    model, moved = _true_model(row)
     known = {item.name for item in fields(BulletConfig)}
     try:
         config = BulletConfig(**{name: value for name, value in settings.items() if name in known})
     except (ValueError, TypeError) as error:
         raise ConfigurationError(f"run {run_id}: settings of bullet in the manifest: {error}") from error
-    return LoggedRun(
-        row,
-        track,
-        model,
-        config,
-        steps[names].to_numpy(dtype=np.float64),
-        model.to_base(track.vectors("true_feature_")),
-        model.to_base(track.vectors("reference_")),
-    )
+    q, ball = steps[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
+    moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
+
+    def in_base(points: FloatArray) -> FloatArray:
+        later = points[:0] if moved is None else moved.to_base(points[moved_from:])
+        return np.concatenate([model.to_base(points[:moved_from]), later])
+
+    reference = in_base(track.vectors("reference_"))
+    return LoggedRun(row, track, model, moved, moved_from, config, q, in_base(ball), reference)
 
 
 class Replay:
@@ -129,7 +133,8 @@ class Replay:
         self._run, self._fineness = run, fineness
         self._scene: Scene = Scene(run.model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=True, window=False)
         self._camera = run.config.camera()
-        self._view: View = view_of(self._camera, run.model.X_BC)
+        self._views: list[View] = [view_of(self._camera, model.X_BC) for model in (run.model, run.moved) if model]
+        self._view = self._views[0]
         self._overview_pose = _look_at(np.array(EYE), np.array(TARGET))
         fine = replace(OVERVIEW, width=round(fineness * OVERVIEW.width), height=round(fineness * OVERVIEW.height))
         self._overview: View = view_of(fine, self._overview_pose)
@@ -143,7 +148,8 @@ class Replay:
         self._scene.close()
 
     def place(self, k: int) -> None:
-        """Put the arm where it was in period `k`."""
+        """Put arm and camera where they were in period `k`."""
+        self._view = self._views[k >= self._run.moved_from]
         self._scene.place(self._run.model.arm.joint_angle(self._run.joint_position[k]))
 
     def camera_view(self) -> ByteArray:
@@ -187,8 +193,8 @@ class Replay:
                 cv2.addWeighted(layer, PALE, picture, 1 - PALE, 0.0, dst=picture)
 
 
-def _true_model(row: dict[str, Any]) -> HandEyeModel:
-    """Return the run's true robot.
+def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]:
+    """Return the run's true robot, and what it was after its camera was moved; None if it was not.
 
     Raises:
         ConfigurationError: its mismatch cannot be drawn, or other values come out than the table has.
@@ -204,7 +210,17 @@ def _true_model(row: dict[str, Any]) -> HandEyeModel:
             f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "
             "give now; record it with the version of servobench that made it"
         )
-    return model
+    return model, sample.moved(model)
+
+
+def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:
+    """Return the first period in which the true feature (k, m) is the one that the moved camera sees at q (k, n)."""
+    before, after = (
+        np.linalg.norm([camera.feature(joints) - seen for joints, seen in zip(q, feature, strict=True)], axis=1)
+        for camera in (model, moved)
+    )
+    seen = np.flatnonzero(after < before)
+    return int(seen[0]) if len(seen) else len(q)
 
 
 def _look_at(eye: FloatArray, target: FloatArray) -> FloatArray:

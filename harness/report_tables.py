@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import pandas as pd
 
 from harness import results
 from harness.run import COMPLETED
-from harness.statistics import Estimate, median_with_interval, success_rate
+from harness.statistics import Estimate, median_with_interval, settled_share, settling_times
 
 CONDITIONS = ("plant", "mismatch", "noise_factor", "latency_periods")  # what a folder may vary beside the task
 NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
@@ -40,8 +39,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> str:
     Raises:
         ConfigurationError: not a results folder.
     """
-    results.check_folder(folder)
-    manifest: dict[str, Any] = json.loads((folder / results.MANIFEST).read_text(encoding="utf-8"))
+    manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     runs_in_words = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     lines = [f"- **{runs_in_words}**, of which {completed} reached the last period."]
@@ -82,25 +80,19 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
 
 
-def settled_runs(runs: pd.DataFrame) -> pd.Series[bool]:
-    """Return which runs settled; one that ended early did not, however near it was."""
-    return _column(runs, "settling_time_s").notna() & (runs["status"] == COMPLETED)
-
-
 def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return for each condition and controller how many moves settled, how fast, and with what error."""
     moves, _ = split_tasks(runs)
     rows = []
     for key, group in _groups(moves):
-        settled = int(settled_runs(group).sum())
-        rate = success_rate(settled, len(group))
+        share = settled_share(group)
         rows.append(
             key
             | {
                 "moves": len(group),
-                "settled": settled,
-                "settled [%]": round(100 * settled / len(group)),
-                "settled, 95 %": f"{100 * rate.low:.0f} – {100 * rate.high:.0f}",
+                "settled": int(settling_times(group).notna().sum()),
+                "settled [%]": round(share.value),
+                "settled, 95 %": f"{share.low:.0f} – {share.high:.0f}",
             }
             | _median(group, "settling_time_s")
             | _median(group, "overshoot")
@@ -178,11 +170,10 @@ def _median(group: pd.DataFrame, name: str) -> dict[str, Any]:
     A move that never settled counts as one that settles after all others, ∞; of other measures a gap is left out.
     """
     heading, factor, digits = MEASURES[name]
-    values = factor * _column(group, name)
     if name == "settling_time_s":
-        values = values.where(settled_runs(group))
-        middle = median_with_interval(values)
+        middle = median_with_interval(factor * settling_times(group))
     else:
+        values = factor * _column(group, name)
         middle = median_with_interval(values, missing="left_out") if values.notna().any() else NOTHING
     interval = "" if np.isnan(middle.low) else f"{middle.low:.{digits}f} – {middle.high:.{digits}f}"
     return {heading: _number(middle.value, digits), f"{heading.split(' [')[0]}, 95 %": interval.replace("inf", "∞")}

@@ -20,7 +20,7 @@ from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest
 from harness.figures.places import draw_places
 from harness.figures.style import method_styles
-from harness.statistics import Estimate, median_with_interval, settling_times, success_rate
+from harness.statistics import Estimate, median_with_interval, settled_share, settling_times
 from harness.sweep import Cell, vary
 from plant.mismatch import magnitude_texts
 
@@ -28,7 +28,6 @@ BASE: Final = "moderate"
 TASK: Final = "random"
 MOVE: Final = "camera_move"
 MOVE_DURATION: Final = 20.0  # s, of a run whose camera is moved in its middle
-ROTATION_PLACES: Final = "0:180:30deg"
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Line:
 
 
 LINES: Final = (
-    Line("camera_rotation", "camera turned, °", magnitude_texts("camera_rotation", ROTATION_PLACES)),
+    Line("camera_rotation", "camera turned, °", magnitude_texts("camera_rotation", "0:180:30deg")),
     Line("links", "link lengths wrong by up to, %", magnitude_texts("links", "0:30:10%")),
     Line("joint_offsets", "joint zeros wrong by up to, °", magnitude_texts("joint_offsets", "0:20:5deg")),
     Line("tool", "tool wrong by up to, mm", magnitude_texts("tool", "0:100:25mm")),
@@ -108,12 +107,6 @@ def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:
             10.0,
         ),
     ]
-
-
-def settled_share(runs: pd.DataFrame) -> Estimate:
-    """Return how many of `runs` settled, in percent, with the Wilson interval."""
-    rate = success_rate(int(settling_times(runs).notna().sum()), len(runs))
-    return Estimate(100.0 * rate.value, 100.0 * rate.low, 100.0 * rate.high, rate.count)
 
 
 def settling_median(runs: pd.DataFrame) -> Estimate:

@@ -209,6 +209,12 @@ def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
     return runs.reindex(columns=["settling_time_s"])["settling_time_s"].astype(float).where(runs["status"] == COMPLETED)
 
 
+def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+    """Return how many of `runs` settled, in percent, with the Wilson interval."""
+    rate = success_rate(int(settling_times(runs).notna().sum()), len(runs), confidence)
+    return Estimate(100.0 * rate.value, 100.0 * rate.low, 100.0 * rate.high, rate.count)
+
+
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return for each run `settled`, `not_settled` (it completed, outside the band) or the fault that ended it."""
     settled = pd.Series(np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED), index=runs.index)

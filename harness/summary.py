@@ -8,6 +8,7 @@ from rich.console import Group
 from rich.table import Table
 
 from harness.run import COMPLETED
+from harness.statistics import settling_times
 
 KEYS = ["plant", "mismatch", "task", "controller"]
 
@@ -23,7 +24,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
         row = dict(zip(KEYS, key, strict=True))
         row["runs"] = len(group)
         row["completed"] = int((group["status"] == COMPLETED).sum())
-        row["settled"] = int(_column(group, "settling_time_s").notna().sum())
+        row["settled"] = int(settling_times(group).notna().sum())
         for name in (
             "settling_time_s",
             "overshoot",

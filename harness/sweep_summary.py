@@ -7,6 +7,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.table import Table
 
+from harness.statistics import settling_times
+
 PLACE = ["mismatch", "noise_factor", "latency_periods"]
 
 
@@ -14,8 +16,7 @@ def sweep_tables(runs: pd.DataFrame) -> Group:
     """Return tables for the terminal, one for each plant and task: share of runs settled within 5 mm."""
     tables: list[Table | str] = []
     controllers = list(dict.fromkeys(runs["controller"]))
-    settled = runs["settling_time_s"].notna() if "settling_time_s" in runs else pd.Series(False, index=runs.index)
-    table_rows = runs.assign(settled=settled)
+    table_rows = runs.assign(settled=settling_times(runs).notna())
     for (plant, task), group in table_rows.groupby(["plant", "task"], sort=False):
         table = Table(title=f"{task} on {plant}: settled, %", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
         for heading in ("mismatch", "noise", "latency"):

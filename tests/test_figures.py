@@ -15,7 +15,7 @@ from harness.figures.panels import ENDED
 from harness.figures.style import method_styles
 from harness.figures.tracks import Track, load_groups
 from harness.registry import CONTROLLERS as KNOWN
-from harness.report_tables import settled_runs, split_tasks
+from harness.report_tables import split_tasks
 
 OTHERS = [f"method_{i}" for i in range(20)]
 
@@ -151,7 +151,7 @@ def test_a_folder_without_steps_has_no_figures_of_them(tmp_path, folder):
 
 def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp_path):
     moves, _ = split_tasks(results.load_runs(sweep(tmp_path / "out")))
-    figure = draw_conditions(moves.assign(settled=settled_runs(moves)), method_styles(CONTROLLERS))
+    figure = draw_conditions(moves, method_styles(CONTROLLERS))
     labels = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
     assert labels == ["latency [periods]", "camera rotation [deg]"]
     share = np.asarray(figure.axes[1].containers[0].lines[0].get_ydata(), dtype=float)
@@ -160,7 +160,7 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
 
 def test_nothing_is_drawn_over_conditions_that_do_not_vary(tmp_path):
     moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "out")))
-    assert draw_conditions(moves.assign(settled=True), method_styles(CONTROLLERS)) is None
+    assert draw_conditions(moves, method_styles(CONTROLLERS)) is None
 
 
 def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):

@@ -203,3 +203,22 @@ def test_a_plant_with_a_robot_of_its_own_is_refused(result, monkeypatch):
     monkeypatch.setattr("harness.replay.find_plant", lambda name: Entry())
     with pytest.raises(ConfigurationError, match="brings a robot of its own, no UR5"):
         logged_run(result.row | {"plant": "fmu:crane.toml"}, pd.DataFrame(), {})
+
+
+def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
+    request = RunRequest("kinematic", "rbfnn_mfac_plus", "random", "moderate+camera_move=90deg", 3)
+    made = run_experiment(request, Settings({"random": {"duration": 2.0}}))
+    shown = logged_run(made.row, made.steps, {})
+    assert shown.moved_from == 21  # of 40 periods; the move happens during the one before
+    arm = np.array([shown.model.to_base(shown.model.feature(q)) for q in shown.joint_position])
+    np.testing.assert_allclose(shown.ball, arm, atol=1e-9)
+    before, after = shown.reference[:21], shown.reference[21:]
+    np.testing.assert_allclose(np.ptp(before, axis=0), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.ptp(after, axis=0), 0.0, atol=1e-9)
+    assert np.linalg.norm(after[0] - before[0]) > 0.1
+    with Replay(shown) as replay:
+        views = []
+        for k in (20, 21):
+            replay.place(k)
+            views.append(replay.camera_view())
+    assert (views[0] != views[1]).mean() > 0.1

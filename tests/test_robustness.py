@@ -27,10 +27,10 @@ from harness.robustness import (
     map_cells,
     moved_settings,
     number_of,
-    settled_share,
     settling_median,
 )
 from harness.run import run_experiment
+from harness.statistics import settled_share
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():

@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from harness.figures.panels import Styles, add_legend
-from harness.statistics import success_rate
+from harness.figures.panels import Styles, add_legend, label_rows, panel_grid
+from harness.figures.places import draw_places
+from harness.statistics import Estimate, settled_share
 
 MAGNITUDE = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}
@@ -19,34 +20,26 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
     """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies; None if none does.
 
     Args:
-        runs: rows of the table of runs, with the column `settled` added.
+        runs: rows of the table of runs.
         styles: of the controllers.
     """
     sweeps = _sweeps(runs)
     if not sweeps:
         return None
-    columns = min(3, len(sweeps))
-    rows = -(-len(sweeps) // columns)
-    figure = Figure(figsize=(1.0 + 3.2 * columns if columns > 1 else 6.0, 1.0 + 2.5 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
-    for axes, (label, part) in zip(panels, sweeps.items(), strict=False):
-        spread = 0.012 * float(np.ptp(part["size"]))
-        for i, (name, group) in enumerate(part.groupby("controller", sort=False)):
-            counts = group.groupby("size")["settled"].agg(["sum", "count"])
-            rates = [success_rate(int(total), int(count)) for total, count in counts.to_numpy()]
-            share = 100.0 * np.array([rate.value for rate in rates])
-            low, high = (100.0 * np.array([getattr(rate, end) for rate in rates]) for end in ("low", "high"))
-            bars = np.clip(np.stack([share - low, high - share]), 0.0, None)
-            style = styles[str(name)].line_arguments(1) | {"markevery": None}
-            shift = spread * (i - 0.5 * (part["controller"].nunique() - 1))  # intervals beside, not upon each other
-            axes.errorbar(counts.index + shift, share, yerr=bars, label=name, capsize=2, elinewidth=0.8, **style)
+    figure, panels = panel_grid(len(sweeps), 2.5)
+    for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
+        cells = dict(iter(part.groupby(["controller", "size"])))
+        names, sizes = part["controller"].unique(), sorted(part["size"].unique())
+        shares = {name: [_share(cells.get((name, size))) for size in sizes] for name in names}
+        draw_places(axes, sizes, shares, styles, joined=True)
         axes.set(xlabel=label, ylim=(-4, 104))
-    for i, axes in enumerate(panels):
-        axes.set_visible(i < len(sweeps))
-        if i % columns == 0:
-            axes.set_ylabel("settled runs [%]")
-    add_legend(figure, [axes for axes in panels if axes.get_visible()])
+    label_rows(panels, "settled runs [%]")
+    add_legend(figure, panels)
     return figure
+
+
+def _share(runs: pd.DataFrame | None) -> Estimate:
+    return Estimate(np.nan, np.nan, np.nan, 0) if runs is None else settled_share(runs)
 
 
 def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:

@@ -21,6 +21,7 @@ SETTLED = f"settling band, {MILLI * SETTLING_BAND:g} mm"
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 CAMERA_TILT = -62.0  # deg; −90 looks along the optical axis, from which depth could not be seen
 NO_VALUES = "no values"
+ROW = 3  # panels
 EXACT = 1e-9  # relative error below which an estimate counts as the truth
 LEAST_DEPTH = 0.4  # of the widest axis, so that a flat path does not hide the depth axis
 
@@ -78,6 +79,28 @@ def draw_path(axes: Axes3D, tracks: Tracks, styles: Styles) -> None:
                           linestyle="", zorder=12, gid=ENDED)  # fmt: skip
     _draw_ends(axes, longest, reference)
     _dress_space(axes, longest.features)
+
+
+def panel_grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `ROW` panels a row with a common ordinate, and its `count` panels.
+
+    Args:
+        count: how many panels, at least one.
+        height: of a row, inches.
+    """
+    columns = min(ROW, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(1.0 + 3.1 * columns if columns > 1 else 6.0, 1.0 + height * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure, panels[:count]
+
+
+def label_rows(panels: list[Axes], text: str) -> None:
+    """Label the ordinate of the first panel of each row."""
+    for i, axes in enumerate(panels):
+        axes.set_ylabel(text if i % ROW == 0 else "")
 
 
 def add_legend(figure: Figure, panels: Iterable[Axes], columns: int = 5) -> None:

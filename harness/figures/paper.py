@@ -16,7 +16,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from harness.figures.panels import Styles, add_legend, draw_error, draw_feature, draw_jacobian, draw_path
+from harness.figures.panels import (
+    Styles,
+    add_legend,
+    draw_error,
+    draw_feature,
+    draw_jacobian,
+    draw_path,
+    label_rows,
+    panel_grid,
+)
 from harness.figures.tracks import Tracks
 
 ROOM_IN_SPACE = (0.0, 0.0, 0.95, 0.95)  # matplotlib does not reckon with the labels of axes in space
@@ -94,17 +103,11 @@ def draw_jacobians(tasks: dict[str, Tracks], styles: Styles) -> Figure | None:
     known = {task: tracks for task, tracks in known.items() if tracks}
     if not known:
         return None
-    columns = min(3, len(known))
-    rows = -(-len(known) // columns)
-    figure = Figure(figsize=(1.0 + 3.0 * columns if columns > 1 else 6.0, 1.0 + 2.3 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
-    for axes, (task, tracks) in zip(panels, known.items(), strict=False):
+    figure, panels = panel_grid(len(known), 2.3)
+    for axes, (task, tracks) in zip(panels, known.items(), strict=True):
         draw_jacobian(axes, tracks, styles)
         axes.set(title=task, xlabel="time [s]")
-    for i, axes in enumerate(panels):
-        axes.set_visible(i < len(known))
-        if i % columns:
-            axes.set_ylabel("")
+    label_rows(panels, panels[0].get_ylabel())
     add_legend(figure, panels)
     return figure
 

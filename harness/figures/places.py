@@ -25,7 +25,7 @@ def draw_places(
 
     Args:
         axes: where.
-        places: abscissae, evenly spaced.
+        places: abscissae, ascending; marks are spread over a part of the first distance.
         values: method -> an estimate a place; an infinite one is left out, an infinite end leaves the picture.
         styles: method -> style.
         joined: connect the marks of a method by a line.
