@@ -7,7 +7,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
-from scipy.stats import qmc
 
 from controllers.controller import JacobianFunction
 from controllers.networks import information_vector
@@ -27,6 +26,8 @@ def unit_points(count: int, dimension: int, rng: np.random.Generator, sequence: 
         rng: draws the scrambling.
         sequence: "sobol" or "halton"; "kmeans" clusters Halton points.
     """
+    from scipy.stats import qmc  # noqa: PLC0415 - a third of a second, when networks are trained alone
+
     if sequence == "sobol":
         exponent = int(np.ceil(np.log2(max(count, 2))))
         return np.asarray(qmc.Sobol(dimension, seed=rng).random_base2(exponent)[:count])

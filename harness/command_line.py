@@ -20,7 +20,6 @@ from harness.compare import Batch, check_batch, parse_seeds, run_batch
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings
 from harness.defaults import default_config
 from harness.experiment import known_sections, train_networks
-from harness.figures import draw_figures
 from harness.fmu_commands import fmu_app
 from harness.manifest import describe_batch
 from harness.options import INTERRUPTED, ConfigOption, SetOption, split_names, split_words
@@ -193,6 +192,8 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None,
     console.print(summary_tables(runs))
     _print_faults(runs)
     with console.status("drawing the figures"):
+        from harness.figures.draw import draw_figures  # noqa: PLC0415 - matplotlib takes a third of a second to import
+
         figures = draw_figures(folder)
     if out is None:
         results.point_latest(folder)

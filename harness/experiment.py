@@ -132,7 +132,7 @@ def build_experiment(
     run = settings.resolve("run", RunSettings())
     entry = find_plant(request.plant)
     if entry.own_robot:
-        return _build_with_own_robot(request, settings, run, entry)
+        return _build_with_own_robot(request, settings, run, entry, keep, progress)
     nominal = nominal_ur5()
     try:
         mismatch = parse_mismatch(request.mismatch)
@@ -188,7 +188,14 @@ def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     )
 
 
-def _build_with_own_robot(request: RunRequest, settings: Settings, run: RunSettings, entry: PlantEntry) -> Experiment:
+def _build_with_own_robot(
+    request: RunRequest,
+    settings: Settings,
+    run: RunSettings,
+    entry: PlantEntry,
+    keep: Path | None,
+    progress: Progress | None,
+) -> Experiment:
     """Make a run ready on a plant of whose robot only the plant itself knows anything."""
     if request.mismatch != "none":
         raise ConfigurationError(
@@ -199,7 +206,9 @@ def _build_with_own_robot(request: RunRequest, settings: Settings, run: RunSetti
         spec = plant.spec
         setting = TaskSetting(None, spec.n, spec.feature_names, named_seed(request.seed, "task"))
         scenario = _build_scenario(request, settings, setting)
-        knowledge = RobotKnowledge(spec, run.preview, plant.nominal_jacobian())
+        nominal = plant.nominal_jacobian()
+        source = None if nominal is None else network_source(nominal, spec, keep, progress)
+        knowledge = RobotKnowledge(spec, run.preview, nominal, train=source)
         controller = _build_controller(request, settings, knowledge, plant.true_model)
     except BaseException:
         plant.close()

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from controllers.training import Progress
-from harness.configuration import ConfigurationError
+from harness.configuration import ConfigurationError, suggest
 from harness.figures.draw import save_figure
 from harness.figures.panels import SETTLED
 from harness.figures.style import figure_style, method_styles
@@ -39,6 +39,17 @@ FINENESS = 1.25  # rendered pixels for one of the overview
 REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
 PLACES = 8  # snapshots
 NEAR = 0.05  # of a curve's size, within which its reference counts as back where it began
+
+
+def find_kind(name: str) -> str:
+    """Return the name of a kind of recording.
+
+    Raises:
+        ConfigurationError: an unknown one.
+    """
+    if name not in KINDS:
+        raise ConfigurationError(f"--kinds: unknown {name!r}: {suggest(name, KINDS)}")
+    return name
 
 
 def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:

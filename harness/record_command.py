@@ -11,8 +11,7 @@ from rich.console import Console
 from harness import results
 from harness.configuration import ConfigurationError, Settings, flatten, read_settings, suggest
 from harness.experiment import RunRequest, known_sections
-from harness.options import split_words
-from harness.record import KINDS, write_recording
+from harness.options import split_names
 from harness.replay import LoggedRun, logged_run
 from harness.run import run_experiment
 from plant.bullet import BulletConfig
@@ -37,16 +36,15 @@ def record(
         list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
     ] = None,
     config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None,
-    kinds: Annotated[str, typer.Option(help=f"What to write, by comma: {', '.join(KINDS)}.")] = ",".join(KINDS),
+    kinds: Annotated[str, typer.Option(help="What to write, by comma: mp4, gif, snapshots; or all.")] = "all",
     out: Annotated[
         Path | None, typer.Option(help="Folder for the films; default recordings below the results folder.")
     ] = None,
 ) -> None:
     """Show a run: film (MP4, GIF) and snapshots of the rendered arm, its camera's view and the error."""
-    wanted = tuple(dict.fromkeys(split_words(kinds)))
-    for kind in wanted or (kinds,):
-        if kind not in KINDS:
-            raise ConfigurationError(f"--kinds: unknown {kind!r}: {suggest(kind, KINDS)}")
+    from harness.record import KINDS, find_kind, write_recording  # noqa: PLC0415 - matplotlib, see compare
+
+    wanted = split_names("kinds", kinds, KINDS, find_kind)
     new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "seed": seed}
     given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
     with console.status("reading") as status:

@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from harness import results
 from harness.compare import Batch
 from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest
@@ -28,6 +30,9 @@ BASE: Final = "moderate"
 TASK: Final = "random"
 MOVE: Final = "camera_move"
 MOVE_DURATION: Final = 20.0  # s, of a run whose camera is moved in its middle
+
+
+USUAL, MOVED = "usual", "moved"  # folders of a map: runs of usual length, and those whose camera moves
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,19 @@ def moved_settings(settings: Settings) -> Settings:
     """Return the settings of the runs whose camera moves; a duration that the user gives stays."""
     task = {"duration": MOVE_DURATION, **settings.sections.get(TASK, {})}
     return Settings({**settings.sections, TASK: task})
+
+
+def load_map(folder: Path) -> pd.DataFrame:
+    """Return the runs of a map, both parts; `moved_at_s` says when the camera was moved, NaN where it was not.
+
+    Raises:
+        ConfigurationError: not the folder of a map.
+    """
+    usual, moved = (results.load_runs(folder / part) for part in (USUAL, MOVED))
+    configuration = results.read_manifest(folder / MOVED)["configuration"]
+    moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
+    at_rest = moved["magnitude"].map(number_of).astype(float) == 0.0
+    return pd.concat([usual, moved.assign(moved_at_s=np.where(at_rest, np.nan, moment))], ignore_index=True)
 
 
 def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-import pandas as pd
 import typer
 from rich.console import Console
 
@@ -15,11 +13,10 @@ from harness.compare import parse_seeds
 from harness.configuration import read_settings
 from harness.options import ConfigOption, SetOption, split_names
 from harness.registry import controller_names, find_controller, find_plant, plant_names
-from harness.robustness import TASK, draw_map, map_cells, moved_settings, number_of
 from harness.sweep_command import carry_out_sweep
 
 FIVE = "rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
-USUAL, MOVED, FIGURES = "usual", "moved", "figures"
+FIGURES = "figures"
 
 console = Console()
 
@@ -36,6 +33,8 @@ def robustness(
     config: ConfigOption = None,
 ) -> None:
     """Draw the robustness map: success and settling time along seven axes, one made worse at a time."""
+    from harness.robustness import MOVED, USUAL, draw_map, load_map, map_cells, moved_settings  # noqa: PLC0415 - matplotlib, see compare
+
     settings = read_settings(config, set_ or [])
     names = split_names("controllers", controllers, controller_names(), find_controller)
     usual, moved = map_cells(split_names("plant", plant, plant_names(), find_plant)[0], names, parse_seeds(seeds))
@@ -46,16 +45,3 @@ def robustness(
     results.write_summary(out, tables, results.read_manifest(out / USUAL))
     files = draw_map(load_map(out), out / FIGURES)
     console.print(f"the map is in {files[0]}; tables in {out / USUAL} and {out / MOVED}", soft_wrap=True)
-
-
-def load_map(folder: Path) -> pd.DataFrame:
-    """Return the runs of a map, both parts; `moved_at_s` says when the camera was moved, NaN where it was not.
-
-    Raises:
-        ConfigurationError: not the folder of a map.
-    """
-    usual, moved = (results.load_runs(folder / part) for part in (USUAL, MOVED))
-    configuration = results.read_manifest(folder / MOVED)["configuration"]
-    moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
-    at_rest = moved["magnitude"].map(number_of).astype(float) == 0.0
-    return pd.concat([usual, moved.assign(moved_at_s=np.where(at_rest, np.nan, moment))], ignore_index=True)

@@ -21,9 +21,6 @@ from typing import Final, Literal
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy import stats
-from statsmodels.stats.multitest import multipletests
-from statsmodels.stats.proportion import proportion_confint
 
 from harness.run import COMPLETED
 from plant.signals import FloatArray
@@ -77,6 +74,8 @@ def success_rate(successes: int, runs: int, confidence: float = CONFIDENCE) -> E
     Raises:
         ValueError: no run, or more successes than runs.
     """
+    from statsmodels.stats.proportion import proportion_confint  # noqa: PLC0415 - half a second, to judge alone
+
     if not 0 <= successes <= runs or runs < 1:
         raise ValueError(f"successes must be from 0 to runs, and runs at least 1; got {successes} of {runs}")
     low, high = proportion_confint(successes, runs, alpha=1.0 - confidence, method="wilson")
@@ -106,6 +105,8 @@ def median_with_interval(
     Raises:
         ValueError: no value, or −∞.
     """
+    from scipy import stats  # noqa: PLC0415 - as above
+
     sample = _sample(values, missing)
     if len(sample) == 0:
         raise ValueError("values must hold at least one number")
@@ -189,6 +190,8 @@ def compare_pairs(
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values after Holm's correction for their number."""
+    from statsmodels.stats.multitest import multipletests  # noqa: PLC0415 - as above
+
     return [float(value) for value in multipletests(p_values, method="holm")[1]]
 
 
@@ -197,6 +200,8 @@ def signed_rank_p_value(differences: ArrayLike) -> float:
 
     Differences below a billionth of the largest count as zero and equal ones as ties: 0.3 − 0.1 and 0.2 are no ranks.
     """
+    from scipy import stats  # noqa: PLC0415 - as above
+
     difference = np.asarray(differences, dtype=np.float64)
     largest = float(np.abs(difference).max())
     if largest == 0.0:

@@ -8,9 +8,8 @@ import pytest
 from folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 
 from harness import results
-from harness.figures import draw_figures, picture_of
 from harness.figures.conditions import draw_conditions
-from harness.figures.draw import folder_figures
+from harness.figures.draw import draw_figures, folder_figures, picture_of
 from harness.figures.panels import ENDED
 from harness.figures.style import method_styles
 from harness.figures.tracks import Track, load_groups

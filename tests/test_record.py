@@ -153,7 +153,7 @@ def test_a_new_run_is_recorded_below_the_results(monkeypatch, capsys, tmp_path):
         (("FOLDER", "--controller", "rls"), "--controller belongs to a new run"),
         (("FOLDER", "--run", "nobody"), "has no run 'nobody'"),
         (("FOLDER", "--kinds", "mp4,avi"), "--kinds: unknown 'avi'"),
-        (("FOLDER", "--kinds", ","), "--kinds: unknown ','"),
+        (("FOLDER", "--kinds", ","), "--kinds is empty; valid: mp4"),
         (("NONE",), "is not a results folder"),
         (("--seed", "-1"), "seed must not be negative, got -1"),
         (("--task", "exp9"), "unknown task 'exp9'"),

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from controllers.controller import Diagnostics
 from plant.signals import FloatArray
 
+LONGEST_DELAY = 14  # periods: no estimator tells of a longer one, so that laws know how much past to keep
+
 
 @dataclass(frozen=True, slots=True)
 class Motion:
@@ -44,7 +46,7 @@ class Estimator(ABC):
         """Return Ĵ at `joint_position` (n,), rad, as an (m, n) array in m/rad that the caller may keep."""
 
     def delay(self) -> int:
-        """Return by how many periods features are older than joint positions, as far as it is estimated; 0 if not."""
+        """Return by how many periods features are late, at most `LONGEST_DELAY`; 0 where that is not estimated."""
         return 0
 
     @abstractmethod

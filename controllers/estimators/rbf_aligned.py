@@ -15,14 +15,13 @@ from typing import final
 import numpy as np
 
 from controllers.controller import Diagnostics
-from controllers.estimators.estimator import Estimator, Motion
+from controllers.estimators.estimator import LONGEST_DELAY, Estimator, Motion
 from controllers.estimators.map_bank import map_update, near_rotation
 from controllers.estimators.noise_level import NoiseLevel
 from controllers.estimators.rbf import RbfConfig, RbfEstimator
 from controllers.networks import JacobianNetwork
 from plant.signals import FloatArray, check_number
 
-LONGEST = 14  # periods of latency that a law remembers joint positions for
 ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
 JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm
 JUMP_NOISE = 10.0  # σ, beyond which it is no noise either
@@ -61,7 +60,7 @@ class RbfAlignedConfig:
             check_number(name, getattr(self, name), above=0.0)
         for name in ("walk", "model_error", "rotation_deviation", "margin"):
             check_number(name, getattr(self, name), at_least=0.0)
-        check_number("longest_delay", self.longest_delay, at_least=0, at_most=LONGEST)
+        check_number("longest_delay", self.longest_delay, at_least=0, at_most=LONGEST_DELAY)
         check_number("forgetting", self.forgetting, above=0.0, at_most=1.0)
 
 

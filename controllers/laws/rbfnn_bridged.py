@@ -19,6 +19,7 @@ from typing import Literal, final, get_args
 import numpy as np
 
 from controllers.controller import Diagnostics, RobotKnowledge
+from controllers.estimators.estimator import LONGEST_DELAY
 from controllers.estimators.map_bank import nearest_rotation
 from controllers.estimators.noise_level import NoiseLevel
 from controllers.laws.damped_inverse import damped_inverse
@@ -34,7 +35,6 @@ from plant.signals import FloatArray, Observation, check_number
 Base = Literal["jacobian", "network"]
 BASES: tuple[str, ...] = get_args(Base)
 LEARNED = ("criterion", "step_size", "predicted_error", "learned_weight_norm")  # diagnostics that both bases have
-PAST = 16  # instants of joint positions that are kept, more than any delay
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class RbfnnBridgedLaw(Law):
 
     def expect_delay(self, delay: int) -> None:
         """Take the camera's delay, periods, for the next command."""
-        self._delay = min(delay, PAST - 2)
+        self._delay = delay
 
     def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return u, (n,), rad/s; see `Law.command`."""
@@ -171,7 +171,7 @@ class RbfnnBridgedLaw(Law):
 
     def _extended_past(self, joint_position: FloatArray) -> FloatArray:
         if self._past is None:  # the arm was at rest
-            self._past = np.repeat(joint_position[None], PAST, axis=0)
+            self._past = np.repeat(joint_position[None], LONGEST_DELAY + 2, axis=0)
         else:
             self._past = np.concatenate([joint_position[None], self._past[:-1]])
         return self._past

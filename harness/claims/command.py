@@ -11,7 +11,6 @@ from rich.console import Console
 
 from harness import results
 from harness.claims.answers import answer_all
-from harness.claims.figures import draw_answers
 from harness.claims.studies import MAIN, studies
 from harness.claims.table import ANSWERS, differences, markdown_table, read_answers, write_tables
 from harness.configuration import ConfigurationError
@@ -35,6 +34,8 @@ def claims(
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
+    from harness.claims.figures import draw_answers  # noqa: PLC0415 - matplotlib takes a third of a second to import
+
     if seeds < FEWEST:
         raise ConfigurationError(f"--seeds must be at least {FEWEST} to tell methods apart, got {seeds}")
     names = split_names("plants", plants, plant_names(), find_plant)
