@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import pandas as pd
 
+from harness.configuration import ConfigurationError, suggest
 from harness.run import COMPLETED
 from harness.statistics import (
     SETTLED,
@@ -70,29 +71,57 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def compare_controllers(runs: pd.DataFrame, never: float, metric: str = "settling_time_s") -> pd.DataFrame:
+def usual_metric(runs: pd.DataFrame) -> str:
+    """Return what the controllers of one task are compared by: settling time, or on a curve the error along it."""
+    moves = "overshoot" in runs and runs["overshoot"].notna().any()
+    return "settling_time_s" if moves or "rms_error_evaluated_m" not in runs else "rms_error_evaluated_m"
+
+
+def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> pd.DataFrame:
     """Return a row for each pair of controllers: the median of their paired difference and what Wilcoxon's test says.
 
     Args:
         runs: of one plant, task and condition.
-        never: what a run without a value counts as.
-        metric: the column compared.
+        metric: the column compared; by default the usual one.
+        never: what a run without a value, or one that did not complete, counts as; by default twice the largest value.
+
+    Raises:
+        ConfigurationError: no such column of numbers.
     """
     pairs: Sequence[tuple[str, str]] = list(combinations(dict.fromkeys(runs["controller"]), 2))
     if not pairs:
         return pd.DataFrame()
+    metric = usual_metric(runs) if metric is None else metric
+    numbers = [str(name) for name in runs.select_dtypes("number").columns]
+    if metric not in numbers:
+        raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
+    if never is None:
+        known = runs[metric].dropna()
+        never = 2.0 * float(known.max()) if len(known) else 1.0
     compared = compare_pairs(runs, pairs, never=never, metric=metric, keys=("seed",))
+    heading, factor = _in_units(metric)
     return pd.DataFrame(
         [
             {
                 "pair": f"{pair.first} − {pair.second}",
                 "pairs": str(pair.difference.count),
-                "difference": _text(pair.difference, 3),
+                f"difference in {heading}": _text(_scaled(pair.difference, factor), 2),
                 "p after Holm": f"{pair.corrected_p_value:.2g}",
             }
             for pair in compared
         ]
     )
+
+
+def _in_units(metric: str) -> tuple[str, float]:
+    """Return a column's name with a unit of handy size, and the factor to it."""
+    name, _, unit = metric.rpartition("_")
+    handy, factor = {"m": ("mm", 1000.0), "s": ("s", 1.0), "us": ("µs", 1.0), "rad": ("rad", 1.0)}.get(unit, ("", 1.0))
+    return (f"{name.replace('_', ' ')}, {handy}" if handy else metric.replace("_", " ")), factor
+
+
+def _scaled(estimate: Estimate, factor: float) -> Estimate:
+    return Estimate(factor * estimate.value, factor * estimate.low, factor * estimate.high, estimate.count)
 
 
 def _median(values: pd.Series[float] | None, factor: float, digits: int) -> str:

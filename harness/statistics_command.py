@@ -19,13 +19,17 @@ console = Console()
 
 def statistics(
     folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
-    metric: Annotated[str, typer.Option(help="Column that pairs are compared by; less is better.")] = "settling_time_s",
-    never: Annotated[float, typer.Option(help="What a run without a value counts as in pairs.")] = 10.0,
+    metric: Annotated[
+        str | None, typer.Option(help="Column that pairs are compared by; default: settling time, on curves RMS error.")
+    ] = None,
+    never: Annotated[
+        float | None, typer.Option(help="What a run without a value counts as in pairs; default: twice the largest.")
+    ] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print tables for a page.")] = False,
 ) -> None:
     """Judge the controllers of a folder: rates, medians, tails, failures, paired differences, with 95 % intervals."""
     for words, runs in places(results.load_runs(folder)):
-        for title, table in ((words, judge_controllers(runs)), ("pairs", compare_controllers(runs, never, metric))):
+        for title, table in ((words, judge_controllers(runs)), ("pairs", compare_controllers(runs, metric, never))):
             if len(table):
                 _print_markdown(title, table) if markdown else console.print(_terminal(title, table))
 

@@ -111,6 +111,14 @@ def test_runs_that_never_settle_or_fail_count_as_slow():
     assert verdicts(made)["1"] == f"{DEPENDS}: holds in 6 of 12"
 
 
+@pytest.mark.parametrize(("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)])
+def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, number, same):
+    answer = answer_all(tables(), "kinematic")[0]
+    write_tables([replace(answer, evidence="circle 10.0 [9.0, 12.5] mm in 38 of 40")], tmp_path)
+    found = [replace(answer, evidence=f"circle {number} mm in 37 of 40")]
+    assert (differences(found, read_answers(tmp_path / "answers.csv")) == []) == same
+
+
 def test_a_committed_table_is_compared_line_by_line(tmp_path):
     answers = answer_all(tables(), "kinematic")
     write_tables(answers, tmp_path)
@@ -118,6 +126,8 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
     assert differences(answers, wanted) == []
     (line,) = differences([replace(answers[0], verdict=REPRODUCED), *answers[1:]], wanted)
     assert line.startswith("claim 1 on kinematic: now reproduced: faster in")
+    (line,) = differences([replace(answers[0], evidence=answers[0].evidence.replace("faster", "slower"))], wanted)
+    assert "slower" in line
     assert differences([replace(answers[0], plant="bullet")], wanted) == ["claim 1 on bullet: not in the table"]
     with pytest.raises(ConfigurationError, match="is not a table of answers"):
         read_answers(tmp_path / "nothing.csv")

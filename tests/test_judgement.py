@@ -10,6 +10,7 @@ import pytest
 
 from harness import results
 from harness.command_line import main
+from harness.configuration import ConfigurationError
 from harness.judgement import compare_controllers, judge_controllers, places
 
 
@@ -46,9 +47,28 @@ def test_pairs_are_compared_on_common_seeds(runs):
     (row,) = compare_controllers(runs, never=10.0).to_dict("records")
     assert row["pair"] == "quick − slow"
     assert row["pairs"] == "20"
-    assert row["difference"].startswith("-1.1")
+    assert row["difference in settling time, s"].startswith("-1.1")
     assert float(row["p after Holm"]) < 0.001
     assert compare_controllers(runs[runs["controller"] == "quick"], never=10.0).empty
+
+
+def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
+    better = runs["controller"] == "quick"
+    curve = runs.assign(overshoot=np.nan, rms_error_evaluated_m=np.where(better, 0.002, 0.0035), status="completed")
+    (row,) = compare_controllers(curve).to_dict("records")
+    assert row["difference in rms error evaluated, mm"] == "-1.50 [-1.50, -1.50]"
+
+
+def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
+    late = runs.assign(settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0))
+    few = late[late["seed"] < 4]  # of which the slow one settles in none
+    (row,) = compare_controllers(few).to_dict("records")
+    assert row["difference in settling time, s"].startswith("-31.0")
+
+
+def test_an_unknown_metric_is_told_in_one_line(runs):
+    with pytest.raises(ConfigurationError, match="no column of numbers 'settling_time': .*settling_time_s"):
+        compare_controllers(runs, "settling_time")
 
 
 def test_conditions_are_told_apart_in_words(runs):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, TypeAlias
 
+import numpy as np
 import pandas as pd
 
 from harness.claims.measurements import Answer
@@ -13,6 +15,8 @@ from harness.configuration import ConfigurationError
 
 ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
+NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
+SHARE, PERIOD = 0.1, 0.051  # of a number, and absolute, by which evidence may differ
 COLUMNS: Final = ("claim", "statement", "plant", "verdict", "evidence")
 
 Answers: TypeAlias = Mapping[tuple[str, str], tuple[str, str]]
@@ -66,15 +70,25 @@ def read_answers(path: Path) -> Answers:
 
 
 def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
-    """Return a line for each answer that is not the one wanted."""
+    """Return a line for each answer that is not the one wanted.
+
+    Verdicts and words must be the same. Numbers of the evidence may differ by a tenth and a period: networks that are
+    fitted on another processor differ by rounding, which loops amplify.
+    """
     lines = []
     for answer in answers:
         name, key = f"claim {answer.claim} on {answer.plant}", (answer.claim, answer.plant)
         if key not in wanted:
             lines.append(f"{name}: not in the table")
-        elif wanted[key] != (answer.verdict, answer.evidence):
+        elif wanted[key][0] != answer.verdict or not _agree(answer.evidence, wanted[key][1]):
             lines.append(f"{name}: now {answer.verdict}: {answer.evidence}")
     return lines
+
+
+def _agree(found: str, wanted: str) -> bool:
+    ours, theirs = ([float(number) for number in NUMBER.findall(text)] for text in (found, wanted))
+    same_words = NUMBER.sub("", found) == NUMBER.sub("", wanted)
+    return same_words and bool(np.allclose(ours, theirs, rtol=SHARE, atol=PERIOD))
 
 
 def markdown_table(answers: Sequence[Answer]) -> str:
