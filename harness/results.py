@@ -8,6 +8,7 @@ then renamed, steps first: what is there is whole. At the end they are put toget
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator
@@ -43,10 +44,19 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    """Write `manifest.json`, whole or not at all."""
+    """Write `manifest.json`, whole or not at all; JSON has no infinity, so that a setting without limit reads "inf"."""
     partial = folder / f".{MANIFEST}"
-    partial.write_text(json.dumps({"schema_version": SCHEMA_VERSION, **manifest}, indent=2) + "\n", encoding="utf-8")
+    content = json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2, allow_nan=False)
+    partial.write_text(content + "\n", encoding="utf-8")
     partial.replace(folder / MANIFEST)
+
+
+def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
+    if isinstance(value, dict):
+        return {key: _in_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_in_json(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_part(folder: Path, index: int, row: dict[str, Any], steps: pd.DataFrame) -> None:

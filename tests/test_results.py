@@ -107,3 +107,11 @@ def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder
     (folder.parent / "latest").mkdir()
     results.point_latest(newer)
     assert not (folder.parent / "latest").is_symlink()
+
+
+def test_the_manifest_is_json_for_every_reader(tmp_path):
+    results.create_folder(tmp_path / "out", {"limit": float("inf"), "low": (1.5, float("-inf")), "count": 3})
+    text = (tmp_path / "out" / results.MANIFEST).read_text(encoding="utf-8")
+    assert "Infinity" not in text
+    manifest = json.loads(text)
+    assert (manifest["limit"], manifest["low"], manifest["count"]) == ("inf", [1.5, "-inf"], 3)
