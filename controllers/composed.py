@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 from controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from controllers.estimators.broyden import BroydenConfig, BroydenEstimator
@@ -35,6 +35,8 @@ from controllers.servo import ServoController
 from controllers.training import obtain_networks
 from controllers.training_config import TrainingConfig
 
+NetworkSource: TypeAlias = Callable[[], TrainedNetworks]
+
 
 @dataclass(frozen=True)
 class EstimatorEntry:
@@ -42,13 +44,15 @@ class EstimatorEntry:
 
     Attributes:
         config: frozen dataclass with a default for every field.
-        build: makes the estimator from its configuration and what it may know.
+        build: makes the estimator from its configuration, what it may know and where offline networks come from.
         needs_truth: it is told the true Jacobian.
+        trained: it starts from offline networks.
     """
 
     config: type[Any]
-    build: Callable[[Any, RobotKnowledge], Estimator]
+    build: Callable[[Any, RobotKnowledge, NetworkSource], Estimator]
     needs_truth: bool = False
+    trained: bool = False
 
 
 @dataclass(frozen=True)
@@ -57,50 +61,53 @@ class LawEntry:
 
     Attributes:
         config: frozen dataclass with a default for every field.
-        build: makes the law from its configuration and what it may know.
+        build: makes the law from its configuration, what it may know and where offline networks come from.
+        trained: it starts from offline networks.
     """
 
     config: type[Any]
-    build: Callable[[Any, RobotKnowledge], Law]
-
-
-def _default_networks(knowledge: RobotKnowledge) -> TrainedNetworks:
-    """Return the networks of the default training; with a cache behind `knowledge.train` both parts share one."""
-    return obtain_networks(TrainingConfig(), knowledge)
+    build: Callable[[Any, RobotKnowledge, NetworkSource], Law]
+    trained: bool = False
 
 
 ESTIMATORS: dict[str, EstimatorEntry] = {
-    "constant": EstimatorEntry(ConstantConfig, lambda _config, _knowledge: ConstantEstimator()),
-    "true": EstimatorEntry(TrueConfig, lambda _config, knowledge: TrueEstimator(knowledge), needs_truth=True),
-    "ukf": EstimatorEntry(UkfConfig, lambda config, _knowledge: UkfEstimator(config)),
-    "kalman": EstimatorEntry(KalmanConfig, lambda config, _knowledge: KalmanEstimator(config)),
-    "broyden": EstimatorEntry(BroydenConfig, lambda config, _knowledge: BroydenEstimator(config)),
-    "rls": EstimatorEntry(RlsConfig, lambda config, _knowledge: RlsEstimator(config)),
+    "constant": EstimatorEntry(ConstantConfig, lambda _config, _knowledge, _networks: ConstantEstimator()),
+    "true": EstimatorEntry(
+        TrueConfig, lambda _config, knowledge, _networks: TrueEstimator(knowledge), needs_truth=True
+    ),
+    "ukf": EstimatorEntry(UkfConfig, lambda config, _knowledge, _networks: UkfEstimator(config)),
+    "kalman": EstimatorEntry(KalmanConfig, lambda config, _knowledge, _networks: KalmanEstimator(config)),
+    "broyden": EstimatorEntry(BroydenConfig, lambda config, _knowledge, _networks: BroydenEstimator(config)),
+    "rls": EstimatorEntry(RlsConfig, lambda config, _knowledge, _networks: RlsEstimator(config)),
     "rbf": EstimatorEntry(
-        RbfConfig, lambda config, knowledge: RbfEstimator(config, _default_networks(knowledge).jacobian)
+        RbfConfig, lambda config, _knowledge, networks: RbfEstimator(config, networks().jacobian), trained=True
     ),
     "rbf_lyapunov": EstimatorEntry(
         RbfLyapunovConfig,
-        lambda config, knowledge: RbfLyapunovEstimator(config, _default_networks(knowledge).jacobian),
+        lambda config, _knowledge, networks: RbfLyapunovEstimator(config, networks().jacobian),
+        trained=True,
     ),
     "rbf_aligned": EstimatorEntry(
         RbfAlignedConfig,
-        lambda config, knowledge: RbfAlignedEstimator(
-            config, _default_networks(knowledge).jacobian, knowledge.spec.period
-        ),
+        lambda config, knowledge, networks: RbfAlignedEstimator(config, networks().jacobian, knowledge.spec.period),
+        trained=True,
     ),
-    "cfdl": EstimatorEntry(CfdlConfig, lambda config, _knowledge: CfdlEstimator(config)),
+    "cfdl": EstimatorEntry(CfdlConfig, lambda config, _knowledge, _networks: CfdlEstimator(config)),
 }
 
 LAWS: dict[str, LawEntry] = {
-    "pid": LawEntry(PidConfig, PidLaw),
-    "mfac": LawEntry(MfacConfig, MfacLaw),
-    "mpc": LawEntry(MpcConfig, MpcLaw),
+    "pid": LawEntry(PidConfig, lambda config, knowledge, _networks: PidLaw(config, knowledge)),
+    "mfac": LawEntry(MfacConfig, lambda config, knowledge, _networks: MfacLaw(config, knowledge)),
+    "mpc": LawEntry(MpcConfig, lambda config, knowledge, _networks: MpcLaw(config, knowledge)),
     "rbfnn": LawEntry(
-        RbfnnConfig, lambda config, knowledge: RbfnnLaw(config, _default_networks(knowledge).controller, knowledge)
+        RbfnnConfig,
+        lambda config, knowledge, networks: RbfnnLaw(config, networks().controller, knowledge),
+        trained=True,
     ),
     "rbfnn_bridged": LawEntry(
-        RbfnnBridgedConfig, lambda config, knowledge: RbfnnBridgedLaw(config, _default_networks(knowledge), knowledge)
+        RbfnnBridgedConfig,
+        lambda config, knowledge, networks: RbfnnBridgedLaw(config, networks(), knowledge),
+        trained=True,
     ),
 }
 
@@ -111,7 +118,8 @@ def servo_entry(name: str, summary: str, config: type[Any], *, law: str, estimat
     Args:
         name: the word on the command line.
         summary: one line about it.
-        config: frozen dataclass with the fields `estimator`, `law` and `initial`, of the parts' own configurations.
+        config: frozen dataclass with the fields `estimator`, `law` and `initial`, of the parts' own configurations, and
+            `training` where a part starts from offline networks.
         law: a name in `LAWS`.
         estimator: a name in `ESTIMATORS`.
 
@@ -122,9 +130,10 @@ def servo_entry(name: str, summary: str, config: type[Any], *, law: str, estimat
     estimator_entry = _find("estimator", estimator, ESTIMATORS)
 
     def build(settings: Any, knowledge: RobotKnowledge) -> Controller:  # noqa: ANN401 - the entry's own configuration
+        networks = cache(lambda: obtain_networks(settings.training, knowledge))  # of both parts the same
         return ServoController(
-            estimator_entry.build(settings.estimator, knowledge),
-            law_entry.build(settings.law, knowledge),
+            estimator_entry.build(settings.estimator, knowledge, networks),
+            law_entry.build(settings.law, knowledge, networks),
             initial_jacobian(settings.initial, knowledge),
             knowledge,
         )
@@ -141,20 +150,19 @@ def compose(law: str, estimator: str) -> ControllerEntry:
         estimator: a name in `ESTIMATORS`.
 
     Returns:
-        An entry called `law+estimator`, whose configuration has the fields estimator, law and initial.
+        An entry called `law+estimator`, whose configuration has the fields estimator, law and initial, and training
+        where one of the two starts from offline networks.
 
     Raises:
         ValueError: an unknown name.
     """
-    estimator_config = _find("estimator", estimator, ESTIMATORS).config
-    law_config = _find("law", law, LAWS).config
+    parts = _find("estimator", estimator, ESTIMATORS), _find("law", law, LAWS)
+    configs = {"estimator": parts[0].config, "law": parts[1].config, "initial": InitialConfig}
+    if any(part.trained for part in parts):
+        configs["training"] = TrainingConfig
     config = make_dataclass(
         f"{law}_{estimator}_config",
-        [
-            ("estimator", estimator_config, field(default_factory=estimator_config)),
-            ("law", law_config, field(default_factory=law_config)),
-            ("initial", InitialConfig, field(default_factory=InitialConfig)),
-        ],
+        [(name, kind, field(default_factory=kind)) for name, kind in configs.items()],
         frozen=True,
     )
     summary = f"the law {law} on the Jacobian that the estimator {estimator} tells"

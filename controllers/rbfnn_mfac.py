@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.controller import ControllerEntry, RobotKnowledge
-from controllers.estimators.rbf import RbfConfig, RbfEstimator
-from controllers.initial import InitialConfig, initial_jacobian
-from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
-from controllers.servo import ServoController
-from controllers.training import obtain_networks
+from controllers.composed import servo_entry
+from controllers.estimators.rbf import RbfConfig
+from controllers.initial import InitialConfig
+from controllers.laws.rbfnn import RbfnnConfig
 from controllers.training_config import TrainingConfig
 
 
@@ -23,24 +21,10 @@ class RbfnnMfacConfig:
     initial: InitialConfig = field(default_factory=InitialConfig)  # moves before the first step; its matrix is not used
 
 
-def build(config: RbfnnMfacConfig, knowledge: RobotKnowledge) -> ServoController:
-    """Return the proposed controller.
-
-    Raises:
-        ValueError: settings that do not fit the plant, or networks that cannot be had.
-    """
-    networks = obtain_networks(config.training, knowledge)
-    return ServoController(
-        RbfEstimator(config.estimator, networks.jacobian),
-        RbfnnLaw(config.law, networks.controller, knowledge),
-        initial_jacobian(config.initial, knowledge),
-        knowledge,
-    )
-
-
-ENTRY = ControllerEntry(
+ENTRY = servo_entry(
     "rbfnn_mfac",
     "the proposed method: a controller network and a Jacobian network that learn online (eqs. 7-39)",
     RbfnnMfacConfig,
-    build,
+    law="rbfnn",
+    estimator="rbf",
 )

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.controller import ControllerEntry, RobotKnowledge
-from controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
-from controllers.initial import InitialConfig, initial_jacobian
-from controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
-from controllers.servo import ServoController
-from controllers.training import obtain_networks
+from controllers.composed import servo_entry
+from controllers.estimators.rbf_aligned import RbfAlignedConfig
+from controllers.initial import InitialConfig
+from controllers.laws.rbfnn_bridged import RbfnnBridgedConfig
 from controllers.training_config import TrainingConfig
 
 
@@ -26,24 +24,10 @@ class RbfnnMfacPlusConfig:
     initial: InitialConfig = field(default_factory=InitialConfig)  # moves before the first step; its matrix is not used
 
 
-def build(config: RbfnnMfacPlusConfig, knowledge: RobotKnowledge) -> ServoController:
-    """Return the controller.
-
-    Raises:
-        ValueError: settings that do not fit the plant, or networks that cannot be had.
-    """
-    networks = obtain_networks(config.training, knowledge)
-    return ServoController(
-        RbfAlignedEstimator(config.estimator, networks.jacobian, knowledge.spec.period),
-        RbfnnBridgedLaw(config.law, networks, knowledge),
-        initial_jacobian(config.initial, knowledge),
-        knowledge,
-    )
-
-
-ENTRY = ControllerEntry(
+ENTRY = servo_entry(
     "rbfnn_mfac_plus",
     "the proposed method with an estimated camera map and delay, prediction past all delays and a faster law",
     RbfnnMfacPlusConfig,
-    build,
+    law="rbfnn_bridged",
+    estimator="rbf_aligned",
 )
