@@ -17,6 +17,7 @@ from harness.figures.draw import folder_figures, picture_of
 from harness.manifest import describe_batch
 from harness.record import draw_frame
 from harness.replay import logged_run
+from harness.robustness_command import make_map
 
 BATCH = Batch(
     plants=("bullet",),
@@ -28,6 +29,8 @@ BATCH = Batch(
 SHOWN = "bullet-rbfnn_mfac_plus-circle-moderate-0"
 PERIOD = 150  # of the run shown: three quarters of a lap
 FILES = {"errors": "errors", "tracking": "circle", "paths": "paths"}  # kind of figure -> name of its file
+MAP_CONTROLLERS = BATCH.controllers[:5]
+MAP_SEEDS = range(50_000, 50_030)
 COLOURS = 128  # of the rendered picture's palette
 
 
@@ -46,6 +49,10 @@ def draw_pictures(folder: Path) -> Iterator[Path]:
         for named in folder_figures(batch):
             if named.kind in FILES:
                 yield _write(folder / f"{FILES[named.kind]}.png", picture_of(named.figure)[0])
+        for path in make_map(Path(scratch) / "map", "fmu", MAP_CONTROLLERS, MAP_SEEDS, settings):
+            if path.suffix == ".png":
+                with Image.open(path) as picture:
+                    yield _write(folder / path.name, _small(picture.convert("RGB")))
 
 
 def _bench(batch: Path) -> bytes:
@@ -53,8 +60,13 @@ def _bench(batch: Path) -> bytes:
     runs = results.load_runs(batch)
     row = {str(name): value for name, value in runs[runs["run_id"] == SHOWN].iloc[0].items()}
     frame = draw_frame(logged_run(row, results.load_steps(batch, [SHOWN]), {}), PERIOD)
+    return _small(Image.fromarray(frame))
+
+
+def _small(picture: Image.Image) -> bytes:
+    """Return a picture as PNG with a palette."""
     stream = io.BytesIO()
-    Image.fromarray(frame).quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
     return stream.getvalue()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from rich.console import Console
 
 from harness import results
 from harness.compare import parse_seeds
-from harness.configuration import read_settings
+from harness.configuration import Settings, read_settings
 from harness.options import ConfigOption, SetOption, split_names
 from harness.registry import controller_names, find_controller, find_plant, plant_names
 from harness.sweep_command import carry_out_sweep
@@ -33,15 +34,42 @@ def robustness(
     config: ConfigOption = None,
 ) -> None:
     """Draw the robustness map: success and settling time along seven axes, one made worse at a time."""
-    from harness.robustness import MOVED, USUAL, draw_map, load_map, map_cells, moved_settings  # noqa: PLC0415 - matplotlib, see compare
-
     settings = read_settings(config, set_ or [])
     names = split_names("controllers", controllers, controller_names(), find_controller)
-    usual, moved = map_cells(split_names("plant", plant, plant_names(), find_plant)[0], names, parse_seeds(seeds))
+    where = split_names("plant", plant, plant_names(), find_plant)[0]
+    files = make_map(out, where, names, parse_seeds(seeds), settings, workers, scheduler, resume=resume)
+    console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
+
+
+def make_map(
+    out: Path,
+    plant: str,
+    controllers: Sequence[str],
+    seeds: Sequence[int],
+    settings: Settings,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    *,
+    resume: bool = False,
+) -> list[Path]:
+    """Carry out the runs of a map, put its tables together and draw it; the options are those of the command.
+
+    Returns:
+        The files of the pictures.
+    """
+    from harness.robustness import (  # noqa: PLC0415 - matplotlib, see compare
+        MOVED,
+        USUAL,
+        draw_map,
+        load_map,
+        map_cells,
+        moved_settings,
+    )
+
+    usual, moved = map_cells(plant, controllers, seeds)
     for folder, cells, chosen in ((USUAL, usual, settings), (MOVED, moved, moved_settings(settings))):
         going_on = resume and (out / folder).exists()
         carry_out_sweep(cells, chosen, out / folder, workers, scheduler, resume=going_on)
     tables = {part: results.load_runs(out / part) for part in (USUAL, MOVED)}
     results.write_summary(out, tables, results.read_manifest(out / USUAL))
-    files = draw_map(load_map(out), out / FIGURES)
-    console.print(f"the map is in {files[0]}; tables in {out / USUAL} and {out / MOVED}", soft_wrap=True)
+    return draw_map(load_map(out), out / FIGURES)
