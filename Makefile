@@ -21,7 +21,7 @@ format: $(VENV)/ready
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Draw the README's pictures anew from committed seeds: the map takes a quarter of an hour on two processors.
+# Draw the README's pictures anew from committed seeds: the map takes six minutes on two processors, more where they are slow.
 figures: $(VENV)/ready
 	$(BIN)/python -m harness.readme_pictures docs/pictures
 

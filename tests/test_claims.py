@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from command import servobench
 
 from harness.claims.answers import answer_all
 from harness.claims.figures import draw_answers
 from harness.claims.measurements import DEPENDS, NOT_REPRODUCED, REPRODUCED
 from harness.claims.studies import CIRCLE, ENTRIES, FIRST_SEED, FROZEN, MAIN, MOVES, NO_EPSILON, PROPOSED, studies
 from harness.claims.table import answer_table, differences, markdown_table, read_answers, write_tables
-from harness.command_line import main
 from harness.configuration import ConfigurationError
 from harness.seed_ranges import TUNING
 
@@ -149,13 +148,6 @@ def test_no_study_uses_a_seed_that_methods_were_tuned_on():
         seeds = {cell.request.seed for cell in study.cells}
         assert not seeds & set(TUNING)
         assert min(seeds) == FIRST_SEED
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch, tmp_path, capsys):

@@ -12,16 +12,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from command import servobench
 
 from harness import results
-from harness.command_line import main
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 def judged_columns(table: pd.DataFrame) -> pd.DataFrame:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import zipfile
 from pathlib import Path
 
 import pytest
+from command import servobench
 from foreign_fmu import build_crane, describe
 
-from harness.command_line import main
 from harness.configuration import Settings
 from harness.experiment import RunRequest
 from harness.run import run_experiment
@@ -30,13 +29,6 @@ def temporary(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     yield folder
     assert list(folder.iterdir()) == []
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 def run(monkeypatch, tmp_path: Path, version: int, more: str = "") -> tuple[int, Path]:

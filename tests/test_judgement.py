@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pandas as pd
 import pytest
+from command import servobench
 
 from harness import results
-from harness.command_line import main
 from harness.configuration import ConfigurationError
 from harness.judgement import compare_controllers, judge_controllers, places
 
@@ -85,8 +83,5 @@ def test_the_command_prints_the_tables_of_a_folder(runs, tmp_path, monkeypatch, 
     results.create_folder(folder, {})
     results.write_rows(folder, 0, runs.to_dict("records"))
     results.collect(folder)
-    monkeypatch.setattr(sys, "argv", ["servobench", "statistics", str(folder), *option])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
+    assert servobench(monkeypatch, "statistics", str(folder), *option) == 0
     assert word in capsys.readouterr().out

@@ -10,10 +10,10 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+from command import servobench
 from PIL import Image
 
 from harness import record, results
-from harness.command_line import main
 from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest
 from harness.figures.style import method_styles
@@ -21,13 +21,6 @@ from harness.replay import Replay, Trail, logged_run
 from harness.run import run_experiment
 
 REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture(scope="module")

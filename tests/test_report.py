@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 
 import pandas as pd
 import pytest
 from browser import browser_page, find_browser
+from command import servobench
 from folders import comparison, failed_only, made_up_row, sweep, write_folder
 
 from harness import report, results
-from harness.command_line import main
 from harness.configuration import ConfigurationError
 
 needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture(scope="module")

@@ -7,17 +7,16 @@ does not break the test and a regression does.
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import pytest
+from command import servobench
 from scipy.stats import binom
 from statsmodels.stats.proportion import proportion_confint
 
 from harness import results
-from harness.command_line import main
 from harness.configuration import ConfigurationError, Settings
 from harness.experiment import RunRequest
 from harness.robustness import (
@@ -72,10 +71,7 @@ def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
         "robustness", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1",
         "--set", "random.duration=1", "--out", str(out),
     )  # fmt: skip
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert not stop.value.code
+    assert servobench(monkeypatch, *arguments) == 0
     assert "the map is in" in capsys.readouterr().out
     assert len(results.load_runs(out / "moved")) == 5
     assert {path.name for path in (out / "figures").iterdir()} == {

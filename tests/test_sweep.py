@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from command import servobench
 
 from harness import results
-from harness.command_line import main
 from harness.compare import Batch
 from harness.configuration import ConfigurationError
 from harness.sweep import CHUNK, Cell, SweepPlan, chunks_of, parse_variation, vary
@@ -24,13 +24,6 @@ SWEEP = (
     "--seeds", "4", "--workers", "2", "--set", "random.duration=2",
 )  # fmt: skip
 RUNS = 48
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 def command(*arguments: str) -> list[str]:

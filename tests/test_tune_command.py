@@ -9,19 +9,12 @@ import sys
 import time
 
 import pytest
+from command import servobench
 
-from harness.command_line import main
 from harness.tuning.files import read_tuned
 from harness.tuning.spaces import default_values, find_tunable, nested_settings
 
 SHORT = ["--controllers", "rls", "--seeds", "4", "--workers", "1"]
-
-
-def servobench(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["servobench", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
 
 
 def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypatch, capsys, tmp_path):
