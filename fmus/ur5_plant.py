@@ -19,7 +19,7 @@ from plant.fmu_entry import build_plant
 from plant.fmu_mapping import FmuMapping
 from plant.hand_eye import FEATURE_NAMES
 from plant.plant import PlantEntry, PlantSetup
-from plant.sensing import vary_feature_noise
+from plant.sensing import vary_sensing
 from plant.signals import as_vector, check_number
 
 
@@ -111,5 +111,5 @@ ENTRY = PlantEntry(
     summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
     config=Ur5FmuConfig,
     build=build_ur5,
-    sense=vary_feature_noise,
+    sense=vary_sensing,
 )

@@ -15,6 +15,7 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +26,7 @@ from plant.camera import DepthNoise, PinholeCamera
 from plant.hand_eye import hand_eye_spec
 from plant.plant import FeatureLost, Plant, PlantDiverged, PlantEntry, PlantSetup, whole_steps
 from plant.seeds import named_generator
-from plant.sensing import FeatureChannel
+from plant.sensing import FeatureChannel, vary_sensing
 from plant.signals import Command, FloatArray, Observation, PlantSpec, Truth, as_vector, check_number
 from plant.urdf import ArmBody
 
@@ -96,12 +97,6 @@ class Frame:
     rgb: ByteArray
     depth: FloatArray
     detection: Detection | None
-
-
-def vary_sensing(config: BulletConfig, noise_factor: float, latency_periods: int | None) -> BulletConfig:
-    """Return `config` with its depth noise multiplied and its latency set; see `PlantEntry.sense`."""
-    latency = config.latency_periods if latency_periods is None else latency_periods
-    return replace(config, depth_noise_factor=noise_factor * config.depth_noise_factor, latency_periods=latency)
 
 
 def ur5_body() -> ArmBody:
@@ -270,5 +265,5 @@ ENTRY = PlantEntry(
     summary="PyBullet arm with dynamics; the ball is found in the rendered images of a depth camera",
     config=BulletConfig,
     build=BulletPlant,
-    sense=vary_sensing,
+    sense=partial(vary_sensing, noise="depth_noise_factor"),
 )

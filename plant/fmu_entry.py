@@ -9,7 +9,7 @@ from plant.fmu_config import FmuConfig
 from plant.fmu_mapping import FmuMapping, read_mapping
 from plant.fmu_slave import FmuError
 from plant.plant import PlantEntry, PlantSetup
-from plant.sensing import vary_feature_noise
+from plant.sensing import vary_sensing
 
 
 def build_plant(config: FmuConfig, mapping: FmuMapping, setup: PlantSetup) -> FmuPlant:
@@ -37,4 +37,4 @@ def mapped_entry(path: Path) -> PlantEntry:
         return build_plant(config, mapping, setup)
 
     summary = f"the FMU {mapping.path.name}, as mapped by {path.name}"
-    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, sense=vary_feature_noise, own_robot=True)
+    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, sense=vary_sensing, own_robot=True)

@@ -19,7 +19,7 @@ import numpy as np
 from plant.hand_eye import hand_eye_spec
 from plant.plant import Plant, PlantDiverged, PlantEntry, PlantSetup
 from plant.seeds import named_generator
-from plant.sensing import FeatureChannel, vary_feature_noise
+from plant.sensing import FeatureChannel, vary_sensing
 from plant.signals import (
     Command,
     FloatArray,
@@ -144,5 +144,5 @@ ENTRY = PlantEntry(
     summary="numpy arm with joint lag, command delay and feature noise: exact and fast",
     config=KinematicConfig,
     build=KinematicPlant,
-    sense=vary_feature_noise,
+    sense=vary_sensing,
 )

@@ -13,17 +13,20 @@ from plant.signals import FloatArray, check_number
 Config = TypeVar("Config")
 
 
-def vary_feature_noise(config: Config, noise_factor: float, latency_periods: int | None) -> Config:
+def vary_sensing(
+    config: Config, noise_factor: float, latency_periods: int | None, noise: str = "feature_noise"
+) -> Config:
     """Return a plant's configuration with other noise and latency; see `PlantEntry.sense`.
 
     Args:
-        config: frozen dataclass with the fields `feature_noise` and `latency_periods`.
+        config: frozen dataclass with the fields `latency_periods` and `noise`.
         noise_factor: on the noise.
         latency_periods: None leaves it as it is.
+        noise: name of the field that the noise is in proportion to.
     """
     values: Any = config
     latency = values.latency_periods if latency_periods is None else latency_periods
-    changed: Config = replace(values, feature_noise=noise_factor * values.feature_noise, latency_periods=latency)
+    changed: Config = replace(values, latency_periods=latency, **{noise: noise_factor * getattr(values, noise)})
     return changed
 
 
