@@ -19,7 +19,7 @@ from harness.configuration import ConfigurationError
 from harness.figures.tracks import Track
 from harness.registry import find_plant
 from plant import ur5
-from plant.ball import ByteArray, draw_detection, find_patch, locate_ball
+from plant.ball import ByteArray, draw_detection, find_ball
 from plant.bullet import PHYSICS_STEP, BulletConfig, ur5_body
 from plant.camera import PinholeCamera
 from plant.hand_eye import HandEyeModel
@@ -155,11 +155,7 @@ class Replay:
     def camera_view(self) -> ByteArray:
         """Return what the run's camera sees, (h, w, 3), the detected ball marked."""
         rgba, buffer = self._scene.render(self._view)
-        patch = find_patch(rgba)
-        found = None
-        if patch is not None:
-            depth = self._camera.metric_depth(buffer[patch.rows, patch.columns])
-            found = locate_ball(patch, depth, self._camera, ur5.BALL_RADIUS)
+        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
         return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
 
     def overview(self, trails: list[Trail]) -> ByteArray:

@@ -13,6 +13,7 @@ where that slope grows without bound, and pixels whose residual stands far off t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -137,6 +138,29 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
     complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
     return Detection(fit.centre, fit, visible) if plausible and complete else None
+
+
+def find_ball(
+    rgb: ByteArray,
+    buffer: FloatArray,
+    camera: PinholeCamera,
+    radius: float,
+    sense: Callable[[FloatArray], FloatArray] | None = None,
+) -> Detection | None:
+    """Return the ball in a rendered image, or None where none is seen.
+
+    Args:
+        rgb: (h, w, 3 or 4).
+        buffer: depth buffer, (h, w).
+        camera: its intrinsics.
+        radius: m, of the ball.
+        sense: what the sensor makes of the depths of the red pixels, (k,) m; None: it is perfect.
+    """
+    patch = find_patch(rgb)
+    if patch is None:
+        return None
+    depth = camera.metric_depth(buffer[patch.rows, patch.columns])
+    return locate_ball(patch, depth if sense is None else sense(depth), camera, radius)
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plant import ur5
-from plant.ball import ByteArray, Detection, draw_detection, find_patch, locate_ball
+from plant.ball import ByteArray, Detection, draw_detection, find_ball
 from plant.camera import DepthNoise, PinholeCamera
 from plant.hand_eye import hand_eye_spec
 from plant.plant import FeatureLost, Plant, PlantDiverged, PlantEntry, PlantSetup, whole_steps
@@ -223,12 +223,8 @@ class BulletPlant(Plant):
     def frame(self) -> Frame:
         """Return what the camera sees now, without noise; the run and its random streams stay as they are."""
         rgba, buffer = self._scene.render(self._view)
-        depth = self._camera.metric_depth(buffer)
-        patch = find_patch(rgba)
-        detection = None
-        if patch is not None:
-            detection = locate_ball(patch, depth[patch.rows, patch.columns], self._camera, ur5.BALL_RADIUS)
-        return Frame(rgba[..., :3].copy(), depth, detection)
+        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
+        return Frame(rgba[..., :3].copy(), self._camera.metric_depth(buffer), found)
 
     def picture(self) -> ByteArray:
         """Return what the camera sees now with the detected ball marked, (h, w, 3)."""
@@ -246,14 +242,11 @@ class BulletPlant(Plant):
 
     def _measure(self) -> FloatArray | None:
         """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
-        rgba, buffer = self._scene.render(self._view)
-        patch = find_patch(rgba)
-        if patch is None:
-            return None
-        depth = self._camera.metric_depth(buffer[patch.rows, patch.columns])
-        depth = self._depth_noise.apply(depth, self._camera, self._noise)
-        found = locate_ball(patch, depth, self._camera, ur5.BALL_RADIUS)
+        found = find_ball(*self._scene.render(self._view), self._camera, ur5.BALL_RADIUS, self._sense)
         return None if found is None else found.centre
+
+    def _sense(self, depth: FloatArray) -> FloatArray:
+        return self._depth_noise.apply(depth, self._camera, self._noise)
 
     def _keep_pace(self) -> None:
         """Wait until the wall clock has come as far as the run; only with a window."""
