@@ -118,6 +118,12 @@ def test_one_sample_of_noise_by_hand():
     assert level.variance == pytest.approx(1.74 / 1.24)
 
 
+def test_a_frame_that_comes_twice_tells_nothing_of_the_noise():
+    level = NoiseLevel(1.0)
+    level.learn(0.0, 2.0, 0.5)
+    assert level.variance == 1.0
+
+
 def test_a_jump_counts_no_more_than_nine_times_the_noise_and_at_first_ninety_times():
     level = NoiseLevel(1.0)
     level.learn(1e6, 1.0, 0.0)

@@ -66,6 +66,21 @@ def test_the_delay_is_found_within_a_few_motions_and_in_noise():
     assert found.count(2) >= 19
 
 
+@pytest.mark.parametrize(("forgetting", "kept"), [(1.0, True), (0.97, False)])
+def test_on_a_steady_circle_the_delay_is_kept_as_its_beginning_told_it(forgetting, kept):
+    """There a delay and a turn of the map explain the same, so that the latest motions tell nothing of it."""
+    net = JacobianNetwork(np.zeros((N, 1, N)), np.full((N, 1), 1e3), np.random.default_rng(0).normal(size=(N, M, 1)))
+    angle = np.cumsum(0.05 * np.minimum(1.0, np.arange(401) / 5.0))[:, None]
+    a, b = np.random.default_rng(3).normal(scale=0.5, size=(2, N))
+    q = (np.cos(angle) - 1.0) * a + np.sin(angle) * b
+    y = features(net, q, np.eye(M), 1) + np.random.default_rng(1).normal(scale=0.0004, size=(401, M))
+    made, delays = estimator(net, forgetting=forgetting, learn=False), []
+    for k in range(400):
+        feed(made, q[k : k + 2], y[k : k + 2])
+        delays.append(made.delay())
+    assert (set(delays[30:]) == {1}) == kept
+
+
 def test_lost_frames_do_not_mislead_map_and_delay():
     net, q = network(), path(120)
     made = estimator(net)

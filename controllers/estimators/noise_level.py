@@ -37,6 +37,8 @@ class NoiseLevel:
             multiple: a.
             other: b, m².
         """
+        if square == 0.0:  # the same frame again: it tells nothing
+            return
         own = multiple * self.variance
         weight = (own / (own + other)) ** 2
         largest = LARGEST * max(1.0, TRUSTED / self._weights) * self.variance

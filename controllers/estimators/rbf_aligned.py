@@ -48,7 +48,7 @@ class RbfAlignedConfig:
     confidence: float = 0.5  # deviation of an entry of M below which the network learns
     find_delay: bool = True  # estimate the delay; False: 0
     longest_delay: int = 5  # D, periods
-    forgetting: float = 0.97  # γ, of a candidate's score a motion
+    forgetting: float = 1.0  # γ, of a candidate's score a motion; below 1 for a latency that changes
     margin: float = 6.0  # by how much a delay must be the better one, in −2 log likelihood
     detect_moves: bool = True  # forget what is known of the map when the camera seems to have been moved
     gate: float = 12.0  # sum of surprises (CUSUM) beyond which it does
