@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
-	  --controllers rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
+	  --controllers rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
 test: lint
 	$(BIN)/python -m pytest -n auto
