@@ -64,6 +64,12 @@ def correction(**changes):
     return LearnedCorrection(gains(**changes), networks().controller, np.zeros(N), np.full(N, 10.0))
 
 
+def learned_before(made, rng, scale):
+    """Give the correction weights as if it had learned at another Jacobian, and return them."""
+    made._jacobian, made._C = rng.normal(size=(M, N)), scale * rng.normal(size=made._C.shape)
+    return made.weights
+
+
 def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself():
     """The paper's oracle (T = 1, ε = 0, no limit) holds with Ĵ⁺ in the place of the offline network."""
     made, e, q = correction(), np.array([0.2, -0.1, 0.3]), np.full(N, 0.2)
@@ -76,7 +82,7 @@ def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself():
 def test_the_update_is_that_of_the_paper_with_a_horizon_of_one():
     """Eqs. 18, 19 and 23 by the functions of `rbfnn`, for the loop with all three terms."""
     made, rng = correction(epsilon=1e-3), np.random.default_rng(1)
-    before = made.weights = rng.normal(scale=0.05, size=made.weights.shape)
+    before = learned_before(made, rng, 0.1)
     e, q = np.array([0.2, -0.1, 0.3]), rng.normal(scale=0.3, size=N)
     dq = made.step(A, e, q, np.zeros(M), learn=True)
     projected = np.einsum("ij,jpl->ipl", np.linalg.pinv(A) @ A, before)
@@ -94,8 +100,7 @@ def test_the_update_is_that_of_the_paper_with_a_horizon_of_one():
 def test_what_was_learned_leaks_and_stays_out_of_the_null_space():
     made = correction(leak=0.5, k=1e-12)
     rng = np.random.default_rng(0)
-    made.weights = rng.normal(size=made.weights.shape)
-    before = made.weights
+    before = learned_before(made, rng, 1.0)
     made.step(A, np.zeros(M), np.zeros(N), np.zeros(M), learn=False)
     np.testing.assert_allclose(
         np.einsum("mn,npl->mpl", A, made.weights), 0.5 * np.einsum("mn,npl->mpl", A, before), atol=1e-7

@@ -50,7 +50,10 @@ class CorrectionGains:
 
 @final
 class LearnedCorrection:
-    """The law above; it holds the weights W, (n, m + n, N_h)."""
+    """The law above. W, (n, m + n, N_h), lies in the row space of Ĵ, so that W = Ĵᵀ C is held by C, half its size.
+
+    C ← (1 − l) (ĴĴᵀ + δ²I)⁻¹ Ĵ(k) Ĵ(k−1)ᵀ C + α e(k+1) (ξ ⊗ h)
+    """
 
     def __init__(
         self, gains: CorrectionGains, network: ControllerNetwork, posture: FloatArray, limit: FloatArray
@@ -74,7 +77,9 @@ class LearnedCorrection:
         self._forget()
 
     def _forget(self) -> None:
-        self.weights: FloatArray = np.zeros(self._network.weights.shape)
+        network = self._network
+        self._C: FloatArray = np.zeros((network.m, (network.m + network.n) * network.weights.shape[2]))
+        self._jacobian: FloatArray = np.zeros((network.m, network.n))  # Ĵ of the last step
         self.step_size = 0.0
         self._predicted: FloatArray = np.zeros(0)  # e(k+1), m
 
@@ -95,29 +100,34 @@ class LearnedCorrection:
         """
         gains = self._gains
         pinv = damped_inverse(jacobian, gains.damping)
-        row_space = pinv.dot(jacobian)
         away = self._posture - joint_position
-        wanted = pinv.dot(gains.error_share * error) + gains.posture_share * (away - row_space.dot(away))
+        wanted = pinv.dot(gains.error_share * error - gains.posture_share * jacobian.dot(away))
+        wanted += gains.posture_share * away
         following = pinv.dot(forward)
         if gains.k == 0.0:
             return np.asarray(wanted + following)
-        n, p, hidden = self.weights.shape
-        row_space *= 1.0 - gains.leak
-        self.weights = row_space.dot(self.weights.reshape(n, p * hidden)).reshape(n, p, hidden)
+        kept = (1.0 - gains.leak) * self._jacobian.dot(pinv).T
+        C = self._C = kept.dot(self._C)
+        self._jacobian = jacobian
         xi = np.concatenate([error, joint_position])
-        h = self._network.features(xi)
-        wanted += self.weights.reshape(n * p, hidden).dot(h).reshape(n, p).dot(xi)
+        seen = np.multiply.outer(xi, self._network.features(xi)).ravel()  # ξ ⊗ h
+        wanted += C.dot(seen).dot(jacobian)
         excess = max(1.0, float(max(map(abs, (wanted * self._reach).tolist()))))
         ahead = self._predicted = error - jacobian.dot(wanted) / excess
         self.step_size = 0.0
         if not learn or excess > 1.0:
             return np.asarray(wanted + following)
         pull = ahead.dot(jacobian)
-        others = float(xi.dot(xi)) * float(h.dot(h))  # ‖G‖² without what Ĵᵀe adds
+        others = float(seen.dot(seen))  # ‖G‖² without what Ĵᵀe adds
         self.step_size = gains.k * float(ahead.dot(ahead)) / (gains.epsilon + float(pull.dot(pull)) * others)
-        pull *= self.step_size
-        self.weights += (pull[:, None] * xi)[:, :, None] * h
-        return np.asarray(wanted + others * pull + following)
+        C += np.multiply.outer(self.step_size * ahead, seen)
+        return np.asarray(wanted + (self.step_size * others) * pull + following)
+
+    @property
+    def weights(self) -> FloatArray:
+        """W as it is now, (n, m + n, N_h)."""
+        network = self._network
+        return np.asarray(self._jacobian.T @ self._C).reshape(network.n, network.m + network.n, -1)
 
     def diagnostics(self) -> Diagnostics:
         """Return criterion I_c (m²), step size α, predicted error ‖e(k+1)‖ (m) and norm of the weights."""
@@ -125,5 +135,5 @@ class LearnedCorrection:
             "criterion": 0.5 * float(self._predicted.dot(self._predicted)),
             "step_size": self.step_size,
             "predicted_error": float(np.linalg.norm(self._predicted)),
-            "learned_weight_norm": float(np.linalg.norm(self.weights)),
+            "learned_weight_norm": float(np.linalg.norm(self._jacobian.T @ self._C)),
         }
