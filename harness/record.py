@@ -195,7 +195,7 @@ def _frames(run: LoggedRun, step: int) -> Iterator[tuple[float, ByteArray]]:
 def _trails(run: LoggedRun, k: int) -> list[Trail]:
     colour = method_styles([run.row["controller"]])[run.row["controller"]].colour
     red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(colour))
-    desired = run.reference
+    desired = run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
     if run.track.point_to_point:  # a cross at the target
         arms = 0.03 * np.eye(3)
         crosses = [Trail(desired[0] + np.stack([-arm, arm]), REFERENCE_COLOUR, 2) for arm in arms]

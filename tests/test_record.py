@@ -209,6 +209,8 @@ def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
     np.testing.assert_allclose(np.ptp(before, axis=0), 0.0, atol=1e-9)
     np.testing.assert_allclose(np.ptp(after, axis=0), 0.0, atol=1e-9)
     assert np.linalg.norm(after[0] - before[0]) > 0.1
+    targets = [record._trails(shown, k)[0].points.mean(axis=0) for k in (0, 20, 21, 39)]
+    np.testing.assert_allclose(targets, [before[0], before[0], after[0], after[0]], atol=1e-9)
     with Replay(shown) as replay:
         views = []
         for k in (20, 21):
