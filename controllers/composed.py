@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, make_dataclass
 from functools import cache
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from controllers.estimators.broyden import BroydenConfig, BroydenEstimator
@@ -35,76 +35,60 @@ from controllers.servo import ServoController
 from controllers.training import obtain_networks
 from controllers.training_config import TrainingConfig
 
+Part = TypeVar("Part")
 NetworkSource: TypeAlias = Callable[[], TrainedNetworks]
 
 
 @dataclass(frozen=True)
-class EstimatorEntry:
-    """An estimator as `ESTIMATORS` knows it.
+class PartEntry(Generic[Part]):
+    """An estimator or a control law as `ESTIMATORS` and `LAWS` know it.
 
     Attributes:
         config: frozen dataclass with a default for every field.
-        build: makes the estimator from its configuration, what it may know and where offline networks come from.
+        build: makes the part from its configuration, what it may know and where offline networks come from.
         needs_truth: it is told the true Jacobian.
         trained: it starts from offline networks.
     """
 
     config: type[Any]
-    build: Callable[[Any, RobotKnowledge, NetworkSource], Estimator]
+    build: Callable[[Any, RobotKnowledge, NetworkSource], Part]
     needs_truth: bool = False
     trained: bool = False
 
 
-@dataclass(frozen=True)
-class LawEntry:
-    """A control law as `LAWS` knows it.
-
-    Attributes:
-        config: frozen dataclass with a default for every field.
-        build: makes the law from its configuration, what it may know and where offline networks come from.
-        trained: it starts from offline networks.
-    """
-
-    config: type[Any]
-    build: Callable[[Any, RobotKnowledge, NetworkSource], Law]
-    trained: bool = False
-
-
-ESTIMATORS: dict[str, EstimatorEntry] = {
-    "constant": EstimatorEntry(ConstantConfig, lambda _config, _knowledge, _networks: ConstantEstimator()),
-    "true": EstimatorEntry(
-        TrueConfig, lambda _config, knowledge, _networks: TrueEstimator(knowledge), needs_truth=True
-    ),
-    "ukf": EstimatorEntry(UkfConfig, lambda config, _knowledge, _networks: UkfEstimator(config)),
-    "kalman": EstimatorEntry(KalmanConfig, lambda config, _knowledge, _networks: KalmanEstimator(config)),
-    "broyden": EstimatorEntry(BroydenConfig, lambda config, _knowledge, _networks: BroydenEstimator(config)),
-    "rls": EstimatorEntry(RlsConfig, lambda config, _knowledge, _networks: RlsEstimator(config)),
-    "rbf": EstimatorEntry(
+ESTIMATORS: dict[str, PartEntry[Estimator]] = {
+    "constant": PartEntry(ConstantConfig, lambda _config, _knowledge, _networks: ConstantEstimator()),
+    "true": PartEntry(TrueConfig, lambda _config, knowledge, _networks: TrueEstimator(knowledge), needs_truth=True),
+    "ukf": PartEntry(UkfConfig, lambda config, _knowledge, _networks: UkfEstimator(config)),
+    "kalman": PartEntry(KalmanConfig, lambda config, _knowledge, _networks: KalmanEstimator(config)),
+    "broyden": PartEntry(BroydenConfig, lambda config, _knowledge, _networks: BroydenEstimator(config)),
+    "rls": PartEntry(RlsConfig, lambda config, _knowledge, _networks: RlsEstimator(config)),
+    "rbf": PartEntry(
         RbfConfig, lambda config, _knowledge, networks: RbfEstimator(config, networks().jacobian), trained=True
     ),
-    "rbf_lyapunov": EstimatorEntry(
+    "rbf_lyapunov": PartEntry(
         RbfLyapunovConfig,
         lambda config, _knowledge, networks: RbfLyapunovEstimator(config, networks().jacobian),
         trained=True,
     ),
-    "rbf_aligned": EstimatorEntry(
+    "rbf_aligned": PartEntry(
         RbfAlignedConfig,
         lambda config, knowledge, networks: RbfAlignedEstimator(config, networks().jacobian, knowledge.spec.period),
         trained=True,
     ),
-    "cfdl": EstimatorEntry(CfdlConfig, lambda config, _knowledge, _networks: CfdlEstimator(config)),
+    "cfdl": PartEntry(CfdlConfig, lambda config, _knowledge, _networks: CfdlEstimator(config)),
 }
 
-LAWS: dict[str, LawEntry] = {
-    "pid": LawEntry(PidConfig, lambda config, knowledge, _networks: PidLaw(config, knowledge)),
-    "mfac": LawEntry(MfacConfig, lambda config, knowledge, _networks: MfacLaw(config, knowledge)),
-    "mpc": LawEntry(MpcConfig, lambda config, knowledge, _networks: MpcLaw(config, knowledge)),
-    "rbfnn": LawEntry(
+LAWS: dict[str, PartEntry[Law]] = {
+    "pid": PartEntry(PidConfig, lambda config, knowledge, _networks: PidLaw(config, knowledge)),
+    "mfac": PartEntry(MfacConfig, lambda config, knowledge, _networks: MfacLaw(config, knowledge)),
+    "mpc": PartEntry(MpcConfig, lambda config, knowledge, _networks: MpcLaw(config, knowledge)),
+    "rbfnn": PartEntry(
         RbfnnConfig,
         lambda config, knowledge, networks: RbfnnLaw(config, networks().controller, knowledge),
         trained=True,
     ),
-    "rbfnn_bridged": LawEntry(
+    "rbfnn_bridged": PartEntry(
         RbfnnBridgedConfig,
         lambda config, knowledge, networks: RbfnnBridgedLaw(config, networks(), knowledge),
         trained=True,
@@ -138,7 +122,8 @@ def servo_entry(name: str, summary: str, config: type[Any], *, law: str, estimat
             knowledge,
         )
 
-    return ControllerEntry(name, summary, config, build, needs_truth=estimator_entry.needs_truth)
+    needs_truth = estimator_entry.needs_truth or law_entry.needs_truth
+    return ControllerEntry(name, summary, config, build, needs_truth=needs_truth)
 
 
 @cache

@@ -14,6 +14,7 @@ from harness.run import COMPLETED
 from harness.statistics import (
     SETTLED,
     Estimate,
+    column_of,
     compare_pairs,
     median_with_interval,
     outcomes,
@@ -73,7 +74,7 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
 
 def usual_metric(runs: pd.DataFrame) -> str:
     """Return what the controllers of one task are compared by: settling time, or on a curve the error along it."""
-    moves = "overshoot" in runs and runs["overshoot"].notna().any()
+    moves = column_of(runs, "overshoot").notna().any()
     return "settling_time_s" if moves or "rms_error_evaluated_m" not in runs else "rms_error_evaluated_m"
 
 

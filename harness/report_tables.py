@@ -11,7 +11,7 @@ import pandas as pd
 
 from harness import results
 from harness.run import COMPLETED
-from harness.statistics import Estimate, median_with_interval, settled_share, settling_times
+from harness.statistics import Estimate, column_of, median_with_interval, settled_share, settling_times
 
 CONDITIONS = ("plant", "mismatch", "noise_factor", "latency_periods")  # what a folder may vary beside the task
 NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
@@ -74,8 +74,8 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 
     A task of which no run was judged, as each ended before its first period, is in neither.
     """
-    judged = runs.loc[_column(runs, "max_error_m").notna(), "task"].unique()
-    moves = runs.loc[_column(runs, "overshoot").notna(), "task"].unique()
+    judged = runs.loc[column_of(runs, "max_error_m").notna(), "task"].unique()
+    moves = runs.loc[column_of(runs, "overshoot").notna(), "task"].unique()
     curves = [task for task in judged if task not in moves]
     return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
 
@@ -120,7 +120,7 @@ def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
         for name in ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
                      "jacobian_error_mean"):  # fmt: skip
             heading, factor, digits = MEASURES[name]
-            row[heading] = _number(factor * _column(group, name).median(), digits)
+            row[heading] = _number(factor * column_of(group, name).median(), digits)
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -173,14 +173,10 @@ def _median(group: pd.DataFrame, name: str) -> dict[str, Any]:
     if name == "settling_time_s":
         middle = median_with_interval(factor * settling_times(group))
     else:
-        values = factor * _column(group, name)
+        values = factor * column_of(group, name)
         middle = median_with_interval(values, missing="left_out") if values.notna().any() else NOTHING
     interval = "" if np.isnan(middle.low) else f"{middle.low:.{digits}f} – {middle.high:.{digits}f}"
     return {heading: _number(middle.value, digits), f"{heading.split(' [')[0]}, 95 %": interval.replace("inf", "∞")}
-
-
-def _column(group: pd.DataFrame, name: str) -> pd.Series[float]:
-    return group[name].astype(float) if name in group else pd.Series(np.nan, index=group.index)
 
 
 def _number(value: float, digits: int) -> float:

@@ -86,8 +86,8 @@ def moved_settings(settings: Settings) -> Settings:
     return Settings({**settings.sections, TASK: task})
 
 
-def load_map(folder: Path) -> pd.DataFrame:
-    """Return the runs of a map, both parts; `moved_at_s` says when the camera was moved, NaN where it was not.
+def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the runs of a map by part; `moved_at_s` says when the camera was moved, NaN where it was not.
 
     Raises:
         ConfigurationError: not the folder of a map.
@@ -96,7 +96,7 @@ def load_map(folder: Path) -> pd.DataFrame:
     configuration = results.read_manifest(folder / MOVED)["configuration"]
     moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
     at_rest = moved["magnitude"].map(number_of).astype(float) == 0.0
-    return pd.concat([usual, moved.assign(moved_at_s=np.where(at_rest, np.nan, moment))], ignore_index=True)
+    return {USUAL: usual, MOVED: moved.assign(moved_at_s=np.where(at_rest, np.nan, moment))}
 
 
 def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:

@@ -61,8 +61,8 @@ def make_map(
         MOVED,
         USUAL,
         draw_map,
-        load_map,
         map_cells,
+        map_tables,
         moved_settings,
     )
 
@@ -70,6 +70,5 @@ def make_map(
     for folder, cells, chosen in ((USUAL, usual, settings), (MOVED, moved, moved_settings(settings))):
         going_on = resume and (out / folder).exists()
         carry_out_sweep(cells, chosen, out / folder, workers, scheduler, resume=going_on)
-    tables = {part: results.load_runs(out / part) for part in (USUAL, MOVED)}
-    results.write_summary(out, tables, results.read_manifest(out / USUAL))
-    return draw_map(load_map(out), out / FIGURES)
+    results.write_summary(out, map_tables(out), results.read_manifest(out / USUAL))
+    return draw_map(results.load_runs(out), out / FIGURES)

@@ -209,9 +209,14 @@ def signed_rank_p_value(differences: ArrayLike) -> float:
     return float(stats.wilcoxon(np.round(difference / largest, 9), zero_method="pratt").pvalue)
 
 
+def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+    """Return a column of the table of runs, NaN throughout where the table has none of this name."""
+    return runs.reindex(columns=[name])[name].astype(float)
+
+
 def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
     """Return the settling time of each run, s; NaN where it never settled or did not complete."""
-    return runs.reindex(columns=["settling_time_s"])["settling_time_s"].astype(float).where(runs["status"] == COMPLETED)
+    return column_of(runs, "settling_time_s").where(runs["status"] == COMPLETED)
 
 
 def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
@@ -257,7 +262,7 @@ def _restored(values: FloatArray, largest: float) -> FloatArray:
 def _differences(
     runs: pd.DataFrame, pair: tuple[str, str], never: float, metric: str, keys: Sequence[str]
 ) -> FloatArray:
-    values = runs.reindex(columns=[metric])[metric].astype(float).where(runs["status"] == COMPLETED).fillna(never)
+    values = column_of(runs, metric).where(runs["status"] == COMPLETED).fillna(never)
     indexed = pd.Series(values.to_numpy(), index=pd.MultiIndex.from_frame(runs[list(keys)]))
     first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
     for name, series in zip(pair, (first, second), strict=True):

@@ -8,7 +8,7 @@ from rich.console import Group
 from rich.table import Table
 
 from harness.run import COMPLETED
-from harness.statistics import settling_times
+from harness.statistics import column_of, settling_times
 
 KEYS = ["plant", "mismatch", "task", "controller"]
 
@@ -32,7 +32,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
             "path_length_ratio",
             "controller_time_median_us",
         ):
-            row[name] = _column(group, name).median()
+            row[name] = column_of(group, name).median()
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -59,10 +59,6 @@ def summary_tables(runs: pd.DataFrame) -> Group:
         tables.append(table)
     legend = "done: reached the last period; settled: came within 5 mm and stayed; the rest are medians over runs"
     return Group(*tables, legend)
-
-
-def _column(group: pd.DataFrame, name: str) -> pd.Series[float]:
-    return group[name].astype(float) if name in group else pd.Series([float("nan")] * len(group))
 
 
 def _number(value: float, factor: float, digits: int) -> str:

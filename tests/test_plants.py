@@ -107,9 +107,12 @@ def test_a_negative_seed_is_refused(plant):
         plant.reset(-1)
 
 
-def test_it_can_be_closed_twice(plant):
+def test_it_can_be_closed_twice_and_closes_no_other(entry, plant):
     plant.close()
+    other = entry.build(entry.config(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
     plant.close()
+    assert other.reset(0).feature_valid
+    other.close()
 
 
 def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, SPEC, A, M, N, ToyArm, networks
 
+from controllers.estimators.estimator import LONGEST_DELAY
 from controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from controllers.initial import InitialConfig, initial_jacobian
 from controllers.laws.damped_inverse import damped_inverse
@@ -43,6 +44,13 @@ def test_the_first_step_by_hand():
     posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (np.zeros(N) - q)
     expected = (1.0 - np.exp(-14.0 * PERIOD)) * pinv @ e + pinv @ r + posture
     np.testing.assert_allclose(made.command(A, seen(q, np.zeros(M)), reference), expected / PERIOD, atol=1e-7)
+
+
+def test_a_delay_beyond_what_is_kept_of_the_past_is_refused():
+    made = law()
+    made.expect_delay(LONGEST_DELAY)
+    with pytest.raises(ValueError, match="delay must be at least 0 and at most 14, got 15"):
+        made.expect_delay(LONGEST_DELAY + 1)
 
 
 def test_without_redistribution_a_command_that_exceeds_the_limit_is_scaled_as_a_whole():

@@ -17,8 +17,13 @@ def test_every_tuning_seed_is_refused_for_judging(count, offset):
 
 
 def test_seeds_outside_the_tuning_range_judge():
-    refuse_tuning_seeds([0, TUNING.start - 1, TUNING.stop, 10**9])
-    refuse_tuning_seeds([])
+    refused = []
+    for seed in (0, TUNING.start - 1, TUNING.start, TUNING.stop - 1, TUNING.stop, 10**9):
+        try:
+            refuse_tuning_seeds([seed])
+        except ConfigurationError:
+            refused.append(seed)
+    assert refused == [TUNING.start, TUNING.stop - 1]
 
 
 def test_the_refusal_counts_the_others_and_says_what_to_take():

@@ -135,5 +135,5 @@ class LearnedCorrection:
             "criterion": 0.5 * float(self._predicted.dot(self._predicted)),
             "step_size": self.step_size,
             "predicted_error": float(np.linalg.norm(self._predicted)),
-            "learned_weight_norm": float(np.linalg.norm(self._jacobian.T @ self._C)),
+            "learned_weight_norm": float(np.linalg.norm(self.weights)),
         }

@@ -139,7 +139,13 @@ class RbfnnBridgedLaw(Law):
         self._forget()
 
     def expect_delay(self, delay: int) -> None:
-        """Take the camera's delay, periods, for the next command."""
+        """Take the camera's delay, periods, for the next command.
+
+        Raises:
+            ValueError: a delay beyond what a law keeps of the past.
+        """
+        if delay != self._delay:
+            check_number("delay", delay, at_least=0, at_most=LONGEST_DELAY)
         self._delay = delay
 
     def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
