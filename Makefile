@@ -23,7 +23,7 @@ format: $(VENV)/ready
 
 # Draw the README's pictures anew from committed seeds: the map takes six minutes on two processors, more where they are slow.
 figures: $(VENV)/ready
-	$(BIN)/python -m harness.readme_pictures docs/pictures
+	$(BIN)/python -m servobench.harness.studies.readme_pictures docs/pictures
 
 benchmark: $(VENV)/ready
 	for file in benchmarks/*.py; do $(BIN)/python $$file || exit 1; done

@@ -13,12 +13,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from plant import ur5
-from plant.bullet import PHYSICS_STEP, BulletConfig, BulletPlant, ur5_body
-from plant.plant import PlantSetup, whole_steps
-from plant.scene import Scene, view_of
-from plant.signals import Command
-from plant.ur5 import nominal_ur5
+from servobench.plant.bullet.bullet_plant import (
+    PHYSICS_STEP,
+    BulletConfig,
+    BulletPlant,
+    ur5_body,
+)
+from servobench.plant.bullet.scene import Scene, view_of
+from servobench.plant.plant import PlantSetup, whole_steps
+from servobench.plant.robot import ur5
+from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
 

@@ -17,10 +17,10 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from harness.configuration import Settings
-from harness.experiment import RunRequest, build_experiment
-from harness.registry import CONTROLLERS
-from plant.seeds import named_seed
+from servobench.harness.config.registry import CONTROLLERS
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.experiment import RunRequest, build_experiment
+from servobench.plant.seeds import named_seed
 
 PROPOSED, BETTER, OPTIMISING = "rbfnn_mfac", "rbfnn_mfac_plus", "ukf_mpc"
 WARM_UP = 20  # steps

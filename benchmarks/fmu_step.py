@@ -14,11 +14,11 @@ from collections.abc import Callable
 import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
-from fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from plant.fmu import FmuPlant
-from plant.plant import PlantSetup
-from plant.signals import Command
-from plant.ur5 import HOME, nominal_ur5
+from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
+from servobench.plant.fmu.fmu_plant import FmuPlant
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.signals import Command
 
 CALLS = 200
 ROUNDS = 400

@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from controllers.estimators.kalman import split_update
-from controllers.estimators.ukf import sigma_weights, unscented_update
+from servobench.controllers.estimators.kalman import split_update
+from servobench.controllers.estimators.ukf import sigma_weights, unscented_update
 
 M, N, MOTIONS, ROUNDS, FACTOR = 3, 6, 200, 7, 8.0
 SIZE = M * N

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.composed import servo_entry
-from controllers.estimators.true import TrueConfig
-from controllers.initial import InitialConfig
-from controllers.laws.pid import PidConfig
+from servobench.controllers.composed import servo_entry
+from servobench.controllers.estimators.true import TrueConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.laws.pid import PidConfig
 
 
 @dataclass(frozen=True)

@@ -11,29 +11,29 @@ from dataclasses import dataclass, field, make_dataclass
 from functools import cache
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from controllers.controller import Controller, ControllerEntry, RobotKnowledge
-from controllers.estimators.broyden import BroydenConfig, BroydenEstimator
-from controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
-from controllers.estimators.constant import ConstantConfig, ConstantEstimator
-from controllers.estimators.estimator import Estimator
-from controllers.estimators.kalman import KalmanConfig, KalmanEstimator
-from controllers.estimators.rbf import RbfConfig, RbfEstimator
-from controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
-from controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
-from controllers.estimators.rls import RlsConfig, RlsEstimator
-from controllers.estimators.true import TrueConfig, TrueEstimator
-from controllers.estimators.ukf import UkfConfig, UkfEstimator
-from controllers.initial import InitialConfig, initial_jacobian
-from controllers.laws.law import Law
-from controllers.laws.mfac import MfacConfig, MfacLaw
-from controllers.laws.mpc import MpcConfig, MpcLaw
-from controllers.laws.pid import PidConfig, PidLaw
-from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
-from controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
-from controllers.network_file import TrainedNetworks
-from controllers.servo import ServoController
-from controllers.training import obtain_networks
-from controllers.training_config import TrainingConfig
+from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
+from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
+from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator
+from servobench.controllers.estimators.estimator import Estimator
+from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
+from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
+from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
+from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
+from servobench.controllers.estimators.true import TrueConfig, TrueEstimator
+from servobench.controllers.estimators.ukf import UkfConfig, UkfEstimator
+from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.controllers.laws.pid import PidConfig, PidLaw
+from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
+from servobench.controllers.networks.config import TrainingConfig
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.networks.fit import obtain_networks
+from servobench.controllers.servo import ServoController
 
 Part = TypeVar("Part")
 NetworkSource: TypeAlias = Callable[[], TrainedNetworks]

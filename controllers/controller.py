@@ -1,9 +1,9 @@
 """The contract of a controller: reset, step, diagnostics; and what it may know about the robot.
 
 A controller never sees a plant, a simulator, a file or the truth. Adding one: a frozen configuration dataclass, a
-builder, and a `ControllerEntry` that is named in `harness.registry` or published under the entry-point group
+builder, and a `ControllerEntry` that is named in `harness.config.registry` or published under the entry-point group
 `servobench.controllers`. Most controllers are a Jacobian estimator and a control law composed by
-`controllers.servo.ServoController`; one that is not derives from `Controller`.
+`servobench.controllers.servo.ServoController`; one that is not derives from `Controller`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
-from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault
+from servobench.plant.signals import (
+    Command,
+    FloatArray,
+    Observation,
+    PlantSpec,
+    RunFault,
+)
 
 if TYPE_CHECKING:
-    from controllers.network_file import TrainedNetworks
-    from controllers.training_config import TrainingConfig
+    from servobench.controllers.networks.config import TrainingConfig
+    from servobench.controllers.networks.file import TrainedNetworks
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 SymbolicFeature: TypeAlias = Callable[[Any], Any]

@@ -15,8 +15,13 @@ from typing import Literal, final
 
 import numpy as np
 
-from controllers.controller import ControllerDiverged, JacobianFunction, RobotKnowledge
-from plant.signals import FloatArray, Observation, PlantSpec, check_number
+from servobench.controllers.controller import ControllerDiverged, JacobianFunction, RobotKnowledge
+from servobench.plant.signals import (
+    FloatArray,
+    Observation,
+    PlantSpec,
+    check_number,
+)
 
 SOURCES = ("nominal", "probe", "given")
 

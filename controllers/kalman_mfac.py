@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.composed import servo_entry
-from controllers.estimators.kalman import KalmanConfig
-from controllers.initial import InitialConfig
-from controllers.laws.mfac import MfacConfig
+from servobench.controllers.composed import servo_entry
+from servobench.controllers.estimators.kalman import KalmanConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.laws.mfac import MfacConfig
 
 
 @dataclass(frozen=True)

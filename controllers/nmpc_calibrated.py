@@ -10,11 +10,23 @@ from typing import Any, Final, Literal, final, get_args
 import casadi
 import numpy as np
 
-from controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge, SolverFailed
-from controllers.laws.mpc_closed_form import decay_targets, move_weights
-from controllers.laws.mpc_limits import LimitedProgram, joint_bounds
-from controllers.laws.mpc_qp import SOLVERS, QpShape, QpSolution
-from plant.signals import Command, FloatArray, Observation, as_vector, check_number
+from servobench.controllers.controller import (
+    Controller,
+    ControllerEntry,
+    Diagnostics,
+    RobotKnowledge,
+    SolverFailed,
+)
+from servobench.controllers.laws.mpc.closed_form import decay_targets, move_weights
+from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
+from servobench.controllers.laws.mpc.qp import SOLVERS, QpShape, QpSolution
+from servobench.plant.signals import (
+    Command,
+    FloatArray,
+    Observation,
+    as_vector,
+    check_number,
+)
 
 Fallback = Literal["hold", "raise"]
 Solver = Literal["daqp", "qpoases"]

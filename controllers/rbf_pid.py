@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.composed import servo_entry
-from controllers.estimators.rbf_lyapunov import RbfLyapunovConfig
-from controllers.initial import InitialConfig
-from controllers.laws.pid import PidConfig
-from controllers.training_config import TrainingConfig
+from servobench.controllers.composed import servo_entry
+from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.laws.pid import PidConfig
+from servobench.controllers.networks.config import TrainingConfig
 
 
 @dataclass(frozen=True)

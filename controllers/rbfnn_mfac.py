@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.composed import servo_entry
-from controllers.estimators.rbf import RbfConfig
-from controllers.initial import InitialConfig
-from controllers.laws.rbfnn import RbfnnConfig
-from controllers.training_config import TrainingConfig
+from servobench.controllers.composed import servo_entry
+from servobench.controllers.estimators.rbf import RbfConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.laws.rbfnn import RbfnnConfig
+from servobench.controllers.networks.config import TrainingConfig
 
 
 @dataclass(frozen=True)

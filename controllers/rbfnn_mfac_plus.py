@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.composed import servo_entry
-from controllers.estimators.rbf_aligned import RbfAlignedConfig
-from controllers.initial import InitialConfig
-from controllers.laws.rbfnn_bridged import RbfnnBridgedConfig
-from controllers.training_config import TrainingConfig
+from servobench.controllers.composed import servo_entry
+from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig
+from servobench.controllers.networks.config import TrainingConfig
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
     J(k) ← estimator(Δy, Δq),      u(k) = law(J(k), y(k), y_ref(k), y_ref(k+1), …)
 
-Any estimator works with any law. Which of them are known by name is written in `controllers.composed`.
+Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.composed`.
 """
 
 from __future__ import annotations
@@ -12,11 +12,16 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Controller, ControllerDiverged, Diagnostics, RobotKnowledge
-from controllers.estimators.estimator import Estimator, Motion
-from controllers.initial import InitialJacobian
-from controllers.laws.law import Law
-from plant.signals import Command, FloatArray, Observation
+from servobench.controllers.controller import (
+    Controller,
+    ControllerDiverged,
+    Diagnostics,
+    RobotKnowledge,
+)
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.initial import InitialJacobian
+from servobench.controllers.laws.law import Law
+from servobench.plant.signals import Command, FloatArray, Observation
 
 
 @final

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from controllers.composed import servo_entry
-from controllers.estimators.ukf import UkfConfig
-from controllers.initial import InitialConfig
-from controllers.laws.mpc import MpcConfig
+from servobench.controllers.composed import servo_entry
+from servobench.controllers.estimators.ukf import UkfConfig
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.laws.mpc.mpc import MpcConfig
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,35 @@ from pathlib import Path
 
 import numpy as np
 
-from fmus.compile import CODE, Platform, compile_library, this_platform
-from fmus.generate import kinematics_source, layout_header
-from fmus.model_description import Description, write_build_description, write_fmi2, write_fmi3
-from fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
-from fmus.variables import Actuation, Layout, arm_groups, parameters_of
-from plant.hand_eye import HandEyeModel
-from plant.signals import as_vector
-from plant.ur5 import HOME, nominal_ur5
+from servobench.fmus.compile import (
+    CODE,
+    Platform,
+    compile_library,
+    this_platform,
+)
+from servobench.fmus.generate import kinematics_source, layout_header
+from servobench.fmus.model_description import (
+    Description,
+    write_build_description,
+    write_fmi2,
+    write_fmi3,
+)
+from servobench.fmus.reference import (
+    INPUT_FILE,
+    OUTPUT_FILE,
+    input_csv,
+    output_csv,
+    reference_run,
+)
+from servobench.fmus.variables import (
+    Actuation,
+    Layout,
+    arm_groups,
+    parameters_of,
+)
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.signals import as_vector
 
 IDENTIFIER = "ur5_mismatched"
 HEADERS = {
@@ -146,7 +167,7 @@ def _kinematics(layout: Layout) -> str:
 
 
 def _own_file(name: str) -> str:
-    return (files("fmus") / IDENTIFIER / name).read_text(encoding="utf-8")
+    return (files("servobench.fmus") / IDENTIFIER / name).read_text(encoding="utf-8")
 
 
 def _fmi_header(name: str) -> str:

@@ -17,9 +17,15 @@ from typing import Any
 import casadi
 import numpy as np
 
-from fmus.variables import INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
-from plant.signals import FloatArray
-from plant.symbolic import SX, HandEyeGeometry, feature_and_jacobian
+from servobench.fmus.variables import (
+    INPUT,
+    KINEMATIC_PARAMETERS,
+    PARAMETER,
+    STATE,
+    Layout,
+)
+from servobench.plant.robot.symbolic import SX, HandEyeGeometry, feature_and_jacobian
+from servobench.plant.signals import FloatArray
 
 # Generated functions leave parts of their calling convention unused, and none of them is an entry point of the library.
 KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */
@@ -110,7 +116,7 @@ def _geometry(layout: Layout, p: SX) -> HandEyeGeometry:
 
 
 def _rotation(rpy: SX) -> SX:
-    """Rz(yaw) Ry(pitch) Rx(roll), as `plant.kinematics.rotation_from_rpy`."""
+    """Rz(yaw) Ry(pitch) Rx(roll), as `servobench.plant.robot.arm.rotation_from_rpy`."""
     (cr, cp, cy), (sr, sp, sy) = (casadi.vertsplit(f(rpy)) for f in (casadi.cos, casadi.sin))
     return casadi.vertcat(
         casadi.horzcat(cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),

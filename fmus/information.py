@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plant.fmu_archive import FmuFolder
-from plant.fmu_variables import parse_description
+from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.description import parse_description
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from fmus.variables import (
+from servobench.fmus.variables import (
     DERIVATIVE,
     INPUT,
     KINEMATIC_PARAMETERS,
@@ -20,7 +20,7 @@ from fmus.variables import (
     Group,
     Layout,
 )
-from plant.signals import FloatArray
+from servobench.plant.signals import FloatArray
 
 UNITS: dict[str, dict[str, str]] = {
     "1": {},

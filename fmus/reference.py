@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fmus.variables import Actuation, Layout
-from plant.hand_eye import HandEyeModel
-from plant.kinematic import discretise_lag
-from plant.seeds import named_generator
-from plant.signals import FloatArray
+from servobench.fmus.variables import Actuation, Layout
+from servobench.plant.kinematic import discretise_lag
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.seeds import named_generator
+from servobench.plant.signals import FloatArray
 
 STEP = 0.05  # s
 STEPS = 200

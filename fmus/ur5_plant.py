@@ -10,17 +10,17 @@ from typing import Literal
 import numpy as np
 import platformdirs
 
-from fmus.compile import CompilationFailed, CompilerMissing
-from fmus.export import ExportOptions, export_fmu, fingerprint
-from fmus.variables import Actuation, parameters_of
-from plant.fmu import FmuPlant
-from plant.fmu_config import FmuConfig
-from plant.fmu_entry import build_plant
-from plant.fmu_mapping import FmuMapping
-from plant.hand_eye import FEATURE_NAMES
-from plant.plant import PlantEntry, PlantSetup
-from plant.sensing import vary_sensing
-from plant.signals import as_vector, check_number
+from servobench.fmus.compile import CompilationFailed, CompilerMissing
+from servobench.fmus.export import ExportOptions, export_fmu, fingerprint
+from servobench.fmus.variables import Actuation, parameters_of
+from servobench.plant.fmu.config import FmuConfig
+from servobench.plant.fmu.entry import build_plant
+from servobench.plant.fmu.fmu_plant import FmuPlant
+from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.robot.hand_eye import FEATURE_NAMES
+from servobench.plant.sensing import vary_sensing
+from servobench.plant.signals import as_vector, check_number
 
 
 @dataclass(frozen=True)

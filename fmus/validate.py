@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
-from fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
-from plant.fmu import open_slave
-from plant.fmu_archive import FmuFolder
-from plant.fmu_slave import FmuError, Port
-from plant.fmu_variables import FmuDescription, Variable, read_description
-from plant.signals import FloatArray
+from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
+from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.description import FmuDescription, Variable, read_description
+from servobench.plant.fmu.fmu_plant import open_slave
+from servobench.plant.fmu.slave import FmuError, Port
+from servobench.plant.signals import FloatArray
 
 TOLERANCE = 1e-9
 

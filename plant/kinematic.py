@@ -16,11 +16,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from plant.hand_eye import hand_eye_spec
-from plant.plant import Plant, PlantDiverged, PlantEntry, PlantSetup
-from plant.seeds import named_generator
-from plant.sensing import FeatureChannel, vary_sensing
-from plant.signals import (
+from servobench.plant.plant import (
+    Plant,
+    PlantDiverged,
+    PlantEntry,
+    PlantSetup,
+)
+from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.seeds import named_generator
+from servobench.plant.sensing import FeatureChannel, vary_sensing
+from servobench.plant.signals import (
     Command,
     FloatArray,
     Observation,

@@ -1,7 +1,7 @@
 """The contract of a plant: a spec, reset, step, close, and the truth for the log.
 
 A plant never sees a target. Adding one: a class below `Plant`, a frozen configuration dataclass beside it, and a
-`PlantEntry` that is named in `harness.registry` or published under the entry-point group `servobench.plants`.
+`PlantEntry` that is named in `harness.config.registry` or published under the entry-point group `servobench.plants`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,15 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from plant.hand_eye import HandEyeModel
-from plant.signals import Command, FloatArray, Observation, PlantSpec, RunFault, Truth
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.signals import (
+    Command,
+    FloatArray,
+    Observation,
+    PlantSpec,
+    RunFault,
+    Truth,
+)
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from plant.signals import FloatArray, check_number
+from servobench.plant.signals import FloatArray, check_number
 
 Config = TypeVar("Config")
 

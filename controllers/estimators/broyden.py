@@ -13,9 +13,9 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.estimators.estimator import Estimator, Motion
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.plant.signals import FloatArray, check_number
 
 
 @dataclass(frozen=True)

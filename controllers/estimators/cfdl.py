@@ -13,10 +13,10 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.estimators.broyden import projection_update
-from controllers.estimators.estimator import Estimator, Motion
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.broyden import projection_update
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.plant.signals import FloatArray, check_number
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import final
 
-from controllers.controller import Diagnostics
-from controllers.estimators.estimator import Estimator, Motion
-from plant.signals import FloatArray
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.plant.signals import FloatArray
 
 
 @dataclass(frozen=True)

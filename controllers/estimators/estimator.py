@@ -5,8 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from controllers.controller import Diagnostics
-from plant.signals import FloatArray
+from servobench.controllers.controller import Diagnostics
+from servobench.plant.signals import FloatArray
 
 LONGEST_DELAY = 14  # periods: no estimator tells of a longer one, so that laws know how much past to keep
 

@@ -16,9 +16,9 @@ from typing import Literal, final
 
 import numpy as np
 
-from controllers.controller import Diagnostics, FilterDiverged
-from controllers.estimators.estimator import Estimator, Motion
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics, FilterDiverged
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.plant.signals import FloatArray, check_number
 
 FORMS = ("split", "full")
 

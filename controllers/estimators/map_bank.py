@@ -20,8 +20,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg.lapack import dgesdd, dposv
 
-from controllers.controller import FilterDiverged
-from plant.signals import FloatArray
+from servobench.controllers.controller import FilterDiverged
+from servobench.plant.signals import FloatArray
 
 
 def map_update(

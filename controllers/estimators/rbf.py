@@ -9,10 +9,10 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.estimators.estimator import Estimator, Motion
-from controllers.networks import JacobianNetwork, LatestFeatures, jacobian_output
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.networks.rbf import JacobianNetwork, LatestFeatures, jacobian_output
+from servobench.plant.signals import FloatArray, check_number
 
 
 @dataclass(frozen=True)

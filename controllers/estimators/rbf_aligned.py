@@ -14,13 +14,13 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.estimators.estimator import LONGEST_DELAY, Estimator, Motion
-from controllers.estimators.map_bank import map_update, near_rotation
-from controllers.estimators.noise_level import NoiseLevel
-from controllers.estimators.rbf import RbfConfig, RbfEstimator
-from controllers.networks import JacobianNetwork
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import LONGEST_DELAY, Estimator, Motion
+from servobench.controllers.estimators.map_bank import map_update, near_rotation
+from servobench.controllers.estimators.noise_level import NoiseLevel
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
+from servobench.controllers.networks.rbf import JacobianNetwork
+from servobench.plant.signals import FloatArray, check_number
 
 ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
 JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm

@@ -13,10 +13,10 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.estimators.estimator import Estimator, Motion
-from controllers.estimators.kalman import cholesky_of
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.estimators.kalman import cholesky_of
+from servobench.plant.signals import FloatArray, check_number
 
 
 @dataclass(frozen=True)

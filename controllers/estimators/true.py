@@ -7,9 +7,9 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics, RobotKnowledge
-from controllers.estimators.estimator import Estimator, Motion
-from plant.signals import FloatArray
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.plant.signals import FloatArray
 
 
 @dataclass(frozen=True)

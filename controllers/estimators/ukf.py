@@ -20,10 +20,10 @@ from typing import Literal, final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.estimators.estimator import Estimator, Motion
-from controllers.estimators.kalman import check_filter_numbers, cholesky_of, split_update
-from plant.signals import FloatArray, check_number
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.estimators.kalman import check_filter_numbers, cholesky_of, split_update
+from servobench.plant.signals import FloatArray, check_number
 
 FORMS = ("sigma_points", "split")
 

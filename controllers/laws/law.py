@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from plant.signals import FloatArray, Observation
+from servobench.controllers.controller import Diagnostics
+from servobench.plant.signals import FloatArray, Observation
 
 
 class Law(ABC):

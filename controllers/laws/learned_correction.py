@@ -21,10 +21,10 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics
-from controllers.laws.damped_inverse import damped_inverse
-from controllers.networks import ControllerNetwork
-from plant.signals import FloatArray, Observation
+from servobench.controllers.controller import Diagnostics
+from servobench.controllers.laws.damped_inverse import damped_inverse
+from servobench.controllers.networks.rbf import ControllerNetwork
+from servobench.plant.signals import FloatArray, Observation
 
 
 @dataclass(frozen=True)

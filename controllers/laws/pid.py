@@ -16,10 +16,10 @@ from typing import final
 
 import numpy as np
 
-from controllers.controller import Diagnostics, RobotKnowledge
-from controllers.laws.damped_inverse import damped_inverse
-from controllers.laws.law import Law, scale_to_limit
-from plant.signals import FloatArray, Observation, check_number
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.laws.damped_inverse import damped_inverse
+from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.plant.signals import FloatArray, Observation, check_number
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,17 @@ from typing import Literal, final, get_args
 
 import numpy as np
 
-from controllers.controller import Diagnostics, RobotKnowledge
-from controllers.laws.law import Law, scale_to_limit
-from controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
-from controllers.laws.row_space import project_to_row_space
-from controllers.networks import ControllerNetwork, controller_output
-from plant.signals import FloatArray, Observation, check_number
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.laws.roll_out import (
+    RollOut,
+    descent_direction,
+    roll_out,
+    update_step,
+)
+from servobench.controllers.laws.row_space import project_to_row_space
+from servobench.controllers.networks.rbf import ControllerNetwork, controller_output
+from servobench.plant.signals import FloatArray, Observation, check_number
 
 Position = Literal["measured", "commanded"]
 POSITIONS: tuple[str, ...] = get_args(Position)

@@ -18,19 +18,19 @@ from typing import Literal, final, get_args
 
 import numpy as np
 
-from controllers.controller import Diagnostics, RobotKnowledge
-from controllers.estimators.estimator import LONGEST_DELAY
-from controllers.estimators.map_bank import nearest_rotation
-from controllers.estimators.noise_level import NoiseLevel
-from controllers.laws.damped_inverse import damped_inverse
-from controllers.laws.feature_filter import FeatureFilter
-from controllers.laws.joint_response import JointResponse
-from controllers.laws.law import Law, scale_to_limit
-from controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
-from controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
-from controllers.laws.redistribution import redistribute
-from controllers.network_file import TrainedNetworks
-from plant.signals import FloatArray, Observation, check_number
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimators.estimator import LONGEST_DELAY
+from servobench.controllers.estimators.map_bank import nearest_rotation
+from servobench.controllers.estimators.noise_level import NoiseLevel
+from servobench.controllers.laws.damped_inverse import damped_inverse
+from servobench.controllers.laws.feature_filter import FeatureFilter
+from servobench.controllers.laws.joint_response import JointResponse
+from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
+from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from servobench.controllers.laws.redistribution import redistribute
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.plant.signals import FloatArray, Observation, check_number
 
 Base = Literal["jacobian", "network"]
 BASES: tuple[str, ...] = get_args(Base)

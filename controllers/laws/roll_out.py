@@ -17,8 +17,8 @@ from functools import cache
 
 import numpy as np
 
-from controllers.networks import ControllerNetwork, information_vector
-from plant.signals import FloatArray
+from servobench.controllers.networks.rbf import ControllerNetwork, information_vector
+from servobench.plant.signals import FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -1,0 +1,1 @@
+"""A bench on which uncalibrated visual-servoing controllers are compared."""

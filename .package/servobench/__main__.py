@@ -1,0 +1,5 @@
+"""`python -m servobench` is the command `servobench`."""
+
+from servobench.harness.cli.main import main
+
+main()

@@ -1,0 +1,152 @@
+"""The integrals a, b, c of eq. 46 and the predictive laws without limits, in closed form.
+
+Symbols (times τ and horizon H in control periods):
+
+| here | meaning | shape | unit |
+|---|---|---|---|
+| `H` | horizon | | periods |
+| `alpha` | α in (0, 1], weight of a later error against an earlier one, a period | | |
+| `beta` | β = exp(−ρ), share of the error that may be left after one period | | |
+| `a`, `b`, `c` | ∫ τ² α^τ dτ, ∫ τ α^τ dτ, ∫ τ (αβ)^τ dτ over [0, H] | | periods³, periods², periods² |
+| `J` | estimated ∂y/∂q | (m, n) | m/rad |
+| `Q` | diagonal of the move weight | (n,) | m²/rad² |
+
+Departure from the paper: its closed forms are 0/0 at α = 1 and at αβ = 1 and lose all digits near them; there a power
+series takes over. They follow from φ_p(s) = ∫₀¹ x^p exp(−s x) dx with s = −H ln γ: ∫₀ᴴ τ^p γ^τ dτ = H^{p+1} φ_p(s).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servobench.plant.signals import FloatArray, check_number
+
+_SERIES_BELOW = 0.5  # under it the series of 18 terms is exact to rounding, above it the closed form is
+_SERIES_TERMS = 18
+_SMALLEST_POWER = 1e-150
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+@dataclass(frozen=True, slots=True)
+class HorizonIntegrals:
+    """a, b and c of eq. 46."""
+
+    a: float
+    b: float
+    c: float
+
+
+def horizon_integrals(horizon: float, alpha: float, rho: float) -> HorizonIntegrals:
+    """Return a, b and c of eq. 46.
+
+    Args:
+        horizon: H, periods, positive.
+        alpha: α in (0, 1].
+        rho: ρ ≥ 0, decay rate a period.
+
+    Raises:
+        ValueError: an argument outside these bounds.
+    """
+    check_number("horizon", horizon, above=0.0)
+    check_number("alpha", alpha, above=0.0, at_most=1.0)
+    check_number("rho", rho, at_least=0.0)
+    rate = -math.log(alpha)
+    return HorizonIntegrals(
+        a=_weighted_power_integral(2, rate, horizon),
+        b=_weighted_power_integral(1, rate, horizon),
+        c=_weighted_power_integral(1, rate + rho, horizon),
+    )
+
+
+def _weighted_power_integral(power: int, rate: float, horizon: float) -> float:
+    """∫₀ᴴ τ^p exp(−rate τ) dτ for p = 1 or 2."""
+    s = rate * horizon
+    if s < _SERIES_BELOW:
+        term, total = 1.0, 0.0
+        for k in range(_SERIES_TERMS):
+            total += term / (power + k + 1)
+            term *= -s / (k + 1)
+        return float(horizon ** (power + 1) * total)
+    decay = math.exp(-s)
+    first = (1.0 - decay * (1.0 + s)) / s**2
+    value = first if power == 1 else (2.0 * first - decay) / s
+    return float(horizon ** (power + 1) * value)
+
+
+def _power(alpha: float, tau: float) -> float:
+    """α^τ, or 0 where it is so small that products with it would underflow."""
+    value = float(alpha**tau)
+    return value if value > _SMALLEST_POWER else 0.0
+
+
+def decay_targets(error: FloatArray, reference_step: FloatArray, rho: float) -> FloatArray:
+    """Return the feature displacements that the prediction should follow: r_τ + (1 − β^τ) e for τ = 1 … H.
+
+    Args:
+        error: e = y_ref − y now, (m,), m.
+        reference_step: r_τ = y_ref(k+τ) − y_ref(k), (H, m), m.
+        rho: ρ, β = exp(−ρ).
+
+    Returns:
+        (H, m), m.
+    """
+    share = [-math.expm1(-rho * tau) for tau in range(1, len(reference_step) + 1)]
+    return np.asarray(reference_step + np.outer(share, error))
+
+
+def move_weights(horizon: int, alpha: float, terminal_weight: float) -> FloatArray:
+    """Return the weights (H,) of the errors after 1 … H moves: α^τ, plus `terminal_weight` on the last one."""
+    weights = np.array([_power(alpha, tau) for tau in range(1, horizon + 1)])
+    weights[-1] += terminal_weight
+    return weights
+
+
+def preview_weights(horizon: int, alpha: float) -> FloatArray:
+    """Return v (H,) with ∫₀ᴴ τ α^τ r(τ) dτ = Σ_τ v_τ r_τ for the r(τ) that is linear between r_0 = 0, r_1, …, r_H."""
+    v = np.zeros(horizon + 1)
+    x = 0.5 * (_NODES + 1.0)
+    for start in range(horizon):
+        tau = start + x
+        density = 0.5 * _NODE_WEIGHTS * tau * np.array([_power(alpha, t) for t in tau.tolist()])
+        v[start] += density @ (1.0 - x)
+        v[start + 1] += density @ x
+    return v[1:]
+
+
+def constant_step(J: FloatArray, target: FloatArray, a: float, Q: FloatArray) -> FloatArray:
+    """Return the minimiser of ½ a ‖J dq‖² − targetᵀ J dq + ½ dqᵀ Q dq: (a JᵀJ + Q) dq = Jᵀ target.
+
+    With target = (b − c) e it is eq. 46 for Q = q I; for another Q the printed eq. 46 is not this minimiser.
+
+    Args:
+        J: (m, n), m/rad.
+        target: (m,), m times periods².
+        a: periods³.
+        Q: diagonal, (n,), positive.
+
+    Returns:
+        dq, (n,), rad a period.
+    """
+    # The m × m form costs less than the n × n one: dq = Q⁻¹ Jᵀ (I + a J Q⁻¹ Jᵀ)⁻¹ target.
+    weighted = J / Q
+    return np.asarray(weighted.T @ np.linalg.solve(np.eye(len(J)) + a * (weighted @ J.T), target))
+
+
+def free_moves(J: FloatArray, targets: FloatArray, weights: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return the minimiser of ½ Σ_t w_t ‖target_t − J Σ_{s≤t} dq_s‖² + ½ Σ_t dq_tᵀ Q dq_t, (H, n), rad.
+
+    Args:
+        J: (m, n), m/rad.
+        targets: (H, m), m.
+        weights: w, (H,).
+        Q: diagonal, (n,), positive.
+    """
+    horizon, n = len(targets), J.shape[1]
+    tail = np.cumsum(weights[::-1])[::-1]  # Σ_{t≥s} w_t, the weight that move s meets
+    coupling = np.minimum.outer(tail, tail)
+    hessian = np.kron(coupling, J.T @ J) + np.diag(np.tile(Q, horizon))
+    pull = np.cumsum((weights[:, None] * targets)[::-1], axis=0)[::-1] @ J
+    return np.asarray(np.linalg.solve(hessian, pull.ravel()).reshape(horizon, n))

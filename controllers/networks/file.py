@@ -1,0 +1,146 @@
+"""Trained networks and the file that holds them: an .npz without pickles, written at once or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, Kernel
+
+FORMAT = "servobench networks"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedNetworks:
+    """Both networks as the offline training left them.
+
+    Attributes:
+        jacobian: the Jacobian network.
+        controller: the controller network.
+        jacobian_error: held-out RMS of ‖Ĵ − J‖ over that of ‖J‖.
+        controller_error: held-out RMS over joints of ψ ξ − q_cmd, rad.
+        digest: hash of the configuration and of the model.
+    """
+
+    jacobian: JacobianNetwork
+    controller: ControllerNetwork
+    jacobian_error: float
+    controller_error: float
+    digest: str
+
+    def __post_init__(self) -> None:
+        """Check that both networks are of the same robot."""
+        if (self.jacobian.n, self.jacobian.m) != (self.controller.n, self.controller.m):
+            raise ValueError(
+                f"both networks must have the same sizes (n, m), got {(self.jacobian.n, self.jacobian.m)} and "
+                f"{(self.controller.n, self.controller.m)}"
+            )
+
+
+def save_networks(networks: TrainedNetworks, path: Path) -> None:
+    """Write `networks` to `path`; a reader sees the old file or the whole new one, never a part.
+
+    Args:
+        networks: what to store.
+        path: the .npz file; its folder is made where absent.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **_as_arrays(networks))
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load_networks(
+    path: Path, *, n: int | None = None, m: int | None = None, digest: str | None = None
+) -> TrainedNetworks:
+    """Read networks from `path`.
+
+    Args:
+        path: as written by `save_networks`.
+        n: wanted number of joints, None for any.
+        m: wanted number of features, None for any.
+        digest: wanted hash of configuration and model, None for any.
+
+    Raises:
+        ValueError: missing, corrupt, foreign, of another format version, of other sizes, or of another configuration.
+    """
+    arrays = _read_arrays(path)
+    try:
+        networks = _from_arrays(arrays)
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"network file {path} is corrupt: {error}") from error
+    for name, wanted, came in (
+        ("joints", n, networks.jacobian.n),
+        ("features", m, networks.jacobian.m),
+        ("training digest", digest, networks.digest),
+    ):
+        if wanted is not None and wanted != came:
+            raise ValueError(
+                f"network file {path} is of another robot or configuration: {name} {came}, wanted {wanted}"
+            )
+    return networks
+
+
+def _read_arrays(path: Path) -> dict[str, Any]:
+    """Return all arrays of the file after its format and version have been checked."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise ValueError(f"network file {path} does not exist") from error
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+        raise ValueError(f"network file {path} is corrupt or not a network file: {error}") from error
+    if str(arrays.get("format")) != FORMAT:
+        raise ValueError(f"network file {path} is not a network file of servobench")
+    version = str(arrays.get("format_version"))
+    if version != str(FORMAT_VERSION):
+        raise ValueError(f"network file {path} has format version {version}, wanted {FORMAT_VERSION}; train it again")
+    return arrays
+
+
+def _as_arrays(networks: TrainedNetworks) -> dict[str, Any]:
+    jacobian, controller = networks.jacobian, networks.controller
+    return {
+        "format": np.array(FORMAT),
+        "format_version": np.array(FORMAT_VERSION),
+        "digest": np.array(networks.digest),
+        "sizes": np.array([jacobian.n, jacobian.m]),
+        "history": np.array([controller.error_history, controller.position_history]),
+        "kernel": np.array(controller.kernel),
+        "held_out_error": np.array([networks.jacobian_error, networks.controller_error]),
+        "jacobian_centres": jacobian.centres,
+        "jacobian_widths": jacobian.widths,
+        "jacobian_weights": jacobian.weights,
+        "controller_centres": controller.centres,
+        "controller_widths": controller.widths,
+        "controller_weights": controller.weights,
+    }
+
+
+def _from_arrays(arrays: dict[str, Any]) -> TrainedNetworks:
+    error_history, position_history = (int(value) for value in arrays["history"])
+    jacobian_error, controller_error = (float(value) for value in arrays["held_out_error"])
+    jacobian = JacobianNetwork(arrays["jacobian_centres"], arrays["jacobian_widths"], arrays["jacobian_weights"])
+    if tuple(arrays["sizes"].tolist()) != (jacobian.n, jacobian.m):
+        raise ValueError(f"sizes must be {(jacobian.n, jacobian.m)}, got {arrays['sizes'].tolist()}")
+    controller = ControllerNetwork(
+        arrays["controller_centres"],
+        arrays["controller_widths"],
+        arrays["controller_weights"],
+        error_history,
+        position_history,
+        cast(Kernel, str(arrays["kernel"])),
+    )
+    return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, str(arrays["digest"]))

@@ -1,0 +1,278 @@
+"""Offline fits of both networks on the nominal model, which is given as a callable only.
+
+Jacobian network: ridge least squares of W_i on J_i(q) = W_i θ_i(q), one fit for each joint column.
+
+Controller network, one of two fits by ridge least squares on samples of ξ:
+
+- "output" (default): ψ ξ ≈ q_cmd, linear in W with the features ξ ⊗ h(ξ);
+- "entries" (the paper's reading): ψ ≈ [K_p dt J⁺, 0, I, 0], linear in W with the features h(ξ). Its error in the
+  identity block is multiplied by joint positions of some radians.
+
+The paper's ideal law leaves the null space of J alone, so an arm with n > m wanders out of the region on which it was
+trained. The output fit therefore imitates ψ ξ ≈ q + K_p dt J⁺ e + K_n dt (I − J⁺J)(q_c − q), which draws the posture
+towards the region's middle q_c without moving the feature; K_n = 0 is the paper's law.
+
+Widths and regularisation are the best of a small grid on held-out samples. Nothing here is random beyond the
+configuration's own seed, and only `train_cached` touches files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
+from servobench.controllers.networks.rbf import (
+    ControllerNetwork,
+    JacobianNetwork,
+    hidden_features,
+    jacobian_features,
+)
+from servobench.controllers.networks.samples import (
+    ControllerRegion,
+    ControllerSamples,
+    choose_centres,
+    controller_samples,
+    joint_samples,
+    pool_size,
+    unit_points,
+)
+from servobench.plant.signals import FloatArray, PlantSpec
+
+Progress = Callable[[float, str], None]
+JACOBIAN_SHARE = 0.4  # of the work, for the progress bar
+DIGEST_POINTS = 16  # joint positions at which a nominal model is told from another
+DIGEST_DECIMALS = 9  # so that the last bits of another machine make no other network
+
+
+def train(
+    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, progress: Progress | None = None
+) -> TrainedNetworks:
+    """Fit both networks on the nominal model.
+
+    Args:
+        config: region, sizes, grids and seed.
+        nominal_jacobian: (S, n) rad -> (S, m, n).
+        spec: sizes, speed limit and control period.
+        progress: told the share that is done and what is being done.
+
+    Returns:
+        The networks with their held-out errors.
+
+    Raises:
+        ValueError: the region does not fit the plant, or the nominal Jacobian has another shape or is not finite.
+    """
+    digest = training_digest(config, nominal_jacobian, spec)
+    tell = progress if progress is not None else _no_progress
+    jacobian, jacobian_error = _train_jacobian(config, nominal_jacobian, spec, tell)
+    controller, controller_error = _train_controller(config, nominal_jacobian, spec, tell)
+    tell(1.0, "done")
+    return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, digest)
+
+
+def train_cached(
+    config: TrainingConfig,
+    nominal_jacobian: JacobianFunction,
+    spec: PlantSpec,
+    folder: Path,
+    progress: Progress | None = None,
+) -> TrainedNetworks:
+    """Return the networks of this configuration and model from `folder`, and train and store them where absent.
+
+    Raises:
+        ValueError: as `train`, or the stored file is corrupt or foreign.
+    """
+    digest = training_digest(config, nominal_jacobian, spec)
+    path = folder / f"networks-{digest[:16]}.npz"
+    if path.exists():
+        return load_networks(path, n=spec.n, m=spec.m, digest=digest)
+    networks = train(config, nominal_jacobian, spec, progress)
+    save_networks(networks, path)
+    return networks
+
+
+def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> TrainedNetworks:
+    """Return networks for a robot, from `knowledge.train` where there is such a source, else trained on the spot.
+
+    Args:
+        config: a region that is left empty is the robot's working region.
+        knowledge: of the robot.
+
+    Raises:
+        ValueError: no region is known, no nominal model exists, networks of another robot came, or as `train`.
+    """
+    if not config.lower:
+        if knowledge.region is None:
+            raise ValueError("training needs a region: give lower and upper, one number a joint, rad")
+        lower, upper = knowledge.region
+        config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
+    spec = knowledge.spec
+    if knowledge.train is not None:
+        networks = knowledge.train(config)
+    elif knowledge.nominal_jacobian is not None:
+        networks = train(config, knowledge.nominal_jacobian, spec)
+    else:
+        raise ValueError("training needs a nominal model, and this plant has none")
+    if (networks.jacobian.n, networks.jacobian.m) != (spec.n, spec.m):
+        raise ValueError(
+            f"network must be of {spec.n} joints and {spec.m} features, "
+            f"got {networks.jacobian.n} and {networks.jacobian.m}"
+        )
+    return networks
+
+
+def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> str:
+    """Return a hash of all that the networks depend on: configuration, sizes, period, speed limit and model.
+
+    Raises:
+        ValueError: as `train`.
+    """
+    lower, upper = config.region(spec.n)
+    sample = joint_samples(unit_points(DIGEST_POINTS, spec.n, np.random.default_rng(0)), lower, upper)
+    J = _checked(nominal_jacobian, sample, spec)
+    content = {
+        "config": asdict(config),
+        "sizes": [spec.n, spec.m],
+        "period": spec.period,
+        "joint_velocity_limit": spec.joint_velocity_limit.tolist(),
+        "model": (np.round(J, DIGEST_DECIMALS) + 0.0).ravel().tolist(),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _train_jacobian(
+    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, tell: Progress
+) -> tuple[JacobianNetwork, float]:
+    """Return the Jacobian network and its held-out error, the RMS of ‖Ĵ − J‖ over that of ‖J‖."""
+    plan: JacobianTraining = config.jacobian
+    lower, upper = config.region(spec.n)
+    rng = np.random.default_rng([config.seed, 1])
+    placement = plan.placement
+    unit = unit_points(plan.samples, spec.n, rng, placement)
+    pool = unit_points(pool_size(plan.centres, placement), spec.n, rng, placement)
+    centres = joint_samples(choose_centres(pool, plan.centres, rng, placement), lower, upper)
+    q = joint_samples(unit, lower, upper)
+    J = _checked(nominal_jacobian, q, spec)
+    held = held_out_count(plan.samples, config.held_out)
+    spread = float(np.linalg.norm(upper - lower)) / 2.0
+    squares: FloatArray = np.full(spec.n, np.inf)
+    widths, weights = np.ones((spec.n, plan.centres)), np.zeros((spec.n, spec.m, plan.centres))
+    for index, scale in enumerate(plan.width_scales):
+        tell(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
+        theta = jacobian_features(q, centres[None], np.full((1, plan.centres), scale * spread))[:, 0]
+        for W in ridge_path(theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations):
+            residual = (theta[:held] @ W).reshape(held, spec.m, spec.n) - J[:held]
+            square = np.einsum("smn,smn->n", residual, residual)
+            for i in np.flatnonzero(square < squares):
+                squares[i], widths[i] = square[i], scale * spread
+                weights[i] = W.reshape(plan.centres, spec.m, spec.n)[:, :, i].T
+    network = JacobianNetwork(np.broadcast_to(centres, (spec.n, *centres.shape)), widths, weights)
+    return network, float(np.sqrt(squares.sum() / np.einsum("smn,smn->", J[:held], J[:held])))
+
+
+def _train_controller(
+    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, tell: Progress
+) -> tuple[ControllerNetwork, float]:
+    """Return the controller network and its held-out error, the RMS over joints of ψ ξ − q_cmd, rad."""
+    plan: ControllerTraining = config.controller
+    region = controller_region(config, spec)
+    rng = np.random.default_rng([config.seed, 2])
+    posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
+    gains = (plan.gain * spec.period, posture_gain * spec.period)
+    unit = unit_points(plan.samples, region.dimension, rng, plan.placement)
+    samples = controller_samples(unit, region, nominal_jacobian, *gains)
+    pool = unit_points(pool_size(plan.hidden, plan.placement), region.dimension, rng, plan.placement)
+    pool_xi = controller_samples(pool, region, nominal_jacobian, *gains).xi
+    centres = choose_centres(pool_xi, plan.hidden, rng, plan.placement)
+    wanted = samples.command
+    held = held_out_count(plan.samples, config.held_out)
+    spread = float(np.sqrt(np.mean(np.sum((pool_xi - pool_xi.mean(axis=0)) ** 2, axis=-1))))
+    best, network = np.inf, None
+    for index, scale in enumerate(plan.width_scales):
+        tell(JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales), "controller network")
+        reach = scale * spread  # the distance at which a unit has fallen to 1/e
+        widths = np.full(plan.hidden, reach if plan.kernel == "gaussian" else np.sqrt(reach))
+        h = hidden_features(samples.xi, centres, widths, plan.kernel)
+        for weights in _controller_weights(plan, samples, wanted, h, held):
+            candidate = ControllerNetwork(
+                centres, widths, weights, plan.error_history, plan.position_history, plan.kernel
+            )
+            error = float(np.sqrt(np.mean((candidate.command(samples.xi[:held]) - wanted[:held]) ** 2)))
+            if error < best:
+                best, network = error, candidate
+    if network is None:
+        raise ValueError("the controller network could not be fitted: every held-out error is not finite")
+    return network, best
+
+
+def _controller_weights(
+    plan: ControllerTraining, samples: ControllerSamples, wanted: FloatArray, h: FloatArray, held: int
+) -> Iterator[FloatArray]:
+    """Yield the weights W, (n, p, N_h), of each regularisation."""
+    count, p = samples.xi.shape
+    n = wanted.shape[1]
+    if plan.fit == "output":
+        features = (samples.xi[:, :, None] * h[:, None, :]).reshape(count, -1)
+        for W in ridge_path(features[held:], wanted[held:], plan.regularisations):
+            yield W.T.reshape(n, p, plan.hidden)
+        return
+    entries = ideal_controller_matrix(samples.gain, plan.error_history, plan.position_history)
+    for W in ridge_path(h[held:], entries[held:].reshape(count - held, -1), plan.regularisations):
+        yield np.moveaxis(W.reshape(plan.hidden, n, p), 0, -1)
+
+
+def ideal_controller_matrix(gain: FloatArray, error_history: int, position_history: int) -> FloatArray:
+    """Return ψ* = [K_p dt J⁺, 0, I, 0] (eq. 10), (S, n, m L_e + n L_c), from K_p dt J⁺ (S, n, m)."""
+    count, n, m = gain.shape
+    psi = np.zeros((count, n, m * error_history + n * position_history))
+    psi[:, :, :m] = gain
+    psi[:, :, m * error_history : m * error_history + n] = np.eye(n)
+    return psi
+
+
+def controller_region(config: TrainingConfig, spec: PlantSpec) -> ControllerRegion:
+    """Return from where the controller's samples come."""
+    plan = config.controller
+    lower, upper = config.region(spec.n)
+    step = spec.joint_velocity_limit * spec.period
+    return ControllerRegion(lower, upper, plan.error_range, step, plan.error_history, plan.position_history, spec.m)
+
+
+def ridge_path(features: FloatArray, targets: FloatArray, regularisations: tuple[float, ...]) -> Iterator[FloatArray]:
+    """Yield the ridge solutions W = (FᵀF + λ μ I)⁻¹ Fᵀ Y for each λ, with μ the largest eigenvalue of FᵀF.
+
+    Args:
+        features: F, (S, d).
+        targets: Y, (S, t).
+        regularisations: λ, relative to μ.
+    """
+    eigenvalues, V = np.linalg.eigh(features.T @ features)
+    projected = V.T @ (features.T @ targets)
+    largest = eigenvalues[-1]
+    for relative in regularisations:
+        yield V @ (projected / (np.maximum(eigenvalues, 0.0) + relative * largest)[:, None])
+
+
+def held_out_count(samples: int, share: float) -> int:
+    """Return how many of the samples are held out, at least one."""
+    return max(1, round(samples * share))
+
+
+def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec) -> FloatArray:
+    J = np.asarray(nominal_jacobian(q), dtype=np.float64)
+    if J.shape != (len(q), spec.m, spec.n):
+        raise ValueError(f"nominal_jacobian must return {(len(q), spec.m, spec.n)} for {q.shape}, got {J.shape}")
+    if not np.isfinite(J).all():
+        raise ValueError("nominal_jacobian must be finite in the whole training region")
+    return J
+
+
+def _no_progress(share: float, what: str) -> None:
+    """Nobody watches."""

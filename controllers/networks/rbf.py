@@ -1,0 +1,263 @@
+"""The two radial-basis networks of the proposed method, as pure functions and frozen records.
+
+Jacobian network (eqs. 28–30, 40, 41), one network for each joint column i:
+
+    Ĵ_i(q) = W_i θ_i(q),   θ_il = exp(−(‖q − c_il‖ / δ_il)²)
+
+Controller network (eqs. 11–17), one weight matrix for each column ψ_j, all on the same hidden layer:
+
+    q_cmd = ψ ξ,   ψ_j = W_j h(ξ),   h_l = exp(−‖ξ − c_l‖ / γ_l²)
+
+Eq. 16 does not square the norm; that is the default here ("exponential") and the Gaussian is an option. Departure from
+the paper: exponents are cut at 60, so that a unit far away is 1e-26 instead of an underflow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, final, get_args
+
+import numpy as np
+
+from servobench.plant.signals import FloatArray
+
+Kernel = Literal["exponential", "gaussian"]
+KERNELS: tuple[str, ...] = get_args(Kernel)
+LARGEST_EXPONENT = 60.0
+LOWEST_EXPONENT = np.array(-LARGEST_EXPONENT)
+
+
+def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) -> FloatArray:
+    """Return the hidden layers θ of all joint columns (eqs. 29, 40).
+
+    Args:
+        q: (..., n), rad.
+        centres: c, (n, L, n), or (1, L, n) where the columns share them, rad.
+        widths: δ, (n, L), rad.
+
+    Returns:
+        θ, (..., n, L).
+    """
+    offset = q[..., None, None, :] - centres
+    exponent = np.einsum("...k,...k->...", offset, offset) / widths**2
+    return np.asarray(np.exp(-np.minimum(exponent, LARGEST_EXPONENT)))
+
+
+def jacobian_output(weights: FloatArray, theta: FloatArray) -> FloatArray:
+    """Return Ĵ, (..., m, n), m/rad, from weights W (n, m, L) and features θ (..., n, L) (eqs. 30, 41)."""
+    columns = np.matmul(weights, theta[..., None])[..., 0]
+    return np.asarray(np.swapaxes(columns, -1, -2))
+
+
+def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, kernel: Kernel) -> FloatArray:
+    """Return the hidden layer h of the controller network (eq. 16).
+
+    Args:
+        xi: ξ, (..., p), m and rad.
+        centres: c, (N_h, p).
+        widths: γ, (N_h,); for "exponential" γ² has the unit of ξ, for "gaussian" γ has it.
+        kernel: "exponential" for exp(−‖ξ − c‖/γ²), "gaussian" for exp(−‖ξ − c‖²/γ²).
+
+    Returns:
+        h, (..., N_h).
+    """
+    offset = xi[..., None, :] - centres
+    square = np.einsum("...p,...p->...", offset, offset)
+    exponent = (square if kernel == "gaussian" else np.sqrt(square)) / widths**2
+    return np.asarray(np.exp(-np.minimum(exponent, LARGEST_EXPONENT)))
+
+
+def controller_output(weights: FloatArray, xi: FloatArray, h: FloatArray) -> FloatArray:
+    """Return q_cmd = ψ ξ with ψ_j = W_j h (eqs. 12, 17).
+
+    Args:
+        weights: W, (n, p, N_h), rad per unit of ξ.
+        xi: ξ, (..., p).
+        h: (..., N_h).
+
+    Returns:
+        (..., n), rad.
+    """
+    n, p, hidden = weights.shape
+    psi = (h @ weights.reshape(n * p, hidden).T).reshape(*h.shape[:-1], n, p)
+    return np.asarray(np.matmul(psi, xi[..., None])[..., 0])
+
+
+def information_vector(errors: FloatArray, positions: FloatArray) -> FloatArray:
+    """Return ξ = [e(k) … e(k−L_e+1), q(k−1) … q(k−L_c)] (eq. 11).
+
+    Args:
+        errors: (..., L_e, m), m, the newest first.
+        positions: (..., L_c, n), rad, the newest first.
+
+    Returns:
+        (..., m L_e + n L_c).
+    """
+    lead = errors.shape[:-2]
+    return np.concatenate([errors.reshape(*lead, -1), positions.reshape(*lead, -1)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class JacobianNetwork:
+    """n Gaussian networks, one for each joint column of the Jacobian.
+
+    Attributes:
+        centres: c, (n, L, n), rad; `centres[i, l]` is a joint position at which unit l of column i is 1.
+        widths: δ, (n, L), rad, positive.
+        weights: W, (n, m, L), m/rad; `weights[i]` maps the units of column i to the column.
+    """
+
+    centres: FloatArray
+    widths: FloatArray
+    weights: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check that the three arrays fit together and freeze them."""
+        _freeze(self, ("centres", "widths", "weights"))
+        if self.centres.ndim != 3 or self.weights.ndim != 3 or 0 in self.centres.shape + self.weights.shape:
+            raise ValueError(
+                "centres and weights must be (n, L, n) and (n, m, L) with all sizes at least 1, "
+                f"got {self.centres.shape} and {self.weights.shape}"
+            )
+        n, units = self.centres.shape[:2]
+        _check_shape("centres", self.centres, (n, units, n))
+        _check_shape("widths", self.widths, (n, units))
+        _check_shape("weights", self.weights, (n, self.m, units))
+        _check_positive("widths", self.widths)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return int(self.weights.shape[0])
+
+    @property
+    def m(self) -> int:
+        """Number of features."""
+        return int(self.weights.shape[1])
+
+    def features(self, q: FloatArray) -> FloatArray:
+        """Return θ, (..., n, L), at joint positions (..., n), rad: the numbers of `jacobian_features`, sooner."""
+        centres, ones, decay = self._prepared
+        offset = q[..., None, None, :] - centres
+        offset *= offset
+        theta: FloatArray = offset.dot(ones) * decay
+        np.maximum(theta, LOWEST_EXPONENT, out=theta)
+        return np.exp(theta, out=theta)
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad."""
+        return jacobian_output(self.weights, self.features(q))
+
+    @cached_property
+    def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Centres, (1, L, n) where all columns share them as after training, ones (n,), and −1/δ², (n, L)."""
+        shared = bool((self.centres == self.centres[0]).all())
+        return self.centres[: 1 if shared else None], np.ones(self.n), -1.0 / self.widths**2
+
+
+@final
+class LatestFeatures:
+    """θ at the joint position that was asked for last: an estimator is asked several times for the same one."""
+
+    def __init__(self, network: JacobianNetwork) -> None:
+        """Take the network; nothing is known yet."""
+        self._network = network
+        self._key = b""
+        self._theta: FloatArray | None = None
+
+    def at(self, q: FloatArray) -> FloatArray:
+        """Return θ, (n, L), at q, (n,), rad."""
+        key = q.tobytes()
+        if self._theta is None or key != self._key:
+            self._key, self._theta = key, self._network.features(q)
+        return self._theta
+
+
+@dataclass(frozen=True, eq=False)
+class ControllerNetwork:
+    """p = m L_e + n L_c networks on one hidden layer, one for each column of the controller matrix ψ.
+
+    Attributes:
+        centres: c, (N_h, p), m and rad, points in the space of ξ.
+        widths: γ, (N_h,), positive.
+        weights: W, (n, p, N_h); `weights[:, j]` maps the hidden layer to the column ψ_j.
+        error_history: L_e, how many errors ξ holds.
+        position_history: L_c, how many joint positions ξ holds.
+        kernel: of the hidden layer, see `hidden_features`.
+    """
+
+    centres: FloatArray
+    widths: FloatArray
+    weights: FloatArray
+    error_history: int
+    position_history: int
+    kernel: Kernel = "exponential"
+
+    def __post_init__(self) -> None:
+        """Check that arrays and sizes fit together and freeze the arrays."""
+        _freeze(self, ("centres", "widths", "weights"))
+        if self.kernel not in KERNELS:
+            raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, got {self.kernel!r}")
+        if self.weights.ndim != 3 or 0 in self.weights.shape:
+            raise ValueError(f"weights must be (n, p, N_h) with all sizes at least 1, got {self.weights.shape}")
+        n, p, hidden = self.weights.shape
+        _check_shape("centres", self.centres, (hidden, p))
+        _check_shape("widths", self.widths, (hidden,))
+        _check_positive("widths", self.widths)
+        left = p - n * self.position_history
+        if self.error_history < 1 or self.position_history < 1 or left < 1 or left % self.error_history:
+            raise ValueError(
+                f"weights must have m L_e + n L_c columns with L_e = {self.error_history}, n = {n} and "
+                f"L_c = {self.position_history}, got {p}"
+            )
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return int(self.weights.shape[0])
+
+    @property
+    def m(self) -> int:
+        """Number of features."""
+        return int(self.weights.shape[1] - self.n * self.position_history) // self.error_history
+
+    def features(self, xi: FloatArray) -> FloatArray:
+        """Return h, (..., N_h), at ξ (..., p): the numbers of `hidden_features`, sooner."""
+        ones, decay = self._prepared
+        offset = xi[..., None, :] - self.centres
+        offset *= offset
+        h: FloatArray = offset.dot(ones)
+        if self.kernel == "exponential":
+            np.sqrt(h, out=h)
+        h *= decay
+        np.maximum(h, LOWEST_EXPONENT, out=h)
+        return np.exp(h, out=h)
+
+    def command(self, xi: FloatArray) -> FloatArray:
+        """Return q_cmd = ψ(ξ) ξ, (..., n), rad, with the weights as they were trained."""
+        return controller_output(self.weights, xi, self.features(xi))
+
+    @cached_property
+    def _prepared(self) -> tuple[FloatArray, FloatArray]:
+        """Ones, (p,), and −1/γ², (N_h,)."""
+        return np.ones(self.centres.shape[1]), -1.0 / self.widths**2
+
+
+def _freeze(network: object, names: tuple[str, ...]) -> None:
+    for name in names:
+        array = np.array(getattr(network, name), dtype=np.float64)
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} of a network must be finite")
+        array.flags.writeable = False
+        object.__setattr__(network, name, array)
+
+
+def _check_shape(name: str, array: FloatArray, wanted: tuple[int, ...]) -> None:
+    if array.shape != wanted:
+        raise ValueError(f"{name} must have shape {wanted}, got {array.shape}")
+
+
+def _check_positive(name: str, array: FloatArray) -> None:
+    if not (array > 0.0).all():
+        raise ValueError(f"{name} must be positive, the smallest is {array.min()}")

@@ -1,0 +1,1 @@
+"""Statistics and tables of the runs in a results folder."""

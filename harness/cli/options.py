@@ -1,0 +1,35 @@
+"""Options that several commands share, and lists of names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from servobench.harness.config.settings import ConfigurationError
+
+INTERRUPTED = 130  # exit code after Ctrl-C
+
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting, such as kinematic.lag=0.1.")
+]
+
+
+def split_words(text: str) -> tuple[str, ...]:
+    """Return the words in a list by comma."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
+    """Return the names in a list by comma, each of which `find` knows; `all` for those in `known`."""
+    if text.strip() == "all":
+        return tuple(known)
+    names = tuple(dict.fromkeys(split_words(text)))
+    if not names:
+        raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
+    for name in names:
+        find(name)
+    return names

@@ -1,0 +1,1 @@
+"""Settings, their defaults, and what is known by name."""

@@ -1,0 +1,61 @@
+"""The defaults of a controller: those of its configuration class with the tuned values on top.
+
+Tuned values are files `controllers/tuned/NAME.toml` that `servobench tune` wrote; their table `[settings]` holds nested
+fields of the configuration. A controller without a file keeps the defaults of its class.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import Any, Final
+
+from servobench.controllers.controller import ControllerEntry
+from servobench.harness.config.settings import ConfigurationError, Settings
+
+SAME_AS: Final = {"kalman_mfac": "ukf_mfac"}  # the same filter in another form takes the same values, untuned
+
+
+def tuned_file(name: str) -> Traversable:
+    """Return where the tuned values of the controller called `name` lie, if it has any."""
+    return files("servobench.controllers") / "tuned" / f"{SAME_AS.get(name, name)}.toml"
+
+
+def default_config(entry: ControllerEntry) -> Any:  # noqa: ANN401 - any configuration dataclass
+    """Return the configuration of a controller for which nothing is set.
+
+    Raises:
+        ConfigurationError: a file of tuned values that is malformed or does not fit the configuration.
+    """
+    return apply_settings(entry, tuned_settings(entry.name))
+
+
+def apply_settings(entry: ControllerEntry, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - as default_config
+    """Return the configuration of `entry`'s class with nested `values` on top.
+
+    Raises:
+        ConfigurationError: an unknown key, or a value that the configuration refuses.
+    """
+    return Settings({entry.name: values}).resolve(entry.name, entry.config())
+
+
+@cache
+def tuned_settings(name: str) -> Mapping[str, Any]:
+    """Return the tuned values of the controller called `name`, nested; empty where there are none.
+
+    Raises:
+        ConfigurationError: a file that cannot be read as tuned values.
+    """
+    file = tuned_file(name)
+    if not file.is_file():
+        return {}
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))["settings"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigurationError(f"tuned values {file} cannot be read: {error}; make them with tune") from error
+    if not isinstance(values, dict):
+        raise ConfigurationError(f"tuned values {file}: [settings] must be a table, got {values!r}")
+    return values

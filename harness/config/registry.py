@@ -1,0 +1,111 @@
+"""Plants, controllers and tasks by name: those of this package and those that other distributions publish.
+
+A third party publishes a `PlantEntry` or `ControllerEntry` under the entry-point group `servobench.plants` or
+`servobench.controllers`; a name of this package cannot be taken over.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+
+from servobench.controllers.composed import compose
+from servobench.controllers.controller import ControllerEntry
+from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.plant.fmu.entry import mapped_entry
+from servobench.plant.plant import PlantEntry
+
+PLANT_GROUP = "servobench.plants"
+CONTROLLER_GROUP = "servobench.controllers"
+
+PLANTS = {
+    "kinematic": "servobench.plant.kinematic:ENTRY",
+    "bullet": "servobench.plant.bullet.bullet_plant:ENTRY",
+    "fmu": "servobench.fmus.ur5_plant:ENTRY",
+}
+MAPPED = "fmu:"
+CONTROLLERS = {
+    "rbfnn_mfac": "servobench.controllers.rbfnn_mfac:ENTRY",
+    "rbfnn_mfac_plus": "servobench.controllers.rbfnn_mfac_plus:ENTRY",
+    "ukf_mfac": "servobench.controllers.ukf_mfac:ENTRY",
+    "ukf_mpc": "servobench.controllers.ukf_mpc:ENTRY",
+    "rbf_pid": "servobench.controllers.rbf_pid:ENTRY",
+    "constant": "servobench.controllers.constant:ENTRY",
+    "calibrated": "servobench.controllers.calibrated:ENTRY",
+    "nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY",
+    "broyden": "servobench.controllers.broyden:ENTRY",
+    "rls": "servobench.controllers.rls:ENTRY",
+    "kalman_mfac": "servobench.controllers.kalman_mfac:ENTRY",
+    "cfdl_mfac": "servobench.controllers.cfdl_mfac:ENTRY",
+}
+
+
+def plant_names() -> list[str]:
+    """Return the names of all plants, those of this package first."""
+    return list(_points(PLANT_GROUP))
+
+
+def controller_names() -> list[str]:
+    """Return the names of all controllers, those of this package first."""
+    return list(_points(CONTROLLER_GROUP))
+
+
+def find_plant(name: str) -> PlantEntry:
+    """Return the plant called `name`, or for a name like `fmu:PATH.toml` the FMU that this mapping describes.
+
+    Raises:
+        ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
+    """
+    if name.startswith(MAPPED):
+        try:
+            return mapped_entry(Path(name.removeprefix(MAPPED)).expanduser())
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from error
+    entry = _load(PLANT_GROUP, "plant", name)
+    if not isinstance(entry, PlantEntry):
+        raise ConfigurationError(
+            f"plant {name!r} is published as {type(entry).__name__}, wanted a servobench.plant.plant.PlantEntry"
+        )
+    return entry
+
+
+def find_controller(name: str) -> ControllerEntry:
+    """Return the controller called `name`, or the one composed for a name like `mfac+rls` (law + estimator).
+
+    Raises:
+        ConfigurationError: no such controller, or a third party's that cannot be loaded.
+    """
+    law, plus, estimator = name.partition("+")
+    if plus:
+        try:
+            return compose(law, estimator)
+        except ValueError as error:
+            raise ConfigurationError(f"controller {name!r}: {error}") from error
+    entry = _load(CONTROLLER_GROUP, "controller", name)
+    if not isinstance(entry, ControllerEntry):
+        raise ConfigurationError(
+            f"controller {name!r} is published as {type(entry).__name__}, "
+            "wanted a servobench.controllers.controller.ControllerEntry"
+        )
+    return entry
+
+
+@cache
+def _points(group: str) -> dict[str, EntryPoint]:
+    own = PLANTS if group == PLANT_GROUP else CONTROLLERS
+    points = {name: EntryPoint(name, value, group) for name, value in own.items()}
+    for point in entry_points(group=group):
+        points.setdefault(point.name, point)
+    return points
+
+
+@cache
+def _load(group: str, kind: str, name: str) -> object:
+    points = _points(group)
+    if name not in points:
+        raise ConfigurationError(f"unknown {kind} {name!r}: {suggest(name, points)}")
+    try:
+        return points[name].load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigurationError(f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}") from error

@@ -1,0 +1,82 @@
+"""How the share of settled runs changes with what a folder varies: a mismatch's size, the noise, the latency."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from servobench.harness.analysis.statistics import Estimate, settled_share
+from servobench.harness.pictures.panels import (
+    Styles,
+    add_legend,
+    label_rows,
+    panel_grid,
+)
+from servobench.harness.pictures.places import draw_places
+
+MAGNITUDE = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
+NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}
+
+
+def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
+    """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies; None if none does.
+
+    Args:
+        runs: rows of the table of runs.
+        styles: of the controllers.
+    """
+    sweeps = _sweeps(runs)
+    if not sweeps:
+        return None
+    figure, panels = panel_grid(len(sweeps), 2.5)
+    for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
+        cells = dict(iter(part.groupby(["controller", "size"])))
+        names, sizes = part["controller"].unique(), sorted(part["size"].unique())
+        shares = {name: [_share(cells.get((name, size))) for size in sizes] for name in names}
+        draw_places(axes, sizes, shares, styles, joined=True)
+        axes.set(xlabel=label, ylim=(-4, 104))
+    label_rows(panels, "settled runs [%]")
+    add_legend(figure, panels)
+    return figure
+
+
+def _share(runs: pd.DataFrame | None) -> Estimate:
+    return Estimate(np.nan, np.nan, np.nan, 0) if runs is None else settled_share(runs)
+
+
+def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each condition with at least two sizes the runs concerned, with the column `size`.
+
+    Where a sweep says along which axis a run stands, the axes are its own; else the mismatches are read.
+    """
+    axes = runs["axis"].fillna("") if "axis" in runs else pd.Series("", index=runs.index)
+    if (axes != "").any():
+        own = runs[axes != ""]
+        words = own["axis"].str.replace("_", " ") + "=" + own["magnitude"]
+        return _along_axes(own, words)
+    sweeps = {
+        label: runs[runs[name].notna()].assign(size=runs[name].dropna().astype(float))
+        for name, label in NUMBERS.items()
+        if name in runs and runs[name].nunique() > 1
+    }
+    return sweeps | _along_axes(runs, runs["mismatch"])
+
+
+def _along_axes(runs: pd.DataFrame, words: pd.Series[str]) -> dict[str, pd.DataFrame]:
+    """Return the runs of each axis with at least two sizes; `words` say axis and size of each run, `links=10%`."""
+    matches = words.map(MAGNITUDE.match)
+    found = runs[matches.notna()].assign(
+        axis=[match["axis"] for match in matches if match],
+        unit=[match["unit"] for match in matches if match],
+        size=[float(match["size"]) for match in matches if match],
+    )
+    none = runs[words == "none"].assign(size=0.0)
+    sweeps = {}
+    for (axis, unit), group in found.groupby(["axis", "unit"], sort=False):
+        part = pd.concat([none, group]) if len(none) else group
+        if part["size"].nunique() > 1:
+            sweeps[f"{str(axis).replace('_', ' ')} [{unit}]" if unit else str(axis)] = part
+    return sweeps

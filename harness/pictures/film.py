@@ -1,0 +1,260 @@
+"""A moving picture of a run: the arm with the trails of ball and reference, the camera's view, the error below.
+
+Everything comes from the log through `harness.pictures.replay`. Frames are composed once and go to MP4 and GIF side by
+side; both are written by the ffmpeg that the optional extra `animation` brings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from servobench.controllers.networks.fit import Progress
+from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.pictures.draw import save_figure
+from servobench.harness.pictures.panels import SETTLED
+from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
+from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.harness.run.metrics import SETTLING_BAND
+from servobench.plant.bullet.detection import ByteArray
+from servobench.plant.signals import FloatArray
+
+MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
+WIDTH, HEIGHT = 960, 736  # px of a frame; ffmpeg wants multiples of 16
+HEAD, VIEW_WIDTH, VIEW_HEIGHT = 32, 640, 480  # px: line of text on top, overview below it at the left
+SIDE = WIDTH - VIEW_WIDTH
+CAMERA_HEIGHT = 240  # px
+LARGEST_RATE = 25.0  # frames a second
+GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
+FINENESS = 1.25  # rendered pixels for one of the overview
+REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
+PLACES = 8  # snapshots
+NEAR = 0.05  # of a curve's size, within which its reference counts as back where it began
+
+
+def find_kind(name: str) -> str:
+    """Return the name of a kind of recording.
+
+    Raises:
+        ConfigurationError: an unknown one.
+    """
+    if name not in KINDS:
+        raise ConfigurationError(f"--kinds: unknown {name!r}: {suggest(name, KINDS)}")
+    return name
+
+
+def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:
+    """Write what is wanted of a run.
+
+    Args:
+        run: a logged run.
+        stem: the files' place and name without ending.
+        kinds: some of KINDS.
+        progress: told how far it is.
+
+    Returns:
+        The files.
+
+    Raises:
+        ConfigurationError: the extra `animation` is missing, or ffmpeg cannot write.
+    """
+    paths = []
+    films = [kind for kind in kinds if kind != SNAPSHOTS]
+    ffmpeg = _ffmpeg() if films else None
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    if SNAPSHOTS in kinds:
+        progress(0.0, "snapshots")
+        with figure_style():
+            figure = draw_snapshots(run)
+        paths += save_figure(figure, stem.with_name(f"{stem.name}_snapshots"))
+    if ffmpeg is None:
+        return paths
+    step = _frame_step(run.track.time)
+    try:
+        with ExitStack() as stack:
+            writers = []
+            for kind in films:
+                paths.append(stem.with_name(f"{stem.name}.{kind}"))
+                writers.append(stack.enter_context(_writer(ffmpeg, kind, paths[-1], _rate(run.track.time, step))))
+            for share, frame in _frames(run, step):
+                progress(share, "frames")
+                for writer in writers:
+                    writer.send(frame)
+    except OSError as error:
+        raise ConfigurationError(f"ffmpeg cannot write {paths[-1]}: {' '.join(str(error).split())}") from error
+    return paths
+
+
+def draw_snapshots(run: LoggedRun) -> Figure:
+    """Draw the arm at eight places of its first lap, or of the whole run (the paper's figure 8), even in time."""
+    figure = Figure(figsize=(11.0, 4.7), layout="constrained")
+    chosen = np.linspace(0, _lap(run), PLACES).round().astype(int)
+    panels = figure.subplots(2, PLACES // 2).ravel()
+    with Replay(run, fineness=2.0) as replay:
+        for axes, k in zip(panels, chosen.tolist(), strict=True):
+            replay.place(k)
+            axes.imshow(replay.overview(_trails(run, k)), interpolation="antialiased")
+            axes.set_title(f"{run.track.time[k]:.2f} s")
+            axes.set_axis_off()
+    figure.suptitle(f"{_title(run)}: trail of the ball in colour, desired path in black")
+    return figure
+
+
+def draw_frame(run: LoggedRun, k: int) -> ByteArray:
+    """Return the frame of period `k`, (HEIGHT, WIDTH, 3)."""
+    with Replay(run, fineness=2.0) as replay:
+        return _Board(run).compose(replay, k)
+
+
+class _Board:
+    """What stands around the pictures: drawn once, with the error's line and the numbers renewed in each frame."""
+
+    def __init__(self, run: LoggedRun) -> None:
+        self._run = run
+        self._style = method_styles([run.row["controller"]])[run.row["controller"]]
+        self._error = 1000.0 * run.track.column("error_norm_m")
+        with figure_style():
+            figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
+            self._figure = figure
+            self._canvas = _canvas_of(figure)
+            figure.text(0.01, 1 - HEAD / 2 / HEIGHT, _title(run), va="center", fontsize=11, fontweight="bold")
+            self._axes = figure.add_axes((0.085, 0.075, 0.89, 0.2))
+            self._prepare_axes()
+            left, top = VIEW_WIDTH / WIDTH + 0.02, 1 - (HEAD + CAMERA_HEIGHT + 18) / HEIGHT
+            figure.text(left, top, "what the camera sees, ball as detected", fontsize=9, va="top")
+            self._numbers = figure.text(left, top - 0.06, "", fontsize=13, va="top", family="monospace", animated=True)
+            lines = [
+                mpl.lines.Line2D([], [], color=self._style.colour, linewidth=3, label="ball, so far"),
+                mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label="desired path"),
+            ]
+            figure.legend(handles=lines, loc="upper left", bbox_to_anchor=(left - 0.012, top - 0.17), frameon=False)
+            self._canvas.draw()
+            self._background = self._canvas.copy_from_bbox(figure.bbox)
+
+    def compose(self, replay: Replay, k: int) -> ByteArray:
+        """Return the frame of period `k`, (HEIGHT, WIDTH, 3)."""
+        run = self._run
+        replay.place(k)
+        self._canvas.restore_region(self._background)
+        time = run.track.time
+        self._line.set_data(time[: k + 1], self._error[: k + 1])
+        self._now.set_data(time[k : k + 1], self._error[k : k + 1])
+        self._numbers.set_text(f"time  {time[k]:6.2f} s\nerror {self._error[k]:6.1f} mm")
+        for artist in (self._line, self._now):
+            self._axes.draw_artist(artist)
+        self._figure.draw_artist(self._numbers)
+        frame: ByteArray = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        view = cv2.resize(replay.overview(_trails(run, k)), (VIEW_WIDTH, VIEW_HEIGHT), interpolation=cv2.INTER_AREA)
+        frame[HEAD : HEAD + VIEW_HEIGHT, :VIEW_WIDTH] = view
+        raw = replay.camera_view()
+        scale = min(SIDE / raw.shape[1], CAMERA_HEIGHT / raw.shape[0])
+        seen = cv2.resize(raw, (round(scale * raw.shape[1]), round(scale * raw.shape[0])))
+        frame[HEAD : HEAD + seen.shape[0], VIEW_WIDTH : VIEW_WIDTH + seen.shape[1]] = seen
+        return frame
+
+    def _prepare_axes(self) -> None:
+        axes, time = self._axes, self._run.track.time
+        positive = self._error[np.isfinite(self._error) & (self._error > 0.0)]
+        if len(positive):
+            axes.set_yscale("log")
+            axes.set_ylim(
+                min(0.8 * positive.min(), 600 * SETTLING_BAND), 1.3 * max(positive.max(), 1000 * SETTLING_BAND)
+            )
+            axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+        axes.set_xlim(0.0, max(float(time[-1]), 1e-3))
+        axes.axhline(1000 * SETTLING_BAND, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
+        axes.annotate(SETTLED, (0.995, 1000 * SETTLING_BAND), xycoords=("axes fraction", "data"), fontsize=8,
+                      color="0.3", ha="right", va="bottom")  # fmt: skip
+        axes.set(xlabel="time [s]", ylabel="true error [mm]")
+        (self._line,) = axes.plot([], [], color=self._style.colour, linewidth=1.8, animated=True)
+        (self._now,) = axes.plot([], [], color=self._style.colour, marker="o", markersize=6, animated=True)
+
+
+def _canvas_of(figure: Figure) -> Any:  # noqa: ANN401 - matplotlib leaves its canvas untyped
+    return FigureCanvasAgg(figure)
+
+
+def _frames(run: LoggedRun, step: int) -> Iterator[tuple[float, ByteArray]]:
+    """Yield how far it is and the next frame."""
+    board, count = _Board(run), len(run.track.table)
+    with Replay(run, fineness=FINENESS) as replay:
+        for k in range(0, count, step):
+            yield k / count, board.compose(replay, k)
+
+
+def _trails(run: LoggedRun, k: int) -> list[Trail]:
+    colour = method_styles([run.row["controller"]])[run.row["controller"]].colour
+    red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(colour))
+    desired = run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
+    if run.track.point_to_point:  # a cross at the target
+        arms = 0.03 * np.eye(3)
+        crosses = [Trail(desired[0] + np.stack([-arm, arm]), REFERENCE_COLOUR, 2) for arm in arms]
+        return [*crosses, Trail(run.ball[: k + 1], (red, green, blue), 3)]
+    return [Trail(desired, REFERENCE_COLOUR, 2), Trail(run.ball[: k + 1], (red, green, blue), 3)]
+
+
+def _lap(run: LoggedRun) -> int:
+    """Return the period in which the reference is back where it began; the last one if it never is."""
+    distance = np.linalg.norm(run.reference - run.reference[0], axis=1)
+    away = np.flatnonzero(distance > 0.5 * distance.max())
+    back = np.flatnonzero(distance <= NEAR * distance.max())
+    after = back[back > away[0]] if len(away) else back[:0]
+    return int(after[0]) if len(after) else len(distance) - 1
+
+
+def _title(run: LoggedRun) -> str:
+    row = run.row
+    return f"{row['controller']}: {row['task']} on {row['plant']}, mismatch {row['mismatch']}, seed {row['seed']}"
+
+
+def _frame_step(time: FloatArray) -> int:
+    """Return how many periods there are from frame to frame."""
+    period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    return max(1, round(1.0 / (LARGEST_RATE * period)))
+
+
+def _rate(time: FloatArray, step: int) -> float:
+    """Return the frames a second at which the film lasts as long as the run."""
+    period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    return 1.0 / (step * period)
+
+
+def _ffmpeg() -> Any:  # noqa: ANN401 - the optional package has no types
+    try:
+        ffmpeg = import_module("imageio_ffmpeg")
+        ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise ConfigurationError(
+            "mp4 and gif need ffmpeg, which the extra 'animation' brings: pip install 'servobench[animation]'; "
+            f"--kinds {SNAPSHOTS} works without it"
+        ) from error
+    return ffmpeg
+
+
+@contextmanager
+def _writer(ffmpeg: Any, kind: str, path: Path, rate: float) -> Iterator[Generator[None, ByteArray, None]]:  # noqa: ANN401
+    """Open ffmpeg on a file; frames are sent to what comes back."""
+    if kind == MP4:
+        quality = ["-crf", "22", "-preset", "medium", "-movflags", "+faststart"]
+        options = {"codec": "libx264", "quality": None, "output_params": quality, "macro_block_size": 16}
+    else:
+        # One palette for the whole film, no dithering, and only the rectangle that changed: a still background is free.
+        chain = (
+            f"fps={min(float(GIF_RATE), rate):g},scale={GIF_WIDTH}:-1:flags=area,split[a][b];"
+            "[a]palettegen=max_colors=128:stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+        )
+        options = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "macro_block_size": 1,
+                   "output_params": ["-filter_complex", chain]}  # fmt: skip
+    with closing(ffmpeg.write_frames(str(path), (WIDTH, HEIGHT), fps=rate, **options)) as writer:
+        writer.send(None)
+        yield writer

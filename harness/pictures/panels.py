@@ -1,0 +1,170 @@
+"""What a single pair of axes shows: an error, a feature, a path in space; and the legend below all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+
+from servobench.harness.pictures.style import MethodStyle
+from servobench.harness.pictures.tracks import Track, Tracks, label_of
+from servobench.harness.run.metrics import SETTLING_BAND
+from servobench.plant.signals import FloatArray
+
+MILLI = 1000.0
+SETTLED = f"settling band, {MILLI * SETTLING_BAND:g} mm"
+ENDED, END = "run ended early", "|"  # and its marker, which no method has
+CAMERA_TILT = -62.0  # deg; −90 looks along the optical axis, from which depth could not be seen
+NO_VALUES = "no values"
+ROW = 3  # panels
+EXACT = 1e-9  # relative error below which an estimate counts as the truth
+LEAST_DEPTH = 0.4  # of the widest axis, so that a flat path does not hide the depth axis
+
+Styles = dict[str, MethodStyle]
+
+
+def draw_error(axes: Axes, tracks: Tracks, styles: Styles) -> None:
+    """Draw the norm of the true error over time, logarithmic, with the band in which a run counts as settled."""
+    metres = all(name.endswith("_m") for track in tracks.values() for name in track.features)
+    _draw_over_time(axes, tracks, styles, "error_norm_m", MILLI if metres else 1.0)
+    if metres:
+        axes.axhline(MILLI * SETTLING_BAND, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=SETTLED)
+    axes.set_ylabel("true error [mm]" if metres else "true error")
+    scale_by_size(axes)
+
+
+def draw_jacobian(axes: Axes, tracks: Tracks, styles: Styles) -> None:
+    """Draw the relative error of the estimated Jacobian over time, logarithmic."""
+    exact = [name for name, track in tracks.items() if np.nanmax(track.column("jacobian_error"), initial=0.0) < EXACT]
+    _draw_over_time(
+        axes, {name: track for name, track in tracks.items() if name not in exact}, styles, "jacobian_error", 100.0
+    )
+    for name in exact:
+        axes.plot([], [], label=f"{name} (exact)", **styles[name].line_arguments(1))
+    axes.set_ylabel("Jacobian error [%]")
+    scale_by_size(axes)
+
+
+def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:
+    """Draw a feature as it was measured, and the desired one."""
+    longest = max(tracks.values(), key=lambda track: len(track.table))
+    axes.plot(
+        longest.time, longest.column(f"reference_{feature}"), color="black", linewidth=3.0, alpha=0.3, label="desired"
+    )
+    _draw_over_time(axes, tracks, styles, f"feature_{feature}", 1.0)
+    axes.set_ylabel(f"measured\n{label_of(feature)}")
+
+
+def draw_path(axes: Axes3D, tracks: Tracks, styles: Styles) -> None:
+    """Draw the true paths as the camera sees them, tilted a little: x right, y down, depth away from the reader."""
+    longest = max(tracks.values(), key=lambda track: len(track.table))
+    if len(longest.features) < 3:
+        axes.set_axis_off()
+        axes.text2D(0.5, 0.5, "fewer than three features", transform=axes.transAxes, ha="center")
+        return
+    reference = longest.vectors("reference_")[:, :3]
+    if not longest.point_to_point:
+        axes.plot(*reference.T, color="black", linewidth=3.0, alpha=0.3, label="desired")
+    for name, track in tracks.items():
+        points = _finite_rows(track.vectors("true_feature_")[:, :3])
+        if len(points):
+            axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
+            if not track.completed:
+                axes.plot(*points[-1:].T, color=styles[name].colour, marker=END, markersize=14, markeredgewidth=2.0,
+                          linestyle="", zorder=12, gid=ENDED)  # fmt: skip
+    _draw_ends(axes, longest, reference)
+    _dress_space(axes, longest.features)
+
+
+def panel_grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `ROW` panels a row with a common ordinate, and its `count` panels.
+
+    Args:
+        count: how many panels, at least one.
+        height: of a row, inches.
+    """
+    columns = min(ROW, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(1.0 + 3.1 * columns if columns > 1 else 6.0, 1.0 + height * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure, panels[:count]
+
+
+def label_rows(panels: list[Axes], text: str) -> None:
+    """Label the ordinate of the first panel of each row."""
+    for i, axes in enumerate(panels):
+        axes.set_ylabel(text if i % ROW == 0 else "")
+
+
+def add_legend(figure: Figure, panels: Iterable[Axes], columns: int = 5) -> None:
+    """Put one legend for all panels below them; a run that ended early gets a line of its own."""
+    entries: dict[str, Artist] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    if any(line.get_gid() == ENDED for axes in panels for line in axes.get_lines()):
+        entries[ENDED] = mpl.lines.Line2D([], [], color="black", marker=END, markersize=12, linestyle="")
+    if entries:
+        figure.legend(
+            list(entries.values()), list(entries), loc="outside lower center", ncols=min(columns, len(entries)),
+            frameon=False, fontsize=8,
+        )  # fmt: skip
+
+
+def scale_by_size(axes: Axes) -> None:
+    """Make the value axis logarithmic with plain numbers, if there is anything above zero on it."""
+    values = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.get_lines()]
+    if any((part > 0.0).any() for part in values):
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    else:
+        axes.text(0.5, 0.5, NO_VALUES, transform=axes.transAxes, ha="center", va="center", color="0.4")
+
+
+def _draw_over_time(axes: Axes, tracks: Tracks, styles: Styles, column: str, factor: float) -> None:
+    for name, track in tracks.items():
+        values = factor * track.column(column)
+        if not np.isfinite(values).any():
+            continue
+        axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
+        if not track.completed:
+            last = np.flatnonzero(np.isfinite(values))[-1]
+            axes.plot(track.time[last], values[last], color=styles[name].colour, marker=END, markersize=14,
+                      markeredgewidth=2.0, linestyle="", zorder=12, gid=ENDED)  # fmt: skip
+
+
+def _draw_ends(axes: Axes3D, track: Track, reference: FloatArray) -> None:
+    start = _finite_rows(track.vectors("true_feature_")[:, :3])[:1]
+    axes.plot(*start.T, color="black", marker="s", markersize=7, markerfacecolor="white", markeredgewidth=1.5,
+              linestyle="", label="start", zorder=10)  # fmt: skip
+    if track.point_to_point:
+        axes.plot(*reference[:1].T, color="black", marker="*", markersize=11, markerfacecolor="white", linestyle="",
+                  label="target", zorder=11)  # fmt: skip
+
+
+def _dress_space(axes: Axes3D, features: list[str]) -> None:
+    labels = [label_of(name) for name in features[:3]]
+    axes.set(xlabel=labels[0], ylabel=labels[1], zlabel=labels[2].replace("z [", "depth z ["))
+    lower, upper = axes.get_zlim()
+    widest = max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()), 1e-6)
+    missing = max(0.0, LEAST_DEPTH * widest - (upper - lower))
+    axes.set_zlim(lower - missing / 2, upper + missing / 2)
+    axes.set_aspect("equal", adjustable="box")
+    axes.view_init(elev=CAMERA_TILT, azim=-90.0, roll=0.0)
+    axes.tick_params(axis="y", pad=9.0)
+    axes.tick_params(axis="z", pad=5.0)
+    axes.yaxis.labelpad, axes.zaxis.labelpad = 18.0, 12.0
+    for axis, count in ((axes.xaxis, 5), (axes.yaxis, 4), (axes.zaxis, 3)):
+        axis.set_major_locator(mpl.ticker.MaxNLocator(count))
+
+
+def _finite_rows(points: FloatArray) -> FloatArray:
+    return np.asarray(points[np.isfinite(points).all(axis=1)])

@@ -1,0 +1,230 @@
+"""A logged run shown again: its joint positions put into the rendered scene, seen from aside and by its own camera.
+
+The true robot is drawn anew from the run's mismatch and seed and compared with the values in the table. Nothing is
+simulated: the arm stands in each frame where the log says, and the ball is found in an image without noise.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields, replace
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from servobench.harness.config.registry import find_plant
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.pictures.tracks import Track
+from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, ur5_body
+from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.robot import ur5
+from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.seeds import named_seed
+from servobench.plant.signals import FloatArray
+
+if TYPE_CHECKING:
+    from servobench.plant.bullet.scene import Scene, View
+
+EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame: from the front right, down to the workspace
+OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
+INSIDE = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
+PALE = 0.3  # share of its colour that a hidden part of a trail keeps
+
+
+@dataclass(frozen=True, eq=False)
+class Trail:
+    """A line in space to be drawn into the overview.
+
+    Attributes:
+        points: (k, 3), m, base frame.
+        colour: red, green, blue.
+        width: px.
+    """
+
+    points: FloatArray
+    colour: tuple[int, int, int]
+    width: int
+
+
+@dataclass(frozen=True, eq=False)
+class LoggedRun:
+    """What is needed to show a run again.
+
+    Attributes:
+        row: its row in the table of runs.
+        track: its steps.
+        model: the true arm and camera.
+        moved: the same after the camera was moved in the middle of the run; None if it was not.
+        moved_from: first period that the moved camera sees; the number of periods if none.
+        config: the rendered plant's settings, for its camera.
+        joint_position: (k, n), rad, as reported.
+        ball: (k, 3), m, base frame.
+        reference: (k, 3), m, base frame.
+    """
+
+    row: dict[str, Any]
+    track: Track
+    model: HandEyeModel
+    moved: HandEyeModel | None
+    moved_from: int
+    config: BulletConfig
+    joint_position: FloatArray
+    ball: FloatArray
+    reference: FloatArray
+
+
+def logged_run(row: dict[str, Any], steps: pd.DataFrame, settings: dict[str, Any]) -> LoggedRun:
+    """Return a run made ready to be shown.
+
+    Args:
+        row: its row in the table of runs.
+        steps: its rows in the table of steps.
+        settings: the rendered plant's settings by name, as a manifest has them; empty for the defaults.
+
+    Raises:
+        ConfigurationError: a plant that is no UR5, a run without steps, or one whose robot cannot be drawn again.
+    """
+    run_id = row["run_id"]
+    if find_plant(row["plant"]).own_robot:
+        raise ConfigurationError(
+            f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own, no UR5"
+        )
+    if steps.empty:
+        raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
+    track = Track(run_id, row["status"], steps.reset_index(drop=True))
+    names = [f"joint_position_{name}_rad" for name in ur5.JOINT_NAMES]
+    missing = [name for name in names if name not in steps]
+    if missing:
+        raise ConfigurationError(f"run {run_id} has no column {missing[0]}; wanted the joint positions of a UR5")
+    model, moved = _true_model(row)
+    known = {item.name for item in fields(BulletConfig)}
+    try:
+        config = BulletConfig(**{name: value for name, value in settings.items() if name in known})
+    except (ValueError, TypeError) as error:
+        raise ConfigurationError(f"run {run_id}: settings of bullet in the manifest: {error}") from error
+    q, ball = steps[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
+    moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
+
+    def in_base(points: FloatArray) -> FloatArray:
+        later = points[:0] if moved is None else moved.to_base(points[moved_from:])
+        return np.concatenate([model.to_base(points[:moved_from]), later])
+
+    reference = in_base(track.vectors("reference_"))
+    return LoggedRun(row, track, model, moved, moved_from, config, q, in_base(ball), reference)
+
+
+class Replay:
+    """The scene in which a logged run is shown; to be used in a `with` statement."""
+
+    def __init__(self, run: LoggedRun, *, fineness: float = 1.0) -> None:
+        """Open a world with the run's robot.
+
+        Args:
+            run: what to show.
+            fineness: pixels rendered for one of the overview, along each side; above 1 edges become smooth.
+        """
+        from servobench.plant.bullet.scene import Scene, view_of  # noqa: PLC0415 - PyBullet prints a banner when it is imported
+
+        self._run, self._fineness = run, fineness
+        self._scene: Scene = Scene(run.model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=True, window=False)
+        self._camera = run.config.camera()
+        self._views: list[View] = [view_of(self._camera, model.X_BC) for model in (run.model, run.moved) if model]
+        self._view = self._views[0]
+        self._overview_pose = _look_at(np.array(EYE), np.array(TARGET))
+        fine = replace(OVERVIEW, width=round(fineness * OVERVIEW.width), height=round(fineness * OVERVIEW.height))
+        self._overview: View = view_of(fine, self._overview_pose)
+
+    def __enter__(self) -> Self:
+        """Return the replay."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Leave the world."""
+        self._scene.close()
+
+    def place(self, k: int) -> None:
+        """Put arm and camera where they were in period `k`."""
+        self._view = self._views[k >= self._run.moved_from]
+        self._scene.place(self._run.model.arm.joint_angle(self._run.joint_position[k]))
+
+    def camera_view(self) -> ByteArray:
+        """Return what the run's camera sees, (h, w, 3), the detected ball marked."""
+        rgba, buffer = self._scene.render(self._view)
+        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
+        return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
+
+    def overview(self, trails: list[Trail]) -> ByteArray:
+        """Return the arm from aside, (480, 640, 3) times the fineness, with trails; what is hidden is pale."""
+        rgba, buffer = self._scene.render(self._overview)
+        picture = np.ascontiguousarray(rgba[..., :3])
+        depth = self._overview.camera.metric_depth(buffer)
+        for trail in trails:
+            self._draw(picture, depth, trail)
+        return picture
+
+    def _draw(self, picture: ByteArray, depth: FloatArray, trail: Trail) -> None:
+        if len(trail.points) < 2 or not np.isfinite(trail.points).all():
+            return
+        camera, X = self._overview.camera, self._overview_pose
+        p_C = (trail.points - X[:3, 3]) @ X[:3, :3]
+        if (p_C[:, 2] < camera.near).any():
+            return
+        pixels = camera.project(p_C)
+        columns = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
+        rows = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
+        hidden = p_C[:, 2] > depth[rows, columns] + INSIDE
+        corners = np.round(pixels * 16).astype(np.int32)
+        width = max(1, round(trail.width * self._fineness))
+        covered = hidden[1:] | hidden[:-1]
+        for wanted in (True, False):
+            layer = picture.copy() if wanted else picture
+            for i in np.flatnonzero(covered == wanted):
+                cv2.line(layer, corners[i].tolist(), corners[i + 1].tolist(), trail.colour, width, cv2.LINE_AA, 4)
+            if wanted:
+                cv2.addWeighted(layer, PALE, picture, 1 - PALE, 0.0, dst=picture)
+
+
+def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]:
+    """Return the run's true robot, and what it was after its camera was moved; None if it was not.
+
+    Raises:
+        ConfigurationError: its mismatch cannot be drawn, or other values come out than the table has.
+    """
+    try:
+        mismatch = parse_mismatch(row["mismatch"])
+        model, sample = sample_mismatch(mismatch, ur5.nominal_ur5(), named_seed(int(row["seed"]), "mismatch"))
+    except ValueError as error:
+        raise ConfigurationError(f"run {row['run_id']}: {error}") from error
+    logged = row.get("mismatch_values") or "{}"
+    if json.loads(logged) != json.loads(json.dumps(sample.as_record())):
+        raise ConfigurationError(
+            f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "
+            "give now; record it with the version of servobench that made it"
+        )
+    return model, sample.moved(model)
+
+
+def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:
+    """Return the first period in which the true feature (k, m) is the one that the moved camera sees at q (k, n)."""
+    before, after = (
+        np.linalg.norm([camera.feature(joints) - seen for joints, seen in zip(q, feature, strict=True)], axis=1)
+        for camera in (model, moved)
+    )
+    seen = np.flatnonzero(after < before)
+    return int(seen[0]) if len(seen) else len(q)
+
+
+def _look_at(eye: FloatArray, target: FloatArray) -> FloatArray:
+    """Return X_BC, (4, 4), of a camera at `eye` that looks at `target`, both (3,) m, with the horizon level."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
+    pose[:3, 3] = eye
+    return pose

@@ -1,0 +1,121 @@
+"""One colour, line and marker a method, the same in every picture, and readable without colour."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from servobench.plant.signals import FloatArray
+
+# Okabe and Ito's palette, distinguishable with every kind of colour vision.
+BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY, YELLOW, GREY, BLACK = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#56B4E9",
+    "#B8A900",
+    "#7F7F7F",
+    "#000000",
+)
+WINE = "#882255"  # of Tol's palette, which goes with it
+
+
+MARKS = 8  # on each line
+
+
+@dataclass(frozen=True)
+class MethodStyle:
+    """How a method's line looks.
+
+    Attributes:
+        colour: as matplotlib and plotly take it.
+        line: matplotlib's line style.
+        marker: matplotlib's marker; empty = none.
+        shift: 0 … 1, where between two marks of another method this one's marks lie.
+    """
+
+    colour: str
+    line: Any
+    marker: str
+    shift: float = 0.0
+
+    def line_arguments(self, points: int) -> dict[str, Any]:
+        """Return keyword arguments for a matplotlib line of `points` points, with about eight markers on it."""
+        step = max(1, points // MARKS)
+        return self._arguments() | {"markevery": (int(self.shift * step), step)}
+
+    def path_arguments(self, points: FloatArray) -> dict[str, Any]:
+        """Return keyword arguments for a line through `points`, (k, d), with about eight markers evenly along it."""
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        places = (np.arange(MARKS) + self.shift) / MARKS * way[-1]
+        return self._arguments() | {"markevery": np.unique(np.searchsorted(way, places)).tolist()}
+
+    def _arguments(self) -> dict[str, Any]:
+        return {
+            "color": self.colour,
+            "linestyle": self.line,
+            "marker": self.marker,
+            "markersize": 4.5,
+            "linewidth": 1.4,
+        }
+
+
+_STYLES = {
+    "rbfnn_mfac": MethodStyle(VERMILLION, "-", "o"),
+    "rbfnn_mfac_plus": MethodStyle(WINE, "-", "*"),
+    "ukf_mfac": MethodStyle(BLUE, "--", "s"),
+    "ukf_mpc": MethodStyle(GREEN, "-.", "^"),
+    "rbf_pid": MethodStyle(ORANGE, (0, (5, 1)), "D"),
+    "calibrated": MethodStyle(BLACK, "-", ""),
+    "nmpc_calibrated": MethodStyle(BLACK, ":", "x"),
+    "constant": MethodStyle(GREY, ":", "v"),
+    "broyden": MethodStyle(PURPLE, "--", "P"),
+    "rls": MethodStyle(SKY, "-.", "X"),
+    "kalman_mfac": MethodStyle(SKY, "-", "+"),
+    "cfdl_mfac": MethodStyle(YELLOW, (0, (3, 1, 1, 1)), "*"),
+}
+_OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILLION, BLUE, GREEN)
+_OTHER_LINES = ((0, (1, 1)), (0, (4, 2)), (0, (6, 1, 1, 1)), "-", "--")
+_OTHER_MARKERS = ("<", ">", "h", "p", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
+
+
+def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
+    """Return a style for each name: the known ones always the same, others by their place in the alphabet.
+
+    Ask once for all names of a folder, so that a third party's controller looks the same in all its figures.
+    """
+    wanted = list(dict.fromkeys(names))
+    unknown = sorted(name for name in wanted if name not in _STYLES)
+    styles = {name: _STYLES.get(name) or _other(unknown.index(name)) for name in wanted}
+    return {name: replace(style, shift=i / len(styles)) for i, (name, style) in enumerate(styles.items())}
+
+
+def figure_style() -> AbstractContextManager[None]:
+    """Return the context in which every figure is drawn; text in SVG stays text, fonts in PDF are embedded."""
+    return mpl.rc_context(
+        {
+            "font.size": 9,
+            "axes.titlesize": 9,
+            "axes.grid": True,
+            "grid.alpha": 0.3,
+            "axes.axisbelow": True,
+            "svg.fonttype": "none",
+            "pdf.fonttype": 42,
+        }
+    )
+
+
+def _other(index: int) -> MethodStyle:
+    """Return the style of an unknown method; the first 32 differ in their markers."""
+    return MethodStyle(
+        _OTHER_COLOURS[index % len(_OTHER_COLOURS)],
+        _OTHER_LINES[index % len(_OTHER_LINES)],
+        _OTHER_MARKERS[index % len(_OTHER_MARKERS)],
+    )

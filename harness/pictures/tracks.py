@@ -1,0 +1,126 @@
+"""The logged steps of a results folder, arranged as figures want them: by plant and mismatch, task and controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.episode import COMPLETED
+from servobench.plant.signals import FloatArray
+
+FEATURE = "feature_"
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The steps of one run.
+
+    Attributes:
+        run_id: the run's name.
+        status: how it ended.
+        table: its rows, at least one; columns without any value are left out.
+    """
+
+    run_id: str
+    status: str
+    table: pd.DataFrame
+
+    @property
+    def completed(self) -> bool:
+        """Whether the run reached its last period."""
+        return self.status == COMPLETED
+
+    @property
+    def time(self) -> FloatArray:
+        """Instants, (k,) s."""
+        return self.column("time_s")
+
+    @property
+    def features(self) -> list[str]:
+        """Names of the features with their unit, such as `x_m`."""
+        return [name.removeprefix(FEATURE) for name in self.table.columns if name.startswith(FEATURE) and
+                f"reference_{name.removeprefix(FEATURE)}" in self.table.columns]  # fmt: skip
+
+    @property
+    def joints(self) -> list[str]:
+        """Names of the joints with their unit, such as `elbow_rad`."""
+        return [
+            name.removeprefix("joint_position_") for name in self.table.columns if name.startswith("joint_position_")
+        ]
+
+    @property
+    def point_to_point(self) -> bool:
+        """Whether the reference rests."""
+        return bool(np.ptp(self.vectors("reference_"), axis=0).max(initial=0.0) == 0.0)
+
+    def column(self, name: str) -> FloatArray:
+        """Return a column as (k,) numbers; NaN where the run has none."""
+        if name not in self.table.columns:
+            return np.full(len(self.table), np.nan)
+        return np.asarray(self.table[name].to_numpy(dtype=np.float64))
+
+    def vectors(self, kind: str) -> FloatArray:
+        """Return the features of a kind (`feature_`, `true_feature_`, `reference_`), (k, m) in their unit."""
+        return np.stack([self.column(kind + name) for name in self.features], axis=-1).reshape(len(self.table), -1)
+
+
+Tracks = dict[str, Track]
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """The runs that belong into one figure: of one plant and mismatch, and in each task of one seed.
+
+    Attributes:
+        plant: its name.
+        mismatch: as it was given.
+        seed: of these runs.
+        tasks: task -> controller -> track; tasks without any step are left out.
+    """
+
+    plant: str
+    mismatch: str
+    seed: int
+    tasks: dict[str, Tracks]
+
+    def select(self, *, point_to_point: bool) -> dict[str, Tracks]:
+        """Return the tasks with a fixed target, or those with a moving reference."""
+        return {
+            task: tracks
+            for task, tracks in self.tasks.items()
+            if next(iter(tracks.values())).point_to_point == point_to_point
+        }
+
+
+def load_groups(folder: Path) -> Iterator[Group]:
+    """Yield a group for each plant and mismatch, with the runs of its smallest seed.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    runs = results.load_runs(folder)
+    for (plant, mismatch), group in runs.groupby(["plant", "mismatch"], sort=False):
+        chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
+        try:
+            steps = results.load_steps(folder, chosen["run_id"].tolist())
+        except ConfigurationError:  # a sweep keeps no steps, and a run may end before its first
+            continue
+        tables = dict(iter(steps.groupby("run_id", sort=False)))
+        tasks: dict[str, Tracks] = {}
+        for row in chosen.to_dict("records"):
+            if row["run_id"] in tables:
+                table = tables[row["run_id"]].dropna(axis=1, how="all").reset_index(drop=True)
+                tasks.setdefault(row["task"], {})[row["controller"]] = Track(row["run_id"], row["status"], table)
+        yield Group(str(plant), str(mismatch), int(chosen["seed"].iloc[0]), tasks)
+
+
+def label_of(feature: str) -> str:
+    """Return `x [m]` for `x_m`."""
+    name, _, unit = feature.rpartition("_")
+    return f"{name} [{unit}]"

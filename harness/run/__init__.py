@@ -1,0 +1,1 @@
+"""One run: request, reference, task, loop, log and metrics."""

@@ -1,0 +1,89 @@
+"""One run carried out: a row of results and a table of steps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from threadpoolctl import threadpool_limits
+
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.experiment import RunRequest, build_experiment
+from servobench.harness.run.log import StepLog
+from servobench.harness.run.loop import run_loop
+from servobench.harness.run.metrics import Judgement, judge_run
+from servobench.plant.plant import ImageArray
+from servobench.plant.signals import RunFault
+
+COMPLETED = "completed"
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What came of it.
+
+    Attributes:
+        row: one row for the table of runs.
+        steps: one row a period.
+        picture: what the camera saw last, or None.
+    """
+
+    row: dict[str, Any]
+    steps: pd.DataFrame
+    picture: ImageArray | None = field(default=None, repr=False)
+
+
+def run_experiment(
+    request: RunRequest, settings: Settings, *, picture: bool = False, keep: Path | None = None
+) -> RunResult:
+    """Carry one run out; a fault on the way is told in the row's `status` and `reason`.
+
+    Args:
+        request: what to run.
+        settings: overrides of the defaults.
+        picture: also return what the camera saw last, where there is one.
+        keep: results folder in which trained networks are kept beside the runs.
+
+    Raises:
+        ConfigurationError: a name, setting, mismatch or seed that cannot be used.
+    """
+    experiment = build_experiment(request, settings, keep=keep)
+    plant, spec, scenario = experiment.plant, experiment.plant.spec, experiment.scenario
+    log = StepLog(spec, full_jacobian=experiment.run.full_jacobian)
+    status, reason = COMPLETED, ""
+    try:
+        with threadpool_limits(1), np.errstate(divide="raise", over="raise", invalid="raise"):
+            run_loop(plant, experiment.controller, scenario.reference, experiment.loop, request.seed, log)
+    except RunFault as fault:
+        status, reason = fault.status, _one_line(fault)
+    except FloatingPointError as error:
+        status, reason = "numerical_error", _one_line(error)
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
+        status, reason = "crashed", f"{type(error).__name__}: {_one_line(error)}"
+    finally:
+        image = plant.picture() if picture and len(log) else None
+        plant.close()
+    steps = log.table(request.run_id)
+    judgement = Judgement(spec, scenario.point_to_point, scenario.evaluate_from)
+    row: dict[str, Any] = {
+        **request.as_row(),
+        "status": status,
+        **(judge_run(steps, judgement) if len(steps) else {}),
+        "periods": len(steps),
+        "reason": reason,
+        "mismatch_values": json.dumps(experiment.sample.as_record() if experiment.sample else {}),
+    }
+    return RunResult(row, steps, image)
+
+
+def crashed_row(request: RunRequest, reason: str) -> dict[str, Any]:
+    """Return the row of a run of which nothing is left but why it failed."""
+    return {**request.as_row(), "status": "crashed", "periods": 0, "reason": reason, "mismatch_values": "{}"}
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())

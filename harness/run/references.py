@@ -1,0 +1,157 @@
+"""What the feature should do: a function of time, and the rows of it that a controller sees.
+
+Row 0 of a preview is now, the rest are the next control instants.
+"""
+
+from __future__ import annotations
+
+import csv
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.signals import FloatArray, check_number
+
+
+class Reference(ABC):
+    """A desired feature over time."""
+
+    @abstractmethod
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the desired feature, (..., m) m, at `time` (...), s."""
+
+    def preview(self, k: int, period: float, rows: int) -> FloatArray:
+        """Return the desired features of instants k … k + rows − 1, (rows, m) m."""
+        return self.at(np.arange(k, k + rows) * period)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedPoint(Reference):
+    """y_ref(t) = target, (m,) m."""
+
+    target: FloatArray
+
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the target, whatever the time."""
+        times = np.asarray(time, dtype=np.float64)
+        return np.broadcast_to(self.target, (*times.shape, len(self.target))).copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Waypoints(Reference):
+    """Straight lines between points passed at given times; before the first and after the last it rests there.
+
+    Attributes:
+        times: (p,), s, ascending.
+        points: (p, m), m.
+    """
+
+    times: FloatArray
+    points: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check sizes and order."""
+        if self.points.ndim != 2 or self.times.shape != (len(self.points),) or len(self.points) == 0:
+            raise ValueError(
+                f"waypoints need times (p,) and points (p, m), got {self.times.shape}, {self.points.shape}"
+            )
+        if not (np.diff(self.times) > 0.0).all():
+            raise ValueError("waypoint times must ascend")
+
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return the interpolated points."""
+        times = np.asarray(time, dtype=np.float64)
+        return np.stack([np.interp(times, self.times, column) for column in self.points.T], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Circle(Reference):
+    """y_ref(t) = c + r (cos ωt · a + sin ωt · b), ω = 2π / lap time, a and b the first two feature axes.
+
+    Attributes:
+        centre: c, (m,), m.
+        radius: r, m.
+        lap_time: s.
+    """
+
+    centre: FloatArray
+    radius: float
+    lap_time: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("radius", self.radius, above=0.0)
+        check_number("lap_time", self.lap_time, above=0.0)
+
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return points on the circle."""
+        phase = 2 * np.pi * np.asarray(time, dtype=np.float64) / self.lap_time
+        return _in_plane(self.centre, self.radius * np.cos(phase), self.radius * np.sin(phase))
+
+
+@dataclass(frozen=True, eq=False)
+class Lemniscate(Reference):
+    """A figure of eight (Gerono): y_ref(t) = c + r (cos ωt · a + sin ωt cos ωt · b), with the symbols of `Circle`."""
+
+    centre: FloatArray
+    radius: float
+    lap_time: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("radius", self.radius, above=0.0)
+        check_number("lap_time", self.lap_time, above=0.0)
+
+    def at(self, time: npt.ArrayLike) -> FloatArray:
+        """Return points on the figure."""
+        phase = 2 * np.pi * np.asarray(time, dtype=np.float64) / self.lap_time
+        return _in_plane(self.centre, self.radius * np.cos(phase), self.radius * np.sin(phase) * np.cos(phase))
+
+
+def line(start: FloatArray, end: FloatArray, duration: float) -> Waypoints:
+    """Return a straight line from `start` to `end`, (m,) m, at constant speed within `duration`, s; it rests there."""
+    check_number("duration", duration, above=0.0)
+    return Waypoints(np.array([0.0, duration]), np.stack([start, end]))
+
+
+def read_waypoints(path: Path, feature_names: tuple[str, ...]) -> Waypoints:
+    """Read waypoints from a CSV file with the columns time_s and <feature>_m.
+
+    Args:
+        path: the file.
+        feature_names: names of the m features, as in the plant's spec.
+
+    Raises:
+        ValueError: the file is missing, lacks a column, or holds something that is not a finite number.
+    """
+    wanted = ("time_s", *(f"{name}_m" for name in feature_names))
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"waypoint file {path} cannot be read: {error}") from error
+    if not rows or any(name not in rows[0] for name in wanted):
+        raise ValueError(f"waypoint file {path} must have a header and rows with the columns {', '.join(wanted)}")
+    values = np.empty((len(rows), len(wanted)))
+    for i, row in enumerate(rows):
+        for j, name in enumerate(wanted):
+            try:
+                values[i, j] = float(row[name])
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"waypoint file {path}, row {i + 1}: {name} is not a number: {row[name]!r}") from error
+    if not np.isfinite(values).all():
+        raise ValueError(f"waypoint file {path} holds a number that is not finite")
+    try:
+        return Waypoints(values[:, 0], values[:, 1:])
+    except ValueError as error:
+        raise ValueError(f"waypoint file {path}: {error}") from error
+
+
+def _in_plane(centre: FloatArray, along_first: FloatArray, along_second: FloatArray) -> FloatArray:
+    points = np.broadcast_to(centre, (*along_first.shape, len(centre))).copy()
+    points[..., 0] += along_first
+    points[..., 1] += along_second
+    return points

@@ -1,0 +1,316 @@
+"""The tasks: where a run starts, what the feature should do, and for how long.
+
+Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
+feature. A target given as joint positions is therefore seen through the true robot, and is always in reach. Curves are
+given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.run.references import (
+    Circle,
+    FixedPoint,
+    Lemniscate,
+    Reference,
+    line,
+    read_waypoints,
+)
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.ur5 import (
+    HOME,
+    TRAINING_LOWER,
+    TRAINING_UPPER,
+    nominal_ur5,
+)
+from servobench.plant.seeds import named_generator
+from servobench.plant.signals import FloatArray, as_vector, check_number
+
+Vector = tuple[float, ...]
+
+SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
+REACH = (0.35, 0.75)  # m, from the shoulder to the ball: some way from the arm's own column and from the stretched arm
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A task made concrete for one true robot.
+
+    Attributes:
+        start: (n,), rad, joint positions at time 0; None for a plant that brings its own.
+        reference: the desired feature over time.
+        duration: s.
+        evaluate_from: s, where the evaluated part begins.
+        point_to_point: the reference is a fixed target.
+    """
+
+    start: FloatArray | None
+    reference: Reference
+    duration: float
+    evaluate_from: float
+    point_to_point: bool = False
+
+
+@dataclass(frozen=True)
+class PointTask:
+    """A move from rest to a fixed target that was taught at given joint positions."""
+
+    start: Vector = HOME  # rad, joint positions at time 0
+    target: Vector = HOME  # rad, joint positions at which the target was taught
+    duration: float = 10.0  # s
+
+
+@dataclass(frozen=True)
+class RandomTask:
+    """A move whose start and target are drawn by the run's seed from a box of joint positions.
+
+    Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
+    """
+
+    lower: Vector = TRAINING_LOWER  # rad
+    upper: Vector = TRAINING_UPPER  # rad
+    shortest: float = 0.1  # m, least distance between start and target (on the nominal model)
+    lowest: float = 0.08  # m, least height of the ball above the table (on the nominal model)
+    duration: float = 10.0  # s
+
+
+@dataclass(frozen=True)
+class CircleTask:
+    """A horizontal circle in the camera frame, entered from its centre: a large initial error."""
+
+    start: Vector = HOME  # rad
+    centre: Vector = (0.0, 0.0, 1.25)  # m, camera frame: (0.5, 0, 0.3) m in the base frame of the nominal robot
+    radius: float = 0.3  # m
+    lap_time: float = 10.0  # s: 200 points a lap at the default period
+    laps: int = 2
+
+    def __post_init__(self) -> None:
+        """Check the numbers that the reference does not."""
+        check_number("laps", self.laps, at_least=1)
+
+
+@dataclass(frozen=True)
+class LemniscateTask(CircleTask):
+    """A figure of eight in the plane of the camera's image."""
+
+
+@dataclass(frozen=True)
+class LineTask:
+    """A straight line at constant speed, then rest at its end."""
+
+    start: Vector = HOME  # rad
+    begin: Vector = (-0.2, 0.0, 1.25)  # m, camera frame
+    end: Vector = (0.2, 0.1, 1.2)  # m, camera frame
+    moving: float = 8.0  # s
+    duration: float = 10.0  # s
+
+
+@dataclass(frozen=True)
+class WaypointTask:
+    """Waypoints from a CSV file with the columns time_s, x_m, y_m, z_m in the camera frame."""
+
+    start: Vector = HOME  # rad
+    file: str = ""  # path of the CSV file
+    settle: float = 2.0  # s after the last waypoint
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("settle", self.settle, at_least=0.0)
+
+
+@dataclass(frozen=True)
+class TargetTask:
+    """A move from rest to a fixed target that is given as a feature."""
+
+    start: Vector = HOME  # rad
+    target: Vector = (0.1, -0.1, 1.2)  # m, camera frame
+    duration: float = 10.0  # s
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        check_number("duration", self.duration, above=0.0)
+
+
+@dataclass(frozen=True)
+class TaskSetting:
+    """Where a task is to be done.
+
+    Attributes:
+        model: the true robot, or None for a plant that brings its own.
+        n: number of joints.
+        feature_names: m names.
+        seed: for tasks that draw random numbers.
+        moved: the true robot after its camera was moved in the middle of the run; None if it is not.
+    """
+
+    model: HandEyeModel | None
+    n: int
+    feature_names: tuple[str, ...]
+    seed: int
+    moved: HandEyeModel | None = None
+
+    @property
+    def m(self) -> int:
+        """Number of features."""
+        return len(self.feature_names)
+
+    def taught_on(self) -> HandEyeModel:
+        """Return the true robot, for a target that is taught on it.
+
+        Raises:
+            ValueError: the plant brings a robot of its own.
+        """
+        if self.model is None:
+            raise ValueError("it is taught on the UR5, and this plant brings a robot of its own; use one of "
+                             f"{', '.join(name for name in TASKS if TASKS[name].any_robot)}")  # fmt: skip
+        return self.model
+
+    def start(self, joint_position: Vector) -> FloatArray | None:
+        """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
+        return None if self.model is None else as_vector("start", joint_position, self.n)
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task as the command line knows it.
+
+    Attributes:
+        name: the word on the command line.
+        summary: one line for `servobench tasks`.
+        default: its settings.
+        build: makes a scenario from settings and the setting of the run.
+        any_robot: it needs no UR5: start and target are not given as its joint positions.
+    """
+
+    name: str
+    summary: str
+    default: Any
+    build: Callable[[Any, TaskSetting], Scenario]
+    any_robot: bool = False
+
+
+def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
+    target = as_vector("target", config.target, setting.n)
+    return _move(config.start, FixedPoint(setting.taught_on().feature(target)), config.duration, setting)
+
+
+def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
+    target = as_vector("target", config.target, setting.m)
+    return _move(config.start, FixedPoint(target), config.duration, setting)
+
+
+def _move(start: Vector, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
+    check_number("duration", duration, above=0.0)
+    return Scenario(setting.start(start), reference, duration, 0.75 * duration, point_to_point=True)
+
+
+def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
+    n, nominal = setting.taught_on().arm.n, nominal_ur5()
+    lower, upper = as_vector("lower", config.lower, n), as_vector("upper", config.upper, n)
+    if not (lower < upper).all():
+        raise ValueError("lower must be below upper for every joint")
+    generator = named_generator(setting.seed, "start_and_target")
+    for _ in range(1000):
+        pair = generator.uniform(lower, upper, (2, n))
+        balls = nominal.arm.ball_position(pair)
+        apart = np.linalg.norm(balls[1] - balls[0]) >= config.shortest
+        if apart and (balls[:, 2] >= config.lowest).all() and _stays_in_reach(pair[1], config.lowest, setting):
+            return _build_point(PointTask(tuple(pair[0]), tuple(pair[1]), config.duration), setting)
+    raise ValueError("no start and target in the box are far enough apart and above the table")
+
+
+def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting) -> bool:
+    """Return whether a target (n,), rad, that was taught before the camera's move is in easy reach after it."""
+    if setting.moved is None:
+        return True
+    point = setting.moved.to_base(setting.taught_on().feature(target))
+    return bool(point[2] >= lowest and REACH[0] <= np.linalg.norm(point - SHOULDER) <= REACH[1])
+
+
+def _build_circle(config: CircleTask, setting: TaskSetting) -> Scenario:
+    reference = Circle(as_vector("centre", config.centre, setting.m), config.radius, config.lap_time)
+    return _lap_scenario(config, reference, setting)
+
+
+def _build_lemniscate(config: LemniscateTask, setting: TaskSetting) -> Scenario:
+    reference = Lemniscate(as_vector("centre", config.centre, setting.m), config.radius, config.lap_time)
+    return _lap_scenario(config, reference, setting)
+
+
+def _lap_scenario(config: CircleTask, reference: Reference, setting: TaskSetting) -> Scenario:
+    laps, lap_time = config.laps, config.lap_time
+    return Scenario(setting.start(config.start), reference, laps * lap_time, (laps - 1) * lap_time)
+
+
+def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
+    m = setting.m
+    reference = line(as_vector("begin", config.begin, m), as_vector("end", config.end, m), config.moving)
+    check_number("duration", config.duration, above=0.0)
+    return Scenario(setting.start(config.start), reference, config.duration, 0.5 * config.duration)
+
+
+def _build_waypoints(config: WaypointTask, setting: TaskSetting) -> Scenario:
+    if not config.file:
+        raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
+    reference = read_waypoints(Path(config.file).expanduser(), setting.feature_names)
+    duration = float(reference.times[-1]) + config.settle
+    check_number("last waypoint's time plus settle", duration, above=0.0)
+    return Scenario(setting.start(config.start), reference, duration, 0.5 * duration)
+
+
+# Start and target as joint positions, and beside them the ball on the nominal robot in the base frame.
+EXP1 = PointTask(
+    start=(0.169, -1.669, -2.250, 0.893, 1.156, 0.0),  # (0.50, -0.10, 0.35) m
+    target=(1.484, -1.897, -2.052, 0.793, 1.624, 0.0),  # (0.15, 0.58, 0.30) m; the shoulder is 0.63 rad outside
+)
+EXP2 = PointTask(
+    start=(0.097, -1.434, -2.282, 0.990, 1.124, 0.0),  # (0.40, -0.15, 0.45) m
+    target=(0.441, -2.006, -2.124, 0.760, 1.255, 0.0),  # (0.60, 0.10, 0.20) m
+)
+EXP3 = PointTask(
+    start=(0.583, -2.093, -1.976, 0.720, 1.301, 0.0),  # (0.62, 0.22, 0.20) m
+    target=(-0.114, -1.648, -2.157, 0.894, 1.067, 0.0),  # (0.45, -0.25, 0.40) m
+)
+EXP4 = PointTask(
+    start=(-0.938, -1.724, -1.814, 0.812, 0.855, 0.0),  # (0.12, -0.55, 0.50) m; the shoulder is 0.69 rad outside
+    target=(0.403, -1.847, -2.248, 0.826, 1.231, 0.0),  # (0.55, 0.05, 0.25) m
+)
+
+_ENTRIES = (
+    TaskEntry("exp1", "a move whose target lies outside the training region", EXP1, _build_point),
+    TaskEntry("exp2", "a move inside the training region, forward and down", EXP2, _build_point),
+    TaskEntry("exp3", "a move inside the training region, across and up", EXP3, _build_point),
+    TaskEntry("exp4", "a move that starts outside the training region", EXP4, _build_point),
+    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle, any_robot=True),
+    TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line, any_robot=True),
+    TaskEntry(
+        "lemniscate", "two laps on a figure of eight", LemniscateTask(radius=0.25), _build_lemniscate, any_robot=True
+    ),
+    TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
+    TaskEntry("target", "a move to a given feature (target.target)", TargetTask(), _build_target, any_robot=True),
+    TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),
+)
+TASKS = {entry.name: entry for entry in _ENTRIES}
+
+
+def task_names() -> list[str]:
+    """Return the names of all tasks."""
+    return list(TASKS)
+
+
+def find_task(name: str) -> TaskEntry:
+    """Return the task called `name`.
+
+    Raises:
+        ConfigurationError: no such task.
+    """
+    if name not in TASKS:
+        raise ConfigurationError(f"unknown task {name!r}: {suggest(name, TASKS)}")
+    return TASKS[name]

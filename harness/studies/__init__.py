@@ -1,0 +1,1 @@
+"""Studies: the paper's claims, tuning, the robustness map, the README's pictures."""

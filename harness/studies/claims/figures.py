@@ -1,0 +1,80 @@
+"""The figure behind each answer: what was measured, on every plant, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servobench.harness.analysis.statistics import Estimate
+from servobench.harness.pictures.places import draw_places
+from servobench.harness.pictures.style import method_styles
+from servobench.harness.studies.claims.measurements import Answer, Measurement
+
+NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
+
+
+def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
+    """Draw a figure for each claim, a column a plant and a row a measurement, as PNG and PDF.
+
+    Args:
+        answers: of all plants.
+        folder: where; made if needed.
+
+    Returns:
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for claim in dict.fromkeys(answer.claim for answer in answers):
+        own = [answer for answer in answers if answer.claim == claim]
+        figure = _draw(own)
+        name = {"ε = 0": "reading_epsilon", "entries": "reading_entries"}.get(claim, f"claim_{claim}")
+        for suffix in (".png", ".pdf"):
+            files.append((folder / name).with_suffix(suffix))
+            figure.savefig(files[-1], dpi=150)
+    return files
+
+
+def _draw(answers: Sequence[Answer]) -> Figure:
+    panels = list(dict.fromkeys(m.panel for answer in answers for m in answer.measurements))
+    figure = Figure(figsize=(4.6 * len(answers), 2.6 * len(panels) + 0.6), layout="constrained")
+    grid = figure.subplots(len(panels), len(answers), squeeze=False, sharey="row")
+    for column, answer in enumerate(answers):
+        for row, panel in enumerate(panels):
+            _draw_panel(grid[row, column], [m for m in answer.measurements if m.panel == panel])
+        grid[0, column].set_title(f"{answer.plant}: {answer.verdict}")
+    for row, panel in enumerate(panels):
+        grid[row, 0].set_ylabel("\n".join(_wrapped(panel)))
+    figure.suptitle(answers[0].title)
+    return figure
+
+
+def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
+    if not measured:
+        axes.set_axis_off()
+        return
+    places = list(dict.fromkeys(m.place for m in measured))
+    labels = list(dict.fromkeys(m.label for m in measured))
+    known = {(m.label, m.place): m.estimate for m in measured}
+    values = {label: [known.get((label, place), NOTHING) for place in places] for label in labels}
+    draw_places(axes, range(len(places)), values, method_styles(labels), joined=False)
+    axes.set_xticks(range(len(places)), places)
+    axes.set_xlim(-0.6, len(places) - 0.4)
+    if "−" in measured[0].panel:
+        axes.axhline(0.0, color="black", linewidth=0.8)
+    elif " over " in measured[0].panel:
+        axes.axhline(1.0, color="black", linewidth=0.8)
+    else:
+        ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
+        axes.set_ylim(0.0, 1.15 * max(1e-9, float(np.max(ends[np.isfinite(ends)], initial=0.0))))
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend(fontsize=7, frameon=False)
+
+
+def _wrapped(text: str) -> list[str]:
+    middle = text.find(",")
+    return [text] if middle < 0 or len(text) < 28 else [text[: middle + 1], text[middle + 2 :]]

@@ -1,0 +1,74 @@
+"""The runs behind the answers: the four methods on the paper's tasks, and the proposed one in other readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.sweep import Cell
+from servobench.harness.config.settings import Settings
+
+PROPOSED: Final = "rbfnn_mfac"
+OTHERS: Final = ("rbf_pid", "ukf_mfac", "ukf_mpc")
+MOVES: Final = ("exp1", "exp2", "exp3", "exp4")
+LEAVING: Final = ("exp1", "exp4")  # start or target lie outside the region in which networks are trained
+STAYING: Final = ("exp2", "exp3")
+CIRCLE: Final = "circle"
+MISMATCH: Final = "moderate"
+FIRST_SEED: Final = 30_000  # far from the seeds that methods are tuned on
+
+MAIN: Final = "main"
+FROZEN: Final = "frozen"  # the Jacobian network as it was trained
+NO_EPSILON: Final = "no_epsilon"  # the paper as printed: no ε in either step size
+ENTRIES: Final = "entries"  # the paper's fit of the entries of ψ
+
+READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
+    FROZEN: {"estimator": {"k2": 1e-9}},
+    NO_EPSILON: {"law": {"epsilon": 0.0}, "estimator": {"epsilon": 0.0}},
+    ENTRIES: {"training": {"controller": {"fit": "entries"}}},
+}
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs with common settings.
+
+    Attributes:
+        name: of its folder.
+        settings: overrides of the defaults.
+        cells: the runs.
+    """
+
+    name: str
+    settings: Settings
+    cells: tuple[Cell, ...]
+
+
+def studies(plants: Sequence[str], seeds: int) -> list[Study]:
+    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle.
+
+    Args:
+        plants: names.
+        seeds: number of robots.
+    """
+    rendered = {"bullet": {"scenery": False}}  # the same observations, bit for bit, for a fifth of the time
+    robots = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
+    some = robots[: max(2, 2 * seeds // 5)]
+
+    def cells(controllers: tuple[str, ...], tasks: tuple[str, ...], chosen: tuple[int, ...]) -> tuple[Cell, ...]:
+        batch = Batch(tuple(plants), controllers, tasks, (MISMATCH,), chosen)
+        return tuple(Cell(request) for request in batch.requests())
+
+    four = (PROPOSED, *OTHERS)
+    main = Study(MAIN, Settings(rendered), cells(four, MOVES, robots) + cells(four, (CIRCLE,), some))
+    others = [
+        Study(
+            name,
+            Settings({**rendered, PROPOSED: reading}),
+            cells((PROPOSED,), MOVES, some) + cells((PROPOSED,), (CIRCLE,), some),
+        )
+        for name, reading in READINGS.items()
+    ]
+    return [main, *others]

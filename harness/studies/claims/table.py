@@ -1,0 +1,98 @@
+"""The table of answers, and the measurements behind them, as files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.studies.claims.measurements import Answer
+
+ANSWERS: Final = "answers.csv"
+MEASUREMENTS: Final = "measurements.csv"
+NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
+SHARE, PERIOD = 0.1, 0.051  # of a number, and absolute, by which evidence may differ
+COLUMNS: Final = ("claim", "statement", "plant", "verdict", "evidence")
+
+Answers: TypeAlias = Mapping[tuple[str, str], tuple[str, str]]
+
+
+def answer_table(answers: Sequence[Answer]) -> pd.DataFrame:
+    """Return a row for each claim and plant."""
+    return pd.DataFrame([[getattr(answer, name) for name in COLUMNS] for answer in answers], columns=list(COLUMNS))
+
+
+def measurement_table(answers: Sequence[Answer]) -> pd.DataFrame:
+    """Return a row for each number behind the answers."""
+    return pd.DataFrame(
+        [
+            {
+                "claim": answer.claim,
+                "plant": answer.plant,
+                "measured": m.panel,
+                "place": m.place,
+                "label": m.label,
+                "value": m.estimate.value,
+                "low": m.estimate.low,
+                "high": m.estimate.high,
+                "count": m.estimate.count,
+                "holds": m.holds,
+            }
+            for answer in answers
+            for m in answer.measurements
+        ]
+    )
+
+
+def write_tables(answers: Sequence[Answer], folder: Path) -> None:
+    """Write both tables."""
+    answer_table(answers).to_csv(folder / ANSWERS, index=False)
+    measurement_table(answers).to_csv(folder / MEASUREMENTS, index=False)
+
+
+def read_answers(path: Path) -> Answers:
+    """Return verdict and evidence by claim and plant from a table of answers.
+
+    Raises:
+        ConfigurationError: the file is not a table of answers.
+    """
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        rows = table[["claim", "plant", "verdict", "evidence"]].itertuples(index=False)
+        return {(claim, plant): (verdict, evidence) for claim, plant, verdict, evidence in rows}
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigurationError(f"{path} is not a table of answers: {' '.join(str(error).split())}") from error
+
+
+def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
+    """Return a line for each answer that is not the one wanted.
+
+    Verdicts and words must be the same. Numbers of the evidence may differ by a tenth and a period: networks that are
+    fitted on another processor differ by rounding, which loops amplify.
+    """
+    lines = []
+    for answer in answers:
+        name, key = f"claim {answer.claim} on {answer.plant}", (answer.claim, answer.plant)
+        if key not in wanted:
+            lines.append(f"{name}: not in the table")
+        elif wanted[key][0] != answer.verdict or not _agree(answer.evidence, wanted[key][1]):
+            lines.append(f"{name}: now {answer.verdict}: {answer.evidence}")
+    return lines
+
+
+def _agree(found: str, wanted: str) -> bool:
+    ours, theirs = ([float(number) for number in NUMBER.findall(text)] for text in (found, wanted))
+    same_words = NUMBER.sub("", found) == NUMBER.sub("", wanted)
+    return same_words and bool(np.allclose(ours, theirs, rtol=SHARE, atol=PERIOD))
+
+
+def markdown_table(answers: Sequence[Answer]) -> str:
+    """Return the answers as a table in Markdown."""
+    lines = ["| claim | plant | verdict | evidence |", "|---|---|---|---|"]
+    lines += [f"| {a.title} | {a.plant} | **{a.verdict}** | {a.evidence} |" for a in answers]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,171 @@
+"""What tuning minimises, and the runs that it is measured on.
+
+For each plant, `seeds` moves of the task `random` and half as many runs of the task `circle`, every one on another
+robot of `moderate` mismatch. Every other run has a camera that delivers one period late, so that gains must bear the
+delay of the rendered plant too. With the score of each set of runs a mean,
+
+    score = mean over random of c_random + mean over circle of c_circle         (0 is perfect, 4 the worst)
+
+    c_random = settling time / duration; 1 if it never settled; 2 if the run did not complete
+    c_circle = min(RMS error of the second lap / 0.05 m, 1);     2 if the run did not complete
+
+Overshoot has no term: what matters of it is in the settling time, since the error must come back and stay within 5 mm,
+and a method's character is not to be tuned away before it is compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final, TypeAlias
+
+import joblib
+import numpy as np
+
+from servobench.harness.batch.seed_ranges import tuning_seeds
+from servobench.harness.batch.workers import leave_interrupts_to_parent
+from servobench.harness.config.registry import find_plant
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import COMPLETED, run_experiment
+from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.tasks import find_task
+
+MOVE: Final = "random"
+CURVE: Final = "circle"
+MISMATCH: Final = "moderate"
+LATENCIES: Final = (0, 1)  # periods between exposure and delivery of the feature, in turn
+WORST_RMS: Final = 0.05  # m, on the circle: more is not worse
+FAULT: Final = 1.0  # on top of the worst
+CHECKED: Final = len(LATENCIES)  # runs of each task in the subset that a test scores again
+
+
+@dataclass(frozen=True)
+class TuningRun:
+    """One run of the set.
+
+    Attributes:
+        plant: name of the plant.
+        task: `random` or `circle`.
+        seed: of the tuning range.
+        latency_periods: of the camera.
+    """
+
+    plant: str
+    task: str
+    seed: int
+    latency_periods: int
+
+
+@dataclass(frozen=True)
+class TuningSet:
+    """The runs on which every trial of every method is scored.
+
+    Attributes:
+        plants: names of plants that have the setting `latency_periods`.
+        seeds: moves on each plant; even, so that both delays come equally often.
+        offset: where in the tuning range the seeds begin.
+    """
+
+    plants: tuple[str, ...] = ("kinematic",)
+    seeds: int = 8
+    offset: int = 0
+
+    def __post_init__(self) -> None:
+        """Check plants and numbers.
+
+        Raises:
+            ConfigurationError: an odd number of moves, seeds outside the tuning range, or a plant without latency.
+        """
+        if self.seeds < 4 or self.seeds % 4:
+            raise ConfigurationError(
+                f"seeds must be 4, 8, 12, …, so that each delay has its share of moves and circles; got {self.seeds}"
+            )
+        tuning_seeds(self.seeds + self.seeds // 2, self.offset)
+        if not self.plants:
+            raise ConfigurationError("no plant to tune on; name one with --plants kinematic")
+        for name in self.plants:
+            entry = find_plant(name)
+            if entry.own_robot or "latency_periods" not in {item.name for item in fields(entry.config)}:
+                raise ConfigurationError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
+
+    def runs(self) -> list[TuningRun]:
+        """Return all runs: for each plant the moves, then the circles on further seeds."""
+        seeds = tuning_seeds(self.seeds + self.seeds // 2, self.offset)
+        tasks = [MOVE] * self.seeds + [CURVE] * (self.seeds // 2)
+        return [
+            TuningRun(plant, task, seed, LATENCIES[index % len(LATENCIES)])
+            for plant in self.plants
+            for index, (task, seed) in enumerate(zip(tasks, seeds, strict=True))
+        ]
+
+    def checked(self) -> list[int]:
+        """Return the indices of a subset with both tasks and both delays, small enough for a test."""
+        runs = self.runs()
+        return [
+            index
+            for task in (MOVE, CURVE)
+            for index in [i for i, run in enumerate(runs) if run.task == task and run.plant == self.plants[0]][:CHECKED]
+        ]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A controller with settings that are to be scored: all fields of its class, nested."""
+
+    controller: str
+    settings: Mapping[str, Any]
+
+
+Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
+
+
+def run_cost(task: str, row: Mapping[str, Any]) -> float:
+    """Return the cost of one run from its row of results; see the module's docstring."""
+    if row["status"] != COMPLETED:
+        return 1.0 + FAULT
+    if task == CURVE:
+        return min(float(row["rms_error_evaluated_m"]) / WORST_RMS, 1.0)
+    settling_time = float(row["settling_time_s"])
+    return 1.0 if math.isnan(settling_time) else settling_time / float(find_task(MOVE).default.duration)
+
+
+def score(runs: Sequence[TuningRun], costs: Sequence[float]) -> float:
+    """Return the score of a trial from the costs of its runs."""
+    by_task = {
+        task: [cost for run, cost in zip(runs, costs, strict=True) if run.task == task] for task in (MOVE, CURVE)
+    }
+    return float(sum(np.mean(values) for values in by_task.values()))
+
+
+def carry_out(trial: Trial, run: TuningRun) -> float:
+    """Carry out one run of a trial and return its cost.
+
+    Raises:
+        ConfigurationError: settings that the controller or the plant refuses.
+    """
+    settings = Settings({trial.controller: trial.settings, run.plant: {"latency_periods": run.latency_periods}})
+    request = RunRequest(run.plant, trial.controller, run.task, MISMATCH, run.seed)
+    return run_cost(run.task, run_experiment(request, settings).row)
+
+
+def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: int) -> Iterator[Cost]:
+    """Carry out every run of every trial and yield each cost as it is known, in any order.
+
+    Args:
+        trials: what to score.
+        runs: on what.
+        workers: number of processes; with 1 the runs happen in this one.
+    """
+    jobs = (
+        joblib.delayed(_evaluate_one)(t, r, trial, run, workers > 1)
+        for r, run in enumerate(runs)
+        for t, trial in enumerate(trials)
+    )
+    yield from joblib.Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
+
+
+def _evaluate_one(trial_index: int, run_index: int, trial: Trial, run: TuningRun, in_worker: bool) -> Cost:
+    if in_worker:
+        leave_interrupts_to_parent()
+    return trial_index, run_index, carry_out(trial, run)

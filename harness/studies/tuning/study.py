@@ -1,0 +1,285 @@
+"""The studies: for each method an Optuna study in a journal file of its own, all advanced in step.
+
+In a round every method that has trials left asks its sampler for one, all runs of these trials are shared out among the
+worker processes, and the scores are told. Sampling happens in this process alone, and each trial's sampler is seeded by
+the study's seed and the number of trials that are finished. So the outcome is the same for any number of workers, and
+for a study that was interrupted and taken up again. The first trial is the default of the controller's class. There is
+no pruning: each trial of each method has the same runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import optuna
+from optuna.distributions import distribution_to_json
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.samplers import TPESampler
+from optuna.storages.journal import JournalFileBackend, JournalStorage
+from optuna.trial import FrozenTrial, TrialState
+
+from servobench.harness.config.settings import ConfigurationError, Settings, flatten
+from servobench.harness.run.experiment import RunRequest, RunSettings, build_experiment
+from servobench.harness.studies.tuning import objective
+from servobench.harness.studies.tuning.files import TunedValues, write_tuned
+from servobench.harness.studies.tuning.objective import (
+    Trial,
+    TuningSet,
+    evaluate,
+    score,
+)
+from servobench.harness.studies.tuning.spaces import (
+    SPACES,
+    default_values,
+    find_tunable,
+    full_settings,
+    nested_settings,
+)
+from servobench.plant.seeds import named_seed
+
+JOURNAL: Final = ".journal"
+FINGERPRINT: Final = "fingerprint"
+COSTS: Final = "costs"
+
+
+@dataclass(frozen=True)
+class TuningPlan:
+    """What is asked for.
+
+    Attributes:
+        controllers: names with a search space.
+        trials: for each of them, the defaults' included.
+        runs: on which a trial is scored.
+        study_seed: seed of the samplers.
+    """
+
+    controllers: tuple[str, ...]
+    trials: int
+    runs: TuningSet
+    study_seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check names and numbers.
+
+        Raises:
+            ConfigurationError: an unknown controller or one without a space, no trial, or a negative seed.
+        """
+        for name in self.controllers:
+            find_tunable(name)
+        if self.trials < 1:
+            raise ConfigurationError(f"trials must be at least 1, got {self.trials}")
+        if self.study_seed < 0:
+            raise ConfigurationError(f"the study's seed must not be negative, got {self.study_seed}")
+
+
+@dataclass(frozen=True)
+class Finished:
+    """One more run is finished.
+
+    Attributes:
+        controller: of which.
+        best: least score of its finished trials; None while there is none.
+    """
+
+    controller: str
+    best: float | None
+
+
+class MethodStudy:
+    """The study of one method on disk."""
+
+    def __init__(self, folder: Path, controller: str, plan: TuningPlan) -> None:
+        """Open the study, or make it where there is none.
+
+        Raises:
+            ConfigurationError: the file is no study, or that of another search space, objective, set of runs or seed.
+        """
+        self.controller = controller
+        self._entry = find_tunable(controller)
+        self._plan = plan
+        self._path = folder / f"{controller}{JOURNAL}"
+        self._asked: optuna.Trial | None = None
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        mend_journal(self._path)
+        try:
+            storage = JournalStorage(JournalFileBackend(str(self._path)))
+            self._study = optuna.create_study(
+                storage=storage, study_name=controller, direction="minimize", load_if_exists=True
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigurationError(f"study {self._path} cannot be opened: {error}") from error
+        self._check_fingerprint()
+        for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+            # Of a call that was killed: the sampler will ask for the same values again.
+            self._study.tell(trial.number, state=TrialState.FAIL)
+        if not self.finished() and not self._study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+            self._study.enqueue_trial(default_values(self._entry))
+
+    def finished(self) -> list[FrozenTrial]:
+        """Return the finished trials, at most as many as are asked for, in their order."""
+        return self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))[: self._plan.trials]
+
+    def best(self) -> float | None:
+        """Return the least score, or None while there is none."""
+        return min((trial_score(trial) for trial in self.finished()), default=None)
+
+    def ask(self) -> Trial:
+        """Return the next trial to carry out."""
+        name = f"{self.controller}, trial {len(self.finished())}"
+        self._study.sampler = TPESampler(
+            seed=named_seed(self._plan.study_seed, name), multivariate=True, constant_liar=False
+        )
+        with np.errstate(all="ignore"):  # the sampler's densities may underflow
+            self._asked = self._study.ask(dict(SPACES[self.controller]))
+        return Trial(self.controller, full_settings(self._entry, nested_settings(self._asked.params)))
+
+    def tell(self, costs: Sequence[float]) -> None:
+        """Finish the trial that was asked for with the costs of its runs."""
+        if self._asked is None:
+            raise ValueError("a trial must be asked for before its costs are told")
+        try:
+            self._asked.set_user_attr(COSTS, list(costs))
+            self._study.tell(self._asked, score(self._plan.runs.runs(), costs))
+        except (ValueError, UpdateFinishedTrialError) as error:
+            raise ConfigurationError(f"study {self._path} is in use by another call of tune: {error}") from error
+        self._asked = None
+
+    def outcome(self) -> TunedValues:
+        """Return the best values so far; at least one trial must be finished."""
+        trials, plan = self.finished(), self._plan
+        best = min(trials, key=lambda trial: (trial_score(trial), trial.number))
+        runs, checked = plan.runs.runs(), plan.runs.checked()
+        ended = [trial.datetime_complete for trial in trials if trial.datetime_complete is not None]
+
+        def checked_score(trial: FrozenTrial) -> float:
+            return score([runs[i] for i in checked], [trial.user_attrs[COSTS][i] for i in checked])
+
+        return TunedValues(
+            controller=self.controller,
+            study_seed=plan.study_seed,
+            trials=len(trials),
+            best_trial=trials.index(best),
+            runs_a_trial=len(runs),
+            plants=plan.runs.plants,
+            moves=plan.runs.seeds,
+            offset=plan.runs.offset,
+            seeds=(min(run.seed for run in runs), max(run.seed for run in runs)),
+            date=max(ended).astimezone(UTC).date().isoformat(),
+            version=version("servobench"),
+            score=trial_score(best),
+            score_of_defaults=trial_score(trials[0]),
+            checked_score=checked_score(best),
+            checked_score_of_defaults=checked_score(trials[0]),
+            settings=nested_settings(best.params),
+        )
+
+    def _check_fingerprint(self) -> None:
+        mine = fingerprint(self.controller, self._plan)
+        theirs = self._study.user_attrs.get(FINGERPRINT)
+        if theirs is None and not self._study.get_trials(deepcopy=False):
+            self._study.set_user_attr(FINGERPRINT, mine)
+        elif theirs != mine:
+            parts = [key for key in mine if (theirs or {}).get(key) != mine[key]]
+            raise ConfigurationError(
+                f"study {self._path} was made with other {', '.join(parts)}; name another folder with --out"
+            )
+
+
+def trial_score(trial: FrozenTrial) -> float:
+    """Return the score of a finished trial."""
+    return float(trial.values[0])
+
+
+def fingerprint(controller: str, plan: TuningPlan) -> dict[str, Any]:
+    """Return all that a study's scores depend on, as JSON has it; the number of trials may grow and is not in it."""
+    entry = find_tunable(controller)
+    constants = ("MOVE", "CURVE", "MISMATCH", "LATENCIES", "WORST_RMS", "FAULT")
+    return {
+        "search space": {key: distribution_to_json(value) for key, value in SPACES[controller].items()},
+        "defaults": {key: repr(value) for key, value in flatten(entry.config()).items()},
+        "objective": {name: repr(getattr(objective, name)) for name in constants},
+        "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
+        "plants": list(plan.runs.plants),
+        "seeds": [plan.runs.seeds, plan.runs.offset],
+        "study seed": plan.study_seed,
+    }
+
+
+def mend_journal(path: Path) -> None:
+    """Cut off a last line that a killed process left unfinished; nothing that counts is in it."""
+    if path.is_file():
+        data = path.read_bytes()
+        whole = data.rfind(b"\n") + 1
+        if data.startswith(b"{") and whole < len(data):
+            with path.open("r+b") as file:
+                file.truncate(whole)
+
+
+def open_studies(folder: Path, plan: TuningPlan) -> list[MethodStudy]:
+    """Open or make the studies of a plan.
+
+    Raises:
+        ConfigurationError: the folder has other things in it or cannot be made, or a study of it is another one.
+    """
+    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not any(folder.glob(f"*{JOURNAL}")))):
+        raise ConfigurationError(f"{folder} exists already and holds no study; name another folder with --out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"study folder {folder} cannot be made: {error.strerror}") from error
+    present_first = sorted(plan.controllers, key=lambda name: not (folder / f"{name}{JOURNAL}").exists())
+    opened = {name: MethodStudy(folder, name, plan) for name in present_first}  # refused before another is made
+    return [opened[name] for name in plan.controllers]
+
+
+def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> Iterator[Finished]:
+    """Carry out the trials that are left, a round at a time, and yield after every run."""
+    runs = plan.runs.runs()
+    while active := [study for study in studies if len(study.finished()) < plan.trials]:
+        with undisturbed():
+            trials = [study.ask() for study in active]
+        for trial in trials:
+            _train(trial, plan.runs.plants[0])
+        costs = np.zeros((len(trials), len(runs)))
+        best = [study.best() for study in active]
+        for trial_index, run_index, cost in evaluate(trials, runs, workers):
+            costs[trial_index, run_index] = cost
+            yield Finished(active[trial_index].controller, best[trial_index])
+        with undisturbed():
+            for study, row in zip(active, costs, strict=True):
+                study.tell(row.tolist())
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C back until the end: it must not come while a journal is locked or written."""
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
+
+
+def write_outcomes(folder: Path, studies: Sequence[MethodStudy]) -> Mapping[str, TunedValues]:
+    """Write `NAME.toml` for every study that has a finished trial, and return their contents by name."""
+    outcomes = {study.controller: study.outcome() for study in studies if study.finished()}
+    for name, tuned in outcomes.items():
+        write_tuned(folder / f"{name}.toml", tuned)
+    return outcomes
+
+
+def _train(trial: Trial, plant: str) -> None:
+    """Build the controller once, so that networks which it needs are in the cache before the workers ask for them."""
+    request = RunRequest(plant, trial.controller, objective.MOVE, objective.MISMATCH, 0)
+    build_experiment(request, Settings({trial.controller: trial.settings})).plant.close()

@@ -1,0 +1,1 @@
+"""The UR5 in PyBullet, seen through a rendered camera."""

@@ -1,0 +1,250 @@
+"""The red ball in an RGB-D image: colour segmentation, depth deprojection and a fit of a sphere of known radius.
+
+The ball's pixels are chosen by colour alone, so depth noise does not select them. Each gives a measured depth z_i along
+its ray r_i = (x/z, y/z, 1). A sphere of radius R about c meets that ray first at the depth
+
+    t_i(c) = (r_i·c − √D_i) / |r_i|²,          D_i = (r_i·c)² − |r_i|² (|c|² − R²)
+
+and c minimises Σ (z_i − t_i(c))² by Gauss-Newton with ∂t_i/∂c = −(t_i r_i − c)/√D_i. The noise lies along the ray,
+hence so do the residuals: a fit of distances to the centre would be biased by noise² / R. Pixels near the silhouette,
+where that slope grows without bound, and pixels whose residual stands far off the others' take no part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.signals import FloatArray
+
+ByteArray = npt.NDArray[np.uint8]
+IntArray = npt.NDArray[np.intp]
+
+# OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
+# both ends 0 and 180, and one range covers purplish and orange reds.
+RED_LOWER, RED_UPPER = (111, 120, 40), (129, 255, 255)
+FULL_BOX = 0.6  # share of red pixels; a disc fills π/4 of its box
+MIN_PIXELS = 16  # fewer do not fix three coordinates under noise
+MIN_VISIBLE = 0.4  # share of the ball's disc that must be seen
+MAX_VISIBLE = 1.4  # a larger red patch is not the ball
+INNER_COSINE = 0.4  # of the angle between ray and surface normal, below which a pixel counts as silhouette
+OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
+OUTLIER_FLOOR = 0.002  # m, what is never an outlier
+MAX_RESIDUAL = 0.4  # of the radius, RMS beyond which the fit is implausible
+MAX_UNCERTAINTY = 0.1  # of the radius, standard error beyond which the fit says too little
+SELECTIONS = 3  # iterations that choose their depths anew
+MAX_ITERATIONS = 10
+STEP_TOLERANCE = 1e-5  # m; what is left after such a step is far smaller
+RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
+OUTLINE = (40, 255, 80)  # RGB of the drawn detection
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """The largest red patch in an image.
+
+    Attributes:
+        rows: (k,), px.
+        columns: (k,), px.
+    """
+
+    rows: IntArray
+    columns: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class SphereFit:
+    """A sphere of known radius fitted to depths.
+
+    Attributes:
+        centre: (3,), m, camera frame.
+        residual: m, RMS of the depths that took part.
+        used: number of those depths.
+        uncertainty: m, standard error of the centre by the residual, all axes together.
+    """
+
+    centre: FloatArray
+    residual: float
+    used: int
+    uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """A ball that was found.
+
+    Attributes:
+        centre: (3,), m, camera frame.
+        fit: how well the sphere fits.
+        visible: share of the ball's disc that is seen, about 1 where nothing hides it.
+    """
+
+    centre: FloatArray
+    fit: SphereFit
+    visible: float
+
+
+def find_patch(rgb: ByteArray) -> Patch | None:
+    """Return the largest red patch of an image.
+
+    Args:
+        rgb: (h, w, 3 or 4), red, green, blue and, ignored, opacity.
+
+    Returns:
+        The patch, or None where there is none, it is too small, or the image's border cuts it.
+    """
+    mask = cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), RED_LOWER, RED_UPPER)
+    x, y, width, height = cv2.boundingRect(mask)
+    if width * height < MIN_PIXELS:
+        return None
+    # Only the box around all red is looked at. A full one holds one patch; the search for connected parts is slow.
+    red = mask[y : y + height, x : x + width] > 0
+    if np.count_nonzero(red) < FULL_BOX * width * height:
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(red.astype(np.uint8), connectivity=8)
+        red = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+    rows, columns = np.nonzero(red)
+    rows, columns = rows + y, columns + x
+    image_height, image_width = mask.shape
+    cut = rows[0] == 0 or rows[-1] == image_height - 1 or columns.min() == 0 or columns.max() == image_width - 1
+    return None if cut or len(rows) < MIN_PIXELS else Patch(rows, columns)
+
+
+def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: float) -> Detection | None:
+    """Return the ball that makes a red patch.
+
+    Args:
+        patch: k pixels.
+        depth: (k,), m, measured along the optical axis.
+        camera: its intrinsics.
+        radius: m, of the ball.
+
+    Returns:
+        The ball, or None where too little of it is seen or no ball of this radius explains the depths.
+    """
+    rays = camera.rays(patch.columns, patch.rows)
+    middle = np.array([np.median(rays[:, 0]), np.median(rays[:, 1]), 1.0])
+    # The median depth over a sphere's disc is R/√2 nearer than its centre.
+    start = middle * (float(np.median(depth)) + radius / np.sqrt(2.0))
+    fit = fit_sphere(rays, depth, start, radius)
+    if fit is None or not fit.centre[2] > radius:
+        return None
+    visible = len(depth) / disc_area(fit.centre, camera, radius)
+    plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
+    complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
+    return Detection(fit.centre, fit, visible) if plausible and complete else None
+
+
+def find_ball(
+    rgb: ByteArray,
+    buffer: FloatArray,
+    camera: PinholeCamera,
+    radius: float,
+    sense: Callable[[FloatArray], FloatArray] | None = None,
+) -> Detection | None:
+    """Return the ball in a rendered image, or None where none is seen.
+
+    Args:
+        rgb: (h, w, 3 or 4).
+        buffer: depth buffer, (h, w).
+        camera: its intrinsics.
+        radius: m, of the ball.
+        sense: what the sensor makes of the depths of the red pixels, (k,) m; None: it is perfect.
+    """
+    patch = find_patch(rgb)
+    if patch is None:
+        return None
+    depth = camera.metric_depth(buffer[patch.rows, patch.columns])
+    return locate_ball(patch, depth if sense is None else sense(depth), camera, radius)
+
+
+def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
+    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    nearest2 = centre[2] ** 2 - radius**2
+    return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
+
+
+def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> SphereFit | None:
+    """Fit the centre of a sphere of known radius to depths along rays.
+
+    Args:
+        rays: (k, 3), with third entry 1.
+        depth: (k,), m.
+        start: (3,), m, first guess of the centre.
+        radius: m.
+
+    Returns:
+        The fit, or None where too few depths agree with a sphere.
+    """
+    centre = start
+    for iteration in range(MAX_ITERATIONS):
+        # Choosing anew for ever would let a pixel at the gate swing in and out, and the centre with it.
+        if iteration < SELECTIONS:
+            chosen = choose_depths(rays, depth, centre, radius)
+            if len(chosen) < MIN_PIXELS:
+                return None
+            r, z = rays[chosen], depth[chosen]
+        t, root = first_hit(r, centre, radius)
+        e = z - t
+        slope = (centre - t[:, None] * r) / root[:, None]
+        normal = slope.T @ slope + RIDGE * len(e)
+        step = np.linalg.solve(normal, slope.T @ e)
+        length = math.sqrt(step @ step)
+        # A step beyond the radius leaves the region in which the slope says anything.
+        centre = centre + step * min(1.0, radius / max(length, radius))
+        if iteration >= SELECTIONS and length < STEP_TOLERANCE:
+            break
+    residual = math.sqrt(e @ e / len(e))
+    # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.
+    return SphereFit(centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal))))
+
+
+def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+    """Return where rays (k, 3) first meet a sphere: the depths t (k,) m and the roots √D (k,); D is kept positive."""
+    length2, along = np.einsum("ij,ij->i", rays, rays), rays @ centre
+    D = along * along - length2 * (centre @ centre - radius**2)
+    root = np.sqrt(np.maximum(D, (0.1 * INNER_COSINE * radius) ** 2))
+    return (along - root) / length2, root
+
+
+def choose_depths(rays: FloatArray, depth: FloatArray, centre: FloatArray, radius: float) -> IntArray:
+    """Return the indices of the rays that meet the sphere well inside its silhouette and whose depth is no outlier."""
+    t, root = first_hit(rays, centre, radius)
+    inner = np.flatnonzero(root >= INNER_COSINE * radius * np.sqrt(np.einsum("ij,ij->i", rays, rays)))
+    if len(inner) == 0:
+        return inner
+    size = np.abs(depth[inner] - t[inner])
+    middle = len(inner) // 2
+    # 1.4826 times the median size estimates the standard deviation, whatever the outliers.
+    gate = max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.partition(size, middle)[middle]))
+    return inner[size <= gate]
+
+
+def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeCamera, radius: float) -> ByteArray:
+    """Return a copy of an image with the detected ball's outline and centre drawn on it.
+
+    Args:
+        rgb: (h, w, 3).
+        detection: the ball, or None: then the copy is plain.
+        camera: the camera that took the image.
+        radius: m, of the ball.
+    """
+    picture = np.ascontiguousarray(rgb).copy()
+    if detection is None:
+        return picture
+    shift = 4  # OpenCV takes fractions of pixels as integers shifted by this many bits
+    u, v = camera.project(detection.centre)
+    centre = (round(u * 2**shift), round(v * 2**shift))
+    size = camera.focal * radius / detection.centre[2]
+    thickness = max(1, round(camera.height / 360))
+    cv2.circle(picture, centre, round((size + 1.5 * thickness) * 2**shift), OUTLINE, thickness, cv2.LINE_AA, shift)
+    arm = round(0.45 * size * 2**shift)
+    for dx, dy in ((arm, 0), (0, arm)):
+        ends = ((centre[0] - dx, centre[1] - dy), (centre[0] + dx, centre[1] + dy))
+        cv2.line(picture, *ends, OUTLINE, thickness, cv2.LINE_AA, shift)
+    return picture

@@ -1,0 +1,168 @@
+"""The simulated bench: the one module that calls PyBullet.
+
+An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W
+is the arm's base frame B.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pybullet
+
+from servobench.plant.bullet.meshes import sphere_obj
+from servobench.plant.bullet.urdf import ArmBody, arm_urdf, bench_files
+from servobench.plant.robot.camera import PinholeCamera, view_matrix
+
+if TYPE_CHECKING:
+    from servobench.plant.bullet.detection import ByteArray
+    from servobench.plant.robot.arm import SerialArm
+    from servobench.plant.signals import FloatArray
+
+GRAVITY = 9.81  # m/s²
+BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
+BALL_MESH = "ball.obj"
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera in the scene, as PyBullet takes it.
+
+    Attributes:
+        camera: the intrinsics.
+        view: 16 numbers of the OpenGL view matrix, column by column.
+        projection: 16 numbers of the OpenGL projection matrix, column by column.
+    """
+
+    camera: PinholeCamera
+    view: tuple[float, ...]
+    projection: tuple[float, ...]
+
+
+def view_of(camera: PinholeCamera, X_BC: FloatArray) -> View:
+    """Return the view of a camera at X_BC (4, 4)."""
+    # OpenGL stores matrices column by column.
+    view, projection = view_matrix(X_BC).T.ravel(), camera.projection_matrix().T.ravel()
+    return View(camera, tuple(view.tolist()), tuple(projection.tolist()))
+
+
+class Scene:
+    """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
+
+    def __init__(self, arm: SerialArm, body: ArmBody, *, physics_step: float, scenery: bool, window: bool) -> None:
+        """Open a world and load the arm.
+
+        Args:
+            arm: the true kinematics.
+            body: masses, torques and looks.
+            physics_step: s.
+            scenery: whether to load the table and the floor.
+            window: whether to open PyBullet's window.
+
+        Raises:
+            ValueError: a window is wanted where there is no display.
+            ConnectionError: PyBullet opens no world, as too many are open.
+        """
+        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
+        self._client: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
+        if self._client < 0:
+            raise ConnectionError("PyBullet could not open a physics world")
+        try:
+            self._load(arm, body, physics_step, scenery=scenery)
+            if window:
+                self._aim_window()
+        except BaseException:
+            self.close()
+            raise
+        n = arm.n
+        self._joints = list(range(n))
+        self._ball_link = n + 1
+        self._torque = body.max_torque.tolist()
+
+    def _load(self, arm: SerialArm, body: ArmBody, physics_step: float, *, scenery: bool) -> None:
+        client = self._client
+        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps
+        # every mesh it ever loaded by file name, so memory would grow from plant to plant.
+        pybullet.setPhysicsEngineParameter(
+            fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
+        )
+        pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        files = {"arm.urdf": arm_urdf(arm, body, BALL_MESH), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
+        if scenery:
+            files |= bench_files()
+        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+            for name, text in files.items():
+                (Path(folder) / name).write_text(text, encoding="utf-8")
+            bodies = [
+                pybullet.loadURDF(
+                    str(Path(folder) / name),
+                    useFixedBase=True,
+                    flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                    physicsClientId=client,
+                )
+                for name in files
+                if name.endswith(".urdf")
+            ]
+        self._arm = bodies[0]
+
+    def _aim_window(self) -> None:
+        """Show the arm from the front right, without PyBullet's side panels."""
+        client = self._client
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+        pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
+
+    def place(self, theta: FloatArray) -> None:
+        """Put the arm at rest at joint angles `theta` (n,) rad."""
+        for joint, angle in zip(self._joints, theta.tolist(), strict=True):
+            pybullet.resetJointState(self._arm, joint, angle, 0.0, physicsClientId=self._client)
+
+    def advance(self, velocities: list[list[float]]) -> None:
+        """Take a physics step for each row of target joint velocities, (n,) rad/s, under the motors' torque limits."""
+        arm, client, joints, torque = self._arm, self._client, self._joints, self._torque
+        control, step, mode = pybullet.setJointMotorControlArray, pybullet.stepSimulation, pybullet.VELOCITY_CONTROL
+        for row in velocities:
+            control(arm, joints, mode, targetVelocities=row, forces=torque, physicsClientId=client)
+            step(physicsClientId=client)
+
+    def joint_angles(self) -> FloatArray:
+        """Return the joint angles θ, (n,) rad."""
+        states = pybullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
+        return np.array([state[0] for state in states])
+
+    def ball_position(self) -> FloatArray:
+        """Return the ball's centre in the base frame, (3,) m, from the simulator's own link state."""
+        state = pybullet.getLinkState(
+            self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        return np.array(state[4])
+
+    def render(self, view: View) -> tuple[ByteArray, FloatArray]:
+        """Return what a camera sees: colours (h, w, 4) uint8, and OpenGL depths (h, w) in [0, 1]."""
+        camera = view.camera
+        _, _, rgba, depth, _ = pybullet.getCameraImage(
+            camera.width,
+            camera.height,
+            view.view,
+            view.projection,
+            shadow=0,
+            renderer=pybullet.ER_TINY_RENDERER,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self._client,
+        )
+        # A PyBullet built without numpy returns tuples.
+        shape = (camera.height, camera.width)
+        return np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4), np.asarray(depth).reshape(shape)
+
+    def close(self) -> None:
+        """Leave the world; calling it twice is allowed."""
+        if self._client >= 0:
+            client, self._client = self._client, -1
+            if pybullet.isConnected(client):
+                pybullet.disconnect(client)

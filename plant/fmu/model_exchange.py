@@ -1,0 +1,154 @@
+"""Reads the model-exchange side of an FMU back into CasADi: the feature and its Jacobian by the FMU's own derivatives.
+
+    q -> (y, ∂y/∂q)
+
+The result has the signature of `plant.robot.symbolic.symbolic_model`, so that whatever is built on the project's own
+equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU whose equations nobody has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.description import FmuDescription, read_exchange
+from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.signals import FloatArray
+
+
+class FmuModel:
+    """y = h(q) of a model-exchange FMU, J = ∂h/∂q by its directional derivatives; other states rest at their start.
+
+    It has an instance of the FMU and extracted files of its own, so that it disturbs no run of the same FMU.
+
+    Attributes:
+        function: (n,) rad -> (m,) and (m, n), a `casadi.Function`; it lives as long as this object.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        joints: Sequence[str] = ("joint_position",),
+        features: Sequence[str] = ("ball_position",),
+        parameters: Mapping[str, npt.ArrayLike] | None = None,
+    ) -> None:
+        """Load the FMU.
+
+        Args:
+            path: the .fmu file, of FMI 2 with model exchange.
+            joints: names of states, or of families `name[1]`, `name[2]`, …
+            features: names of outputs, likewise.
+            parameters: values by name, instead of the start values.
+
+        Raises:
+            ValueError: not such an FMU, or a name that it does not have.
+        """
+        self._folder = FmuFolder(path)
+        try:
+            read_exchange(path, self._folder.root)
+            self._feature = _feature_function(path, self._folder.root, joints, features, dict(parameters or {}))
+            q = casadi.MX.sym("joint_position", self._feature.size1_in(0))
+            y = self._feature(q)
+            outputs: list[Any] = [y, casadi.jacobian(y, q)]
+            create: Any = casadi.Function  # its annotations do not know MX
+            self.function = create("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
+        except BaseException:
+            self._folder.close()
+            raise
+
+    def symbolic(self, joint_position: Any) -> Any:  # noqa: ANN401 - CasADi expressions
+        """Return the feature, (m, 1), as an expression of `joint_position`, an MX expression of shape (n, 1) in rad."""
+        return self._feature(joint_position)
+
+    def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the feature, (m,), at joint positions (n,) in rad."""
+        return np.asarray(self._feature(np.asarray(joint_position)), dtype=np.float64).ravel()
+
+    def jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return ∂feature/∂(joint position), (..., m, n), at joint positions (..., n) in rad."""
+        q = np.asarray(joint_position, dtype=np.float64)
+        rows = [np.asarray(self.function(row)[1]) for row in q.reshape(-1, q.shape[-1])]
+        return np.array(rows, dtype=np.float64).reshape(*q.shape[:-1], *rows[0].shape)
+
+    def close(self) -> None:
+        """Remove the extracted files; the functions must not be used any more. Calling it twice is allowed."""
+        self._folder.close()
+
+
+def mapped_model(
+    mapping: FmuMapping, description: FmuDescription, parameters: Mapping[str, FloatArray] | None = None
+) -> FmuModel:
+    """Return the model of a mapped FMU.
+
+    Args:
+        mapping: names the features, the joints or the states behind them, and the parameters.
+        description: of the FMU.
+        parameters: values by name that go before those of the mapping.
+
+    Raises:
+        ValueError: see `FmuModel`; also a mapping that names neither joints nor states.
+    """
+    states = mapping.true_states or mapping.joints
+    if not states:
+        raise ValueError("truth.states must name the states of the FMU that are the joint positions, got none")
+    values: dict[str, float] = {}
+    for name, value in {**mapping.parameters, **(parameters or {})}.items():
+        variables = description.find(name, "parameters")
+        if np.shape(value) not in ((), (len(variables),)):
+            raise ValueError(f"parameter {name!r} must have {len(variables)} values, got {np.size(value)}")
+        scalars = np.broadcast_to(value, (len(variables),)).tolist()
+        values |= {variable.name: scalar for variable, scalar in zip(variables, scalars, strict=True)}
+    joints = description.select(states, "truth.states" if mapping.true_states else "joints")
+    features = description.select(mapping.true_features or mapping.features, "features")
+    return FmuModel(mapping.path, [each.name for each in joints], [each.name for each in features], values)
+
+
+def _feature_function(
+    path: Path, root: Path, joints: Sequence[str], features: Sequence[str], parameters: dict[str, npt.ArrayLike]
+) -> Any:  # noqa: ANN401 - a casadi.Function
+    """Return q -> y with everything else at its start."""
+    try:
+        builder = casadi.DaeBuilder("fmu", str(root))
+        states, outputs, constants = list(builder.x()), list(builder.y()), list(builder.p())
+        chosen = _resolve("joints", joints, states, f"states of {path.name}")
+        builder.set_y(_resolve("features", features, outputs, f"outputs of {path.name}"))
+        whole = builder.create("fmu", ["x", "u", "p"], ["y"])
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]  # the lines before say where in CasADi
+        raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
+    values = dict(zip(constants, _starts(builder, constants), strict=True))
+    for name, value in parameters.items():
+        names = _resolve("parameters", [name], constants, f"parameters of {path.name}")
+        values.update(zip(names, np.broadcast_to(np.ravel(value), (len(names),)), strict=True))
+    q = casadi.MX.sym("joint_position", len(chosen))
+    place = {name: i for i, name in enumerate(chosen)}
+    rest = dict(zip(states, _starts(builder, states), strict=True))
+    x = casadi.vertcat(*(q[place[name]] if name in place else rest[name] for name in states))
+    inputs = casadi.DM(_starts(builder, list(builder.u())))
+    feature = whole(x, inputs, casadi.DM([float(values[name]) for name in constants]))
+    create: Any = casadi.Function  # its annotations do not know MX
+    return create("feature", [q], [feature], ["joint_position"], ["feature"])
+
+
+def _starts(builder: Any, names: list[str]) -> list[float]:  # noqa: ANN401 - a casadi.DaeBuilder
+    """Return start values; what has none, such as a state that a parameter places, starts at 0."""
+    starts = [float(np.ravel(builder.start(name))[0]) for name in names]
+    return [start if np.isfinite(start) else 0.0 for start in starts]
+
+
+def _resolve(role: str, names: Sequence[str], known: list[str], what: str) -> list[str]:
+    """Return the variables that `names` stand for, in the FMU's order of each family."""
+    found: list[str] = []
+    for name in names:
+        members = [name] if name in known else [each for each in known if each.startswith(f"{name}[")]
+        if not members:
+            families = dict.fromkeys(each.partition("[")[0] for each in known)
+            raise ValueError(f"{role} names {name!r}, which is none of the {what}: {', '.join(families) or 'none'}")
+        found += members
+    return found

@@ -1,0 +1,212 @@
+"""Forward kinematics and position Jacobian of a serial arm with revolute joints.
+
+The arm is a chain of fixed transforms and rotations about z: frame i+1 is reached from frame i by a translation, a
+rotation in roll, pitch, yaw (fixed axes, as in URDF) and then the rotation of joint i+1 about its z axis. Both sources
+map onto it without loss: standard DH, T_i = Rz(θ_i) Tz(d_i) Tx(a_i) Rx(α_i), whose constant part after joint i is the
+translation (a_i, 0, d_i) and the roll α_i, and the calibration file that every Universal Robots arm carries.
+
+    θ = g ⊙ q + o          q reported joint position, g gear ratio (1 = as reported), o joint offset
+    p = p_flange + R_flange t          t ball centre in the flange frame
+    ∂p/∂q_i = g_i z_i × (p − p_i)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from servobench.plant.signals import FloatArray, as_vector
+
+CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+
+
+def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
+    """Return Rz(yaw) Ry(pitch) Rx(roll), shape (..., 3, 3), for `rpy` of shape (..., 3) in rad."""
+    angles = np.asarray(rpy, dtype=np.float64)
+    (cr, cp, cy), (sr, sp, sy) = (np.moveaxis(f(angles), -1, 0) for f in (np.cos, np.sin))
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rpy_from_rotation(R: FloatArray) -> FloatArray:
+    """Return roll, pitch, yaw, (3,) rad, of a rotation matrix (3, 3); sound at a pitch of ±90° too.
+
+    The yaw is taken out before pitch and roll are read, so that no angle is read from two vanishing numbers.
+    """
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+@dataclass(frozen=True, eq=False)
+class SerialArm:
+    """A serial arm with n revolute joints and a ball on its flange.
+
+    Attributes:
+        joint_names: n names.
+        translation: (n+1, 3), m; row i leads from frame i to joint i+1, the last row to the flange.
+        rpy: (n+1, 3), rad; the rotations that go with them.
+        joint_offset: (n,), rad.
+        gear_ratio: (n,), true joint motion over reported joint motion.
+        tool: (3,), m, ball centre in the flange frame.
+    """
+
+    joint_names: tuple[str, ...]
+    translation: FloatArray
+    rpy: FloatArray
+    joint_offset: FloatArray
+    gear_ratio: FloatArray
+    tool: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check shapes and freeze the arrays."""
+        n = len(self.joint_names)
+        for name, wanted in (("translation", (n + 1, 3)), ("rpy", (n + 1, 3))):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != wanted:
+                raise ValueError(f"{name} must have shape {wanted}, got {value.shape}")
+            object.__setattr__(self, name, as_vector(name, value.ravel(), value.size).reshape(wanted))
+        for name, size in (("joint_offset", n), ("gear_ratio", n), ("tool", 3)):
+            object.__setattr__(self, name, as_vector(name, getattr(self, name), size))
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @cached_property
+    def _fixed(self) -> FloatArray:
+        """Fixed transforms as homogeneous matrices, (n+1, 4, 4)."""
+        fixed = np.zeros((self.n + 1, 4, 4))
+        fixed[:, :3, :3] = rotation_from_rpy(self.rpy)
+        fixed[:, :3, 3] = self.translation
+        fixed[:, 3, 3] = 1.0
+        return fixed
+
+    def joint_angle(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the true joint angles θ = g ⊙ q + o, (..., n) rad, for reported positions (..., n) rad."""
+        q = np.asarray(joint_position, dtype=np.float64)
+        if q.shape[-1:] != (self.n,):
+            raise ValueError(f"joint_position must have shape (..., {self.n}), got {q.shape}")
+        return self.gear_ratio * q + self.joint_offset
+
+    def frames(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the poses of all joint frames and of the flange in the base frame.
+
+        Args:
+            joint_position: (..., n), rad, as reported.
+
+        Returns:
+            (..., n+1, 4, 4), m: entry i is the frame after joint i+1, the last one is the flange.
+        """
+        theta = self.joint_angle(joint_position)
+        cos, sin = np.cos(theta), np.sin(theta)
+        poses = np.empty((*theta.shape[:-1], self.n + 1, 4, 4))
+        pose = np.broadcast_to(self._fixed[0], (*theta.shape[:-1], 4, 4))
+        for i in range(self.n):
+            turned = poses[..., i, :, :]
+            c, s = cos[..., i, None], sin[..., i, None]
+            turned[..., :, 0] = pose[..., :, 0] * c + pose[..., :, 1] * s
+            turned[..., :, 1] = pose[..., :, 1] * c - pose[..., :, 0] * s
+            turned[..., :, 2:] = pose[..., :, 2:]
+            pose = turned @ self._fixed[i + 1]
+        poses[..., self.n, :, :] = pose
+        return poses
+
+    def flange_pose(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return X_BE, the flange in the base frame, (..., 4, 4), for joint positions (..., n) in rad."""
+        return self.frames(joint_position)[..., -1, :, :]
+
+    def ball_position(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the ball centre in the base frame, (..., 3) m, for joint positions (..., n) in rad."""
+        return self._ball(self.frames(joint_position))
+
+    def ball_jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return ∂(ball centre)/∂(reported joint position), (..., 3, n) m/rad, for (..., n) in rad."""
+        frames = self.frames(joint_position)
+        lever = self._ball(frames)[..., None, :] - frames[..., : self.n, :3, 3]
+        columns = np.cross(frames[..., : self.n, :3, 2], lever) * self.gear_ratio[:, None]
+        return np.swapaxes(columns, -1, -2)
+
+    def _ball(self, frames: FloatArray) -> FloatArray:
+        flange = frames[..., -1, :, :]
+        return flange[..., :3, :3] @ self.tool + flange[..., :3, 3]
+
+
+def arm_from_dh(
+    a: npt.ArrayLike,
+    d: npt.ArrayLike,
+    alpha: npt.ArrayLike,
+    tool: npt.ArrayLike,
+    joint_names: tuple[str, ...],
+) -> SerialArm:
+    """Return the arm of a standard DH table.
+
+    Args:
+        a: (n,), m, link lengths.
+        d: (n,), m, link offsets.
+        alpha: (n,), rad, link twists.
+        tool: (3,), m, ball centre in the flange frame.
+        joint_names: n names.
+
+    Returns:
+        The arm with gear ratios of 1 and no joint offsets.
+
+    Raises:
+        ValueError: a column of the wrong length.
+    """
+    n = len(joint_names)
+    columns = {name: as_vector(name, value, n) for name, value in (("a", a), ("d", d), ("alpha", alpha))}
+    translation, rpy = np.zeros((n + 1, 3)), np.zeros((n + 1, 3))
+    translation[1:, 0], translation[1:, 2] = columns["a"], columns["d"]
+    rpy[1:, 0] = columns["alpha"]
+    tool_vector = as_vector("tool", tool, 3)
+    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), tool_vector)
+
+
+def arm_from_calibration(path: Path, tool: npt.ArrayLike, joint_names: tuple[str, ...]) -> SerialArm:
+    """Return the arm that a Universal Robots factory-calibration file describes.
+
+    Args:
+        path: YAML file as the `ur_calibration` tool writes it: six blocks of x, y, z [m], roll, pitch, yaw [rad].
+        tool: (3,), m, ball centre in the flange frame.
+        joint_names: six names.
+
+    Returns:
+        The arm with gear ratios of 1 and no joint offsets.
+
+    Raises:
+        ValueError: the file is missing, is not such a file, or a number in it is not finite.
+    """
+    try:
+        blocks = yaml.safe_load(path.read_text(encoding="utf-8"))["kinematics"]
+        keys = ("x", "y", "z", "roll", "pitch", "yaw")
+        table = np.array([[float(blocks[block][key]) for key in keys] for block in CALIBRATION_BLOCKS])
+    except OSError as error:
+        raise ValueError(f"calibration file {path} cannot be read: {error.strerror}") from error
+    except yaml.YAMLError as error:
+        raise ValueError(f"calibration file {path} is not valid YAML: {' '.join(str(error).split())}") from error
+    except KeyError as error:
+        raise ValueError(
+            f"calibration file {path} lacks {error}; wanted 'kinematics' with the blocks "
+            f"{', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
+        ) from error
+    except (TypeError, ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"calibration file {path} holds something that is not a number: {error}") from error
+    if not np.isfinite(table).all():
+        raise ValueError(f"calibration file {path} holds a number that is not finite")
+    n = len(CALIBRATION_BLOCKS)
+    flange = np.zeros((1, 3))
+    translation, rpy = np.vstack([table[:, :3], flange]), np.vstack([table[:, 3:], flange])
+    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), as_vector("tool", tool, 3))

@@ -1,0 +1,273 @@
+"""Named, seeded differences between the true robot and the nominal model that controllers know.
+
+A mismatch is written as words joined by `+`: a profile (`none`, `factory`, `moderate`, `severe`), single axes with a
+magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20mm`, `gear_ratio=5%`,
+`camera_move=90deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file
+(`factory=FILE`; without a file, that of one real UR5).
+
+Links, joint offsets, gear ratios and the three components of the tool offset are each drawn uniformly from plus or
+minus the magnitude. The camera turns about an axis drawn at random; by an angle drawn from plus or minus the
+magnitude in a profile, and by exactly the magnitude as a single axis. It turns about the middle of the workspace,
+which therefore stays where it was in the image, and the axis is drawn among those that tilt the optical axis by at
+most 45°: a camera tilted further would look from below the table. `camera_move` turns the camera in the same way, by
+exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a stream of
+its own, so that the same seed gives the same directions at all magnitudes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, ur5_arm_from_calibration
+from servobench.plant.seeds import named_generator
+from servobench.plant.signals import FloatArray, check_number
+
+MAX_TILT = math.radians(45.0)
+MAX_MOVE_TILT = math.radians(30.0)
+
+ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
+LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+SHARE = {"%": 1e-2, "": 1.0}
+AXES = {
+    "links": (SHARE, "10%"),
+    "joint_offsets": (ANGLE, "3deg"),
+    "camera_rotation": (ANGLE, "60deg"),
+    "tool": (LENGTH, "20mm"),
+    "gear_ratio": (SHARE, "5%"),
+    "camera_move": (ANGLE, "90deg"),
+}
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """How far the true robot may be from the nominal one.
+
+    Attributes:
+        links: largest relative error of each link length and offset.
+        joint_offsets: largest error of each joint's zero, rad.
+        camera_rotation: largest (or exact) rotation of the camera, rad.
+        tool: largest error of each component of the ball's place on the flange, m.
+        gear_ratio: largest relative error of each joint's motion.
+        camera_move: rotation of the camera in the middle of the run, rad.
+        camera_exact: the camera turns by exactly `camera_rotation`.
+        factory: the arm is that of a calibration file.
+        calibration: the calibration file; None for the one that the package brings.
+    """
+
+    links: float = 0.0
+    joint_offsets: float = 0.0
+    camera_rotation: float = 0.0
+    tool: float = 0.0
+    gear_ratio: float = 0.0
+    camera_move: float = 0.0
+    camera_exact: bool = False
+    factory: bool = False
+    calibration: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Check the magnitudes."""
+        check_number("links", self.links, at_least=0.0, below=1.0)
+        check_number("joint_offsets", self.joint_offsets, at_least=0.0, at_most=math.pi)
+        check_number("camera_rotation", self.camera_rotation, at_least=0.0, at_most=math.pi)
+        check_number("camera_move", self.camera_move, at_least=0.0, at_most=math.pi)
+        check_number("tool", self.tool, at_least=0.0, at_most=1.0)
+        check_number("gear_ratio", self.gear_ratio, at_least=0.0, below=1.0)
+
+
+PROFILES = {
+    "none": Mismatch(),
+    "factory": Mismatch(factory=True),
+    "moderate": Mismatch(0.05, math.radians(3.0), math.radians(15.0), 0.020),
+    "severe": Mismatch(0.10, math.radians(6.0), math.radians(45.0), 0.040),
+}
+
+
+@dataclass(frozen=True)
+class MismatchSample:
+    """The values drawn for one run; all of them go into the log.
+
+    Attributes:
+        link_scale: (n+1, 3), factors on the translations between joints.
+        joint_offset: (n,), rad, added to the nominal offsets.
+        gear_ratio: (n,), factors on the nominal gear ratios.
+        tool_offset: (3,), m, in the flange frame.
+        camera_axis: (3,), unit vector in the camera frame.
+        camera_angle: rad.
+        move_axis: (3,), unit vector in the camera frame, of the move in the middle of the run.
+        move_angle: rad.
+    """
+
+    link_scale: FloatArray
+    joint_offset: FloatArray
+    gear_ratio: FloatArray
+    tool_offset: FloatArray
+    camera_axis: FloatArray
+    camera_angle: float
+    move_axis: FloatArray
+    move_angle: float
+
+    def moved(self, model: HandEyeModel) -> HandEyeModel | None:
+        """Return the true robot `model` after its camera was moved in the middle of the run; None if it is not."""
+        if self.move_angle == 0.0:
+            return None
+        return replace(model, X_BC=_turn_camera(model.X_BC, self.move_angle * self.move_axis))
+
+    def as_record(self) -> dict[str, object]:
+        """Return the values as plain lists and floats, for JSON."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+
+
+def parse_mismatch(text: str) -> Mismatch:
+    """Return the mismatch that `text` describes.
+
+    Args:
+        text: profiles and axes joined by `+`, see the module's docstring.
+
+    Raises:
+        ValueError: an unknown word, a missing or malformed magnitude, or one out of its bounds.
+    """
+    mismatch = Mismatch()
+    for position, word in enumerate(part.strip() for part in text.split("+")):
+        name, equals, value = word.partition("=")
+        if name in PROFILES and position == 0 and (name == "factory" or not equals):
+            mismatch = PROFILES[name]
+            if equals:
+                mismatch = replace(mismatch, calibration=Path(value).expanduser())
+        elif name in AXES:
+            magnitude = _parse_magnitude(name, value)
+            exact = name == "camera_rotation" or mismatch.camera_exact
+            changes: dict[str, Any] = {name: magnitude, "camera_exact": exact}
+            mismatch = replace(mismatch, **changes)
+        else:
+            examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
+            raise ValueError(
+                f"mismatch {text!r}: {word!r} is not known here; wanted one profile ({', '.join(PROFILES)}, "
+                f"factory=FILE) and then axes such as {examples}, joined by '+'"
+            )
+    return mismatch
+
+
+def magnitude_texts(axis: str, text: str) -> tuple[str, ...]:
+    """Return the magnitudes in `begin:end:step` (both ends included) or `one/another`, each with the unit at the end.
+
+    Args:
+        axis: name of the axis, such as "camera_rotation".
+        text: such as "0:180:30deg" or "5/10/20mm".
+
+    Raises:
+        ValueError: an unknown axis, a malformed or an empty range.
+    """
+    if axis not in AXES:
+        raise ValueError(f"unknown mismatch axis {axis!r}; valid: {', '.join(AXES)}")
+    example = {"%": "30:10%", "deg": "180:30deg", "mm": "60:20mm"}[re.sub("[0-9.]", "", AXES[axis][1])]
+    number = r"[0-9]*\.?[0-9]+"
+    match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
+    if match is None:
+        raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}=0:{example}; got {text!r}")
+    numbers = [float(part) for part in re.split("[:/]", match[1])]
+    if ":" in match[1]:
+        begin, end, step = numbers
+        count = math.floor((end - begin) / step + 1e-9) + 1 if step > 0.0 else 0
+        numbers = [round(begin + i * step, 9) for i in range(count)]
+    if not numbers:
+        raise ValueError(f"the range {text!r} of {axis} is empty")
+    texts = tuple(f"{number:g}{match[2]}" for number in numbers)
+    for magnitude in texts:
+        _parse_magnitude(axis, magnitude)
+    return texts
+
+
+def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple[HandEyeModel, MismatchSample]:
+    """Draw a true robot.
+
+    Args:
+        mismatch: how far it may be from `model`.
+        model: the nominal robot.
+        seed: non-negative.
+
+    Returns:
+        The true robot and the values that were drawn.
+
+    Raises:
+        ValueError: the calibration file is missing or malformed.
+    """
+    n = model.arm.n
+
+    def draw(name: str, *shape: int) -> FloatArray:
+        return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, shape)
+
+    angle = mismatch.camera_rotation
+    sample = MismatchSample(
+        link_scale=1.0 + mismatch.links * draw("links", n + 1, 3),
+        joint_offset=mismatch.joint_offsets * draw("joint_offsets", n),
+        gear_ratio=1.0 + mismatch.gear_ratio * draw("gear_ratio", n),
+        tool_offset=mismatch.tool * draw("tool", 3),
+        camera_axis=_draw_camera_axis(angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")),
+        camera_angle=angle if mismatch.camera_exact else float(angle * draw("camera_angle", 1)[0]),
+        move_axis=_draw_camera_axis(mismatch.camera_move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
+        move_angle=mismatch.camera_move,
+    )
+    arm = ur5_arm_from_calibration(mismatch.calibration) if mismatch.factory else model.arm
+    return HandEyeModel(
+        _perturb_arm(arm, sample), _turn_camera(model.X_BC, sample.camera_angle * sample.camera_axis)
+    ), sample
+
+
+def _parse_magnitude(axis: str, value: str) -> float:
+    units, example = AXES[axis]
+    match = re.fullmatch(r"([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*([a-z%]*)", value.strip())
+    if match is None or match[2] not in units:
+        names = ", ".join(repr(unit) if unit else "none" for unit in units)
+        raise ValueError(
+            f"mismatch axis {axis} needs a magnitude with one of the units {names}, "
+            f"such as {axis}={example}; got {value!r}"
+        )
+    return float(match[1]) * units[match[2]]
+
+
+def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
+    """Draw an axis about which a turn by up to `angle` tilts the optical axis by at most `max_tilt`.
+
+    A turn by φ about an axis at γ from the optical axis tilts that by τ with sin(τ/2) = sin(φ/2) sin γ.
+    """
+    largest = math.sin(max_tilt / 2) / max(math.sin(angle / 2), math.sin(max_tilt / 2))
+    cos_gamma = 1.0 - generator.uniform() * (1.0 - math.sqrt(1.0 - largest**2))
+    sin_gamma = math.sqrt(1.0 - cos_gamma**2)
+    turn = generator.uniform(0.0, 2 * math.pi)
+    sign = generator.choice([-1.0, 1.0])
+    return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
+
+
+def _perturb_arm(arm: SerialArm, sample: MismatchSample) -> SerialArm:
+    return replace(
+        arm,
+        translation=arm.translation * sample.link_scale,
+        joint_offset=arm.joint_offset + sample.joint_offset,
+        gear_ratio=arm.gear_ratio * sample.gear_ratio,
+        tool=arm.tool + sample.tool_offset,
+    )
+
+
+def _turn_camera(X_BC: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Turn the camera about the middle of the workspace, whose camera coordinates stay the same.
+
+    Args:
+        X_BC: (4, 4), its pose.
+        rotation: (3,), rad, rotation vector in the camera frame.
+    """
+    centre = np.asarray(WORKSPACE_CENTRE)
+    centre_C = X_BC[:3, :3].T @ (centre - X_BC[:3, 3])
+    turned = np.eye(4)
+    turned[:3, :3] = X_BC[:3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
+    turned[:3, 3] = centre - turned[:3, :3] @ centre_C
+    return turned

@@ -1,0 +1,122 @@
+"""The symbolic twin of `plant.robot.arm` and `plant.robot.hand_eye` in CasADi, written from the same table.
+
+θ = g ⊙ q + o,     p_B = p_flange + R_flange t,     y = R_BCᵀ (p_B − p_BC),     ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i))
+
+The core takes symbols or numbers for everything, so that one expression serves a model with its numbers bound and a
+function (or generated C code) whose geometry stays a parameter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, TypeAlias
+
+import casadi
+
+from servobench.plant.robot.hand_eye import HandEyeModel
+
+SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeGeometry:
+    """Everything that describes arm and camera, as CasADi symbols or constants.
+
+    Attributes:
+        translation: (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`.
+        rpy: (n+1, 3), rad.
+        joint_offset: o, (n,), rad.
+        gear_ratio: g, (n,).
+        tool: t, (3,), m.
+        R_BC: (3, 3), camera in the base frame.
+        p_BC: (3,), m, camera in the base frame.
+    """
+
+    translation: SX
+    rpy: SX
+    joint_offset: SX
+    gear_ratio: SX
+    tool: SX
+    R_BC: SX
+    p_BC: SX
+
+
+def geometry_symbols(n: int) -> HandEyeGeometry:
+    """Return a geometry of `n` joints in which every number is a symbol.
+
+    Raises:
+        ValueError: n below 1.
+    """
+    if n < 1:
+        raise ValueError(f"n must be at least 1, got {n}")
+    shapes = ((n + 1, 3), (n + 1, 3), (n, 1), (n, 1), (3, 1), (3, 3), (3, 1))
+    names = [field.name for field in fields(HandEyeGeometry)]
+    return HandEyeGeometry(*(casadi.SX.sym(name, *shape) for name, shape in zip(names, shapes, strict=True)))
+
+
+def geometry_of(model: HandEyeModel) -> HandEyeGeometry:
+    """Return the geometry of `model` as constants."""
+    arm = model.arm
+    numbers = (arm.translation, arm.rpy, arm.joint_offset, arm.gear_ratio, arm.tool)
+    return HandEyeGeometry(*(casadi.SX(number) for number in (*numbers, model.X_BC[:3, :3], model.X_BC[:3, 3])))
+
+
+def feature_and_jacobian(joint_position: SX, geometry: HandEyeGeometry) -> tuple[SX, SX]:
+    """Return the ball centre in the camera frame and its Jacobian as expressions.
+
+    Args:
+        joint_position: q, (n, 1), rad, as reported.
+        geometry: symbols or constants for n joints.
+
+    Returns:
+        y, (3, 1), m, and ∂y/∂q, (3, n), m/rad.
+    """
+    n = joint_position.numel()
+    rotation, position = _rotation(geometry.rpy[0, :]), geometry.translation[0, :].T
+    axes, origins = [], []
+    for i in range(n):
+        theta = geometry.gear_ratio[i] * joint_position[i] + geometry.joint_offset[i]
+        axes.append(rotation[:, 2])
+        origins.append(position)
+        rotation = rotation @ _turn_z(theta)
+        position = position + rotation @ geometry.translation[i + 1, :].T
+        rotation = rotation @ _rotation(geometry.rpy[i + 1, :])
+    ball = position + rotation @ geometry.tool
+    columns = [geometry.gear_ratio[i] * casadi.cross(axes[i], ball - origins[i]) for i in range(n)]
+    return geometry.R_BC.T @ (ball - geometry.p_BC), geometry.R_BC.T @ casadi.horzcat(*columns)
+
+
+def parametric_model(n: int) -> casadi.Function:
+    """Return (q, translation, rpy, joint_offset, gear_ratio, tool, R_BC, p_BC) -> (feature, jacobian) for n joints."""
+    q, geometry = casadi.SX.sym("joint_position", n), geometry_symbols(n)
+    names = ["joint_position", *(field.name for field in fields(geometry))]
+    inputs = [q, *(getattr(geometry, name) for name in names[1:])]
+    return casadi.Function("hand_eye", inputs, list(feature_and_jacobian(q, geometry)), names, ["feature", "jacobian"])
+
+
+def symbolic_model(model: HandEyeModel) -> casadi.Function:
+    """Return q -> (feature, jacobian), (n,) rad -> (3,) m and (3, n) m/rad, with the numbers of `model` bound."""
+    q = casadi.SX.sym("joint_position", model.arm.n)
+    outputs = list(feature_and_jacobian(q, geometry_of(model)))
+    return casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
+
+
+def symbolic_feature(model: HandEyeModel) -> casadi.Function:
+    """Return q -> feature, (n,) rad -> (3,) m, with the numbers of `model` bound."""
+    q = casadi.SX.sym("joint_position", model.arm.n)
+    feature = feature_and_jacobian(q, geometry_of(model))[0]
+    return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
+
+
+def _rotation(rpy: SX) -> SX:
+    """Rz(yaw) Ry(pitch) Rx(roll), as `servobench.plant.robot.arm.rotation_from_rpy`."""
+    c: SX = casadi.cos(rpy)
+    s: SX = casadi.sin(rpy)
+    roll = casadi.vertcat(casadi.horzcat(1, 0, 0), casadi.horzcat(0, c[0], -s[0]), casadi.horzcat(0, s[0], c[0]))
+    pitch = casadi.vertcat(casadi.horzcat(c[1], 0, s[1]), casadi.horzcat(0, 1, 0), casadi.horzcat(-s[1], 0, c[1]))
+    return _turn_z(rpy[2]) @ pitch @ roll
+
+
+def _turn_z(angle: SX) -> SX:
+    c, s = casadi.cos(angle), casadi.sin(angle)
+    return casadi.vertcat(casadi.horzcat(c, -s, 0), casadi.horzcat(s, c, 0), casadi.horzcat(0, 0, 1))

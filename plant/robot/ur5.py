@@ -1,0 +1,94 @@
+"""Facts of the UR5 (CB3) and the bench around it: the arm on a table, the camera above, the ball on the flange.
+
+Sources: Universal Robots, "DH parameters for calculations of kinematics and dynamics" (lengths, masses, centres of mass
+and torques); inertia tensors by the cylinder approximation that the vendor's ROS description uses.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from servobench.plant.robot.arm import SerialArm, arm_from_calibration, arm_from_dh
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.signals import FloatArray
+
+JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+# Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i): lengths in m, angles in rad.
+DH_A = (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0)
+DH_D = (0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823)
+DH_ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+
+MASS = (3.7, 8.393, 2.33, 1.219, 1.219, 0.1879)  # kg
+# Centre of mass of link i in its DH frame (the frame after T_i), m.
+CENTRE_OF_MASS = (
+    (0.0, -0.02561, 0.00193),
+    (0.2125, 0.0, 0.11336),
+    (0.15, 0.0, 0.0265),
+    (0.0, -0.0018, 0.01634),
+    (0.0, 0.0018, 0.01634),
+    (0.0, 0.0, -0.001159),
+)
+# About the centre of mass, kg m²: across the link (ixx = iyy) and along it (izz).
+INERTIA = (
+    (0.01497, 0.01041),
+    (0.13389, 0.01511),
+    (0.03122, 0.00410),
+    (0.00201, 0.00219),
+    (0.00183, 0.00219),
+    (0.0000806, 0.000132),
+)
+MAX_TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # Nm
+MAX_JOINT_SPEED = np.pi  # rad/s, the vendor's limit
+JOINT_RANGE = 2 * np.pi  # rad, each way
+
+# For the looks only: tube radii, and how far a link's tube runs beside its joints, along the joint's axis.
+TUBE_RADIUS = (0.062, 0.056, 0.047, 0.04, 0.04, 0.038)  # m
+SIDE_STEP = (0.0, 0.136, 0.0165, 0.0, 0.0, 0.0)  # m
+
+# The ball stands off the flange so that the wrist does not hide it from above.
+TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
+BALL_RADIUS = 0.035  # m
+
+# The camera hangs above the workspace and looks straight down; image up is +x of the base.
+# The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
+HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
+
+# The box of joint positions in which networks are trained on the nominal model, rad.
+TRAINING_LOWER = (-0.25, -2.29, -3.04, 0.39, 0.92, -0.3)
+TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
+
+WORKSPACE_CENTRE = (0.5, 0.0, 0.25)  # m, base frame
+CAMERA_DISTANCE = 1.3  # m, from the camera to the workspace's centre
+R_BC_DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+
+
+def ur5_arm() -> SerialArm:
+    """Return the UR5 by its data sheet."""
+    return arm_from_dh(DH_A, DH_D, DH_ALPHA, TOOL, JOINT_NAMES)
+
+
+def ur5_arm_from_calibration(path: Path | None = None) -> SerialArm:
+    """Return a UR5 by its factory calibration; without a path, that of one real UR5 which the package brings.
+
+    Raises:
+        ValueError: the file is missing or malformed.
+    """
+    shipped = Path(str(files("servobench.plant") / "data" / "ur5_factory_calibration.yaml"))
+    return arm_from_calibration(shipped if path is None else path, TOOL, JOINT_NAMES)
+
+
+def camera_pose(R_BC: FloatArray) -> FloatArray:
+    """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3) that looks at the workspace's centre."""
+    pose = np.eye(4)
+    pose[:3, :3] = R_BC
+    pose[:3, 3] = np.asarray(WORKSPACE_CENTRE) - CAMERA_DISTANCE * R_BC[:, 2]
+    return pose
+
+
+def nominal_ur5() -> HandEyeModel:
+    """Return what a controller may know: the data-sheet arm under the camera as drawn."""
+    return HandEyeModel(ur5_arm(), camera_pose(np.array(R_BC_DOWN)))

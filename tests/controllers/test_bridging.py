@@ -1,0 +1,194 @@
+"""Tests of what bridges delays: the joints' response, the feature's filter, the shifted reference, redistribution."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers.estimators.noise_level import NoiseLevel
+from servobench.controllers.laws.feature_filter import FeatureFilter
+from servobench.controllers.laws.joint_response import JointResponse
+from servobench.controllers.laws.law import scale_to_limit
+from servobench.controllers.laws.rbfnn_bridged import shifted
+from servobench.controllers.laws.redistribution import redistribute
+
+RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
+
+
+def answered(response, steps=40, length=4, joints=3):
+    """A JointResponse that has seen random commands and their answers; and the commands, the newest last."""
+    rng = np.random.default_rng(3)
+    made, commands = JointResponse(length, joints), [np.zeros(joints)] * len(response)
+    for _ in range(steps):
+        made.learn(sum(g * commands[-1 - i] for i, g in enumerate(response)))
+        commands.append(0.05 * rng.uniform(-1.0, 1.0, joints))
+        made.command(commands[-1])
+    return made, commands
+
+
+def test_the_response_of_the_joints_is_found():
+    made, _ = answered(RESPONSE)
+    np.testing.assert_allclose(made.response, RESPONSE, atol=0.01)
+
+
+def test_flight_and_lead_are_what_is_still_to_come():
+    """Of the newest command nothing is done, of the one before 0.4 is left, of that before 0.1: lead = 1.5 periods."""
+    made, commands = answered(RESPONSE)
+    made.response = RESPONSE
+    made._settle()
+    assert made.lead == pytest.approx(1.0 + 0.4 + 0.1)
+    expected = 1.0 * commands[-1] + 0.4 * commands[-2] + 0.1 * commands[-3]
+    np.testing.assert_allclose(made.flight(), expected, atol=1e-12)
+
+
+def test_at_first_an_arm_is_expected_to_follow_at_once():
+    made = JointResponse(4, 2)
+    made.command(np.array([0.05, -0.05]))
+    np.testing.assert_array_equal(made.flight(), 0.0)
+    assert made.lead == 0.0
+
+
+def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_foreseen():
+    rng, made, rows, answers = np.random.default_rng(0), JointResponse(3, 1), [], []
+    past = np.zeros(3)
+    for _ in range(12):
+        step = float(np.array([0.2, 0.5, 0.3]) @ past) + 0.003 * rng.choice([-1.0, 1.0])
+        if abs(step - made.response @ past) >= 5e-4:
+            rows.append(past)
+            answers.append(step)
+        made.learn(np.array([step]))
+        command = 0.05 * rng.normal()
+        past = np.array([command, *past[:-1]])
+        made.command(np.array([command]))
+    U, prior = np.array(rows), np.array([1.0, 0.0, 0.0])
+    rho = 1e-5 * np.diag([1.0, 1.5, 2.25])
+    expected = np.linalg.solve(U.T @ U + rho, U.T @ np.array(answers) + rho @ prior)
+    assert (expected > 0.0).all()
+    np.testing.assert_allclose(made.response, expected, rtol=1e-9)
+
+
+def test_the_filter_is_a_kalman_filter_by_hand():
+    """σ = 0.1, c = 0.5, ‖Ĵ‖² = 5, ‖Δq‖² = 0.01, r² = 1e-8: p = 0.01 + 0.25·5·0.01/2 = 0.01625, z = 1.2 + L·0.1."""
+    made = FeatureFilter(NoiseLevel(0.1), 0.5, np.array([1.0]), find_noise=False)
+    made.advance(np.array([[2.0, 1.0]]), np.array([0.1, 0.0]), np.array([1.3]))
+    p = 0.01625 + 1e-8
+    np.testing.assert_allclose(made.feature, [1.2 + p / (p + 0.01) * 0.1])
+    assert made.variance == pytest.approx(p * 0.01 / (p + 0.01))
+
+
+def test_a_motion_of_which_the_jacobian_sees_nothing_makes_the_filter_unsure_too():
+    made = FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(1), find_noise=False)
+    before = made.variance
+    made.advance(np.array([[1.0, 0.0]]), np.array([0.0, 0.1]), None)
+    np.testing.assert_array_equal(made.feature, [0.0])
+    assert made.variance > 100.0 * before
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.008])
+def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints(noise):
+    rng, made, errors = (
+        np.random.default_rng(5),
+        FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(3), find_noise=True),
+        [],
+    )
+    for _ in range(900):
+        made.advance(np.eye(3), np.zeros(3), rng.normal(scale=noise, size=3))
+        errors.append(made.feature)
+    assert np.sqrt(np.mean(np.square(errors[300:]))) < 1.3 * np.sqrt(0.5 * 1e-4 * noise)  # L = r/σ: σ √(L/2)
+    before = made.feature
+    made.advance(np.eye(3), np.array([0.01, 0.0, 0.0]), None)
+    np.testing.assert_allclose(made.feature, before + [0.01, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("true", [0.0003, 0.001, 0.004])
+def test_the_noise_is_found_whatever_the_first_guess(true):
+    rng, level, found = np.random.default_rng(6), NoiseLevel(0.001), []
+    for k in range(800):
+        other = 1e-6 * (k % 3)  # variance that is not noise, and known
+        nu = rng.normal(scale=np.sqrt(2.0 * true**2 + other), size=3)
+        level.learn(float(nu @ nu) / 3.0, 2.0, other)
+        found.append(level.variance)
+    assert np.sqrt(np.mean(found[200:])) == pytest.approx(true, rel=0.15)
+
+
+def test_one_sample_of_noise_by_hand():
+    """σ² = 1 counts once: weight (2/(2 + 2))² = 0.25, sample (8 − 2)/2 = 3: (0.99 + 0.75)/(0.99 + 0.25)."""
+    level = NoiseLevel(1.0)
+    level.learn(8.0, 2.0, 2.0)
+    assert level.variance == pytest.approx(1.74 / 1.24)
+
+
+def test_a_frame_that_comes_twice_tells_nothing_of_the_noise():
+    level = NoiseLevel(1.0)
+    level.learn(0.0, 2.0, 0.5)
+    assert level.variance == 1.0
+
+
+def test_a_jump_counts_no_more_than_nine_times_the_noise_and_at_first_ninety_times():
+    level = NoiseLevel(1.0)
+    level.learn(1e6, 1.0, 0.0)
+    assert level.variance == pytest.approx((0.99 + 90.0) / 1.99)
+    for _ in range(1000):
+        level.learn(1.0, 1.0, 0.0)
+    before = level.variance
+    level.learn(1e6, 1.0, 0.0)
+    assert before == pytest.approx(1.0, rel=0.01)
+    assert level.variance == pytest.approx((99.0 * before + 9.0 * before) / 100.0, rel=0.01)
+
+
+def test_eight_times_the_noise_is_known_after_three_samples():
+    rng, known = np.random.default_rng(7), []
+    for _ in range(200):
+        level = NoiseLevel(0.001)
+        for _ in range(3):
+            nu = rng.normal(scale=np.sqrt(2.0) * 0.008, size=3)
+            level.learn(float(nu @ nu) / 3.0, 2.0, 0.0)
+        known.append(np.sqrt(level.variance))
+    assert 0.005 < np.median(known) < 0.011
+
+
+def test_a_feature_far_off_starts_the_filter_anew():
+    made = FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(2), find_noise=True)
+    made.advance(np.eye(2), np.zeros(2), np.array([0.3, 0.1]))
+    np.testing.assert_array_equal(made.feature, [0.3, 0.1])
+
+
+def test_the_shifted_reference_is_interpolated_and_goes_on():
+    reference = np.array([[0.0], [1.0], [4.0], [5.0]])
+    np.testing.assert_allclose(shifted(reference, 0.0, 2), [[0.0], [1.0]])
+    np.testing.assert_allclose(shifted(reference, 1.5, 2), [[2.5], [4.5]])
+    np.testing.assert_allclose(shifted(reference, 2.25, 3), [[4.25], [5.25], [6.25]])
+    np.testing.assert_allclose(shifted(reference[:1], 1.5, 1), [[0.0]])
+
+
+def test_the_second_joint_takes_over_where_the_first_is_at_its_limit():
+    """Both move the feature by 1 m/rad; (0.3, 0.1) wants 0.4 m, scaled to (0.1, 0.033); the second goes on to 0.1."""
+    dq = redistribute(np.array([0.3, 0.1]), np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9)
+    np.testing.assert_allclose(dq, [0.1, 0.1])
+    small = np.array([0.05, 0.1])
+    np.testing.assert_array_equal(redistribute(small, np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9), small)
+
+
+@settings(max_examples=60, deadline=None)
+@given(n=st.integers(1, 7), m=st.integers(1, 4), seed=st.integers(0, 10**6))
+def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, seed):
+    rng = np.random.default_rng(seed)
+    J, limit = rng.normal(size=(m, n)), rng.uniform(0.05, 0.2, n)
+    wanted = rng.normal(size=n)
+    dq, scaled = redistribute(wanted, J, limit, 1e-6), scale_to_limit(wanted, limit)
+    assert (np.abs(dq) <= limit * (1 + 1e-12)).all()
+    way = J @ wanted
+    if np.linalg.cond(J) < 100.0:
+        share = float((J @ dq) @ way / (way @ way))
+        np.testing.assert_allclose(J @ dq, share * way, atol=1e-5)
+        assert float((J @ scaled) @ way / (way @ way)) - 1e-6 <= share <= 1.0 + 1e-9
+
+
+def test_redistribution_goes_further_than_scaling_on_most_arms():
+    rng, further = np.random.default_rng(1), 0
+    for _ in range(50):
+        J, limit, wanted = rng.normal(size=(3, 6)), np.full(6, 0.05), rng.normal(size=6)
+        way = J @ wanted
+        gained = (J @ (redistribute(wanted, J, limit, 0.02) - scale_to_limit(wanted, limit))) @ way / (way @ way)
+        further += gained > 0.005
+    assert further > 40

@@ -1,0 +1,144 @@
+"""Tests of the providers of the first Jacobian, alone and inside a controller on the kinematic plant."""
+
+import numpy as np
+import pytest
+
+from servobench.controllers.composed import compose
+from servobench.controllers.controller import ControllerDiverged, RobotKnowledge
+from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.plant.signals import Command, Observation, PlantSpec
+
+START = np.array([0.35, -1.69, -2.34, 0.89, 1.22, 0.0])
+
+
+def spec(n=2, m=1, reach=1.0):
+    names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
+    return PlantSpec(*names, np.ones(n), np.full(n, -reach), np.full(n, reach), 0.05)
+
+
+def kinematic(**settings):
+    return KinematicPlant(KinematicConfig(**settings), PlantSetup(nominal_ur5(), START, 0.05))
+
+
+def probe(plant, seed=0, **settings):
+    """Run a provider on a plant until it is done."""
+    provider = initial_jacobian(InitialConfig(source="probe", **settings), RobotKnowledge(plant.spec, 0))
+    observation = plant.reset(seed)
+    provider.reset(observation)
+    periods = 0
+    while (u := provider.step(observation)) is not None:
+        assert (np.abs(u) <= plant.spec.joint_velocity_limit).all()
+        observation = plant.step(Command(u))
+        periods += 1
+    return provider.jacobian(), periods
+
+
+def test_probing_finds_the_true_jacobian_through_lag_delay_and_latency():
+    J, _ = probe(kinematic(feature_noise=0.0, latency_periods=1), probe_step=0.002)
+    np.testing.assert_allclose(J, nominal_ur5().jacobian(START), atol=0.006)
+
+
+def test_probing_through_default_noise_is_as_good_as_the_averaged_noise_allows():
+    truth = nominal_ur5().jacobian(START)
+    errors = [probe(kinematic(latency_periods=1), seed)[0] - truth for seed in range(20)]
+    # each column: √(2 / 3) mm of averaged noise over 0.03 rad = 0.027 m/rad an entry, besides the arm's curvature
+    assert np.sqrt(np.mean(np.square(errors))) < 0.04
+
+
+def test_probing_takes_the_periods_that_its_settings_tell():
+    config = InitialConfig(source="probe")
+    _, periods = probe(kinematic())
+    each = config.probe_periods + config.settle_periods + config.average_periods
+    assert periods == config.average_periods - 1 + 6 * each - 6
+
+
+def test_lost_frames_prolong_probing_and_do_no_harm():
+    J, periods = probe(kinematic(feature_noise=0.0, drop_probability=0.4), probe_step=0.002)
+    assert periods > probe(kinematic())[1]
+    np.testing.assert_allclose(J, nominal_ur5().jacobian(START), atol=0.006)
+
+
+def test_a_probing_move_turns_away_from_a_joint_limit():
+    provider = initial_jacobian(InitialConfig("probe", average_periods=1), RobotKnowledge(spec(), 0))
+    provider.reset(at := Observation(0.0, np.array([0.99, 0.0]), np.zeros(1)))
+    np.testing.assert_allclose(provider.step(at), [-0.3, 0.0])
+
+
+def test_a_joint_that_does_not_move_is_a_named_fault():
+    provider = initial_jacobian(InitialConfig("probe"), RobotKnowledge(spec(), 0))
+    observation = Observation(0.0, np.zeros(2), np.zeros(1))
+    provider.reset(observation)
+    while provider.step(observation) is not None:
+        pass
+    with pytest.raises(ControllerDiverged, match="moved the joints too little"):
+        provider.jacobian()
+
+
+def test_a_controller_says_that_it_probes_and_servoes_afterwards():
+    entry, plant = compose("mfac", "kalman"), kinematic()
+    controller = entry.build(entry.config(initial=InitialConfig(source="probe")), RobotKnowledge(plant.spec, 0))
+    observation = plant.reset(1)
+    controller.reset(observation, 1)
+    goal, probing = plant.truth().feature + 0.1, []
+    for _ in range(160):
+        observation = plant.step(controller.step(observation, goal[None, :]))
+        probing.append(controller.diagnostics()["probing"])
+    assert probing == sorted(probing, reverse=True)
+    assert sum(probing) == probe(kinematic())[1]
+    assert np.linalg.norm(plant.truth().feature - goal) < 0.005
+
+
+def test_the_nominal_model_is_evaluated_at_the_start():
+    knowledge = RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :])
+    provider = initial_jacobian(InitialConfig(), knowledge)
+    provider.reset(at := Observation(0.0, np.array([0.1, 0.3]), np.zeros(1)))
+    assert provider.step(at) is None
+    np.testing.assert_array_equal(provider.jacobian(), [[0.2, 0.6]])
+
+
+def test_a_nominal_model_of_another_robot_is_refused():
+    provider = initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: np.zeros((3, 6))))
+    with pytest.raises(ValueError, match=r"nominal_jacobian must return shape \(1, 2\), got \(3, 6\)"):
+        provider.reset(Observation(0.0, np.zeros(2), np.zeros(1)))
+
+
+def test_a_given_jacobian_is_taken_as_it_is():
+    provider = initial_jacobian(InitialConfig("given", given=((1.0, 2.0),)), RobotKnowledge(spec(), 0))
+    provider.reset(at := Observation(0.0, np.zeros(2), np.zeros(1)))
+    assert provider.step(at) is None
+    np.testing.assert_array_equal(provider.jacobian(), [[1.0, 2.0]])
+
+
+def test_the_nominal_source_without_a_model_tells_the_remedy():
+    with pytest.raises(ValueError, match=r"source 'nominal' needs a nominal model.*take 'probe' or 'given'"):
+        initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0))
+
+
+@pytest.mark.parametrize("given", [(), ((1.0,),), ((1.0, 2.0), (3.0,))])
+def test_a_given_jacobian_of_the_wrong_shape_is_refused(given):
+    with pytest.raises(ValueError, match="given must hold 1 rows of 2 entries"):
+        initial_jacobian(InitialConfig("given", given=given), RobotKnowledge(spec(), 0))
+
+
+def test_a_given_jacobian_must_be_finite():
+    with pytest.raises(ValueError, match="given must be finite"):
+        initial_jacobian(InitialConfig("given", given=((1.0, float("inf")),)), RobotKnowledge(spec(), 0))
+
+
+def test_a_probing_move_faster_than_a_joint_or_larger_than_its_range_is_refused():
+    with pytest.raises(ValueError, match=r"probe_step must be at most 0\.1 rad"):
+        initial_jacobian(InitialConfig("probe", probe_step=0.2), RobotKnowledge(spec(), 0))
+    with pytest.raises(ValueError, match="probe_step must be at most half the joint range"):
+        initial_jacobian(InitialConfig("probe"), RobotKnowledge(spec(reach=0.02), 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("source", "guess"), ("probe_step", 0.0), ("probe_periods", 0), ("settle_periods", -1), ("average_periods", 0)],
+)
+def test_a_setting_out_of_bounds_is_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        InitialConfig(**{name: value})

@@ -1,0 +1,399 @@
+import math
+from dataclasses import replace
+
+import casadi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers import ukf_mpc
+from servobench.controllers.controller import RobotKnowledge, SolverFailed
+from servobench.controllers.laws.mpc.closed_form import (
+    constant_step,
+    free_moves,
+    horizon_integrals,
+    move_weights,
+)
+from servobench.controllers.laws.mpc.limits import LimitedProgram
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
+from servobench.plant.signals import Observation, PlantSpec
+
+PERIOD = 0.05
+
+
+def make_spec(n=6, m=3, speed=1.0, reach=6.0):
+    return PlantSpec(
+        tuple(f"joint_{i}" for i in range(n)),
+        tuple(f"feature_{i}" for i in range(m)),
+        np.full(n, speed),
+        np.full(n, -reach),
+        np.full(n, reach),
+        PERIOD,
+    )
+
+
+def observe(spec, position=None, feature=None):
+    q = np.zeros(spec.n) if position is None else position
+    y = np.zeros(spec.m) if feature is None else feature
+    return Observation(0.0, q, y)
+
+
+def make_law(spec, preview=20, **settings):
+    return MpcLaw(MpcConfig(**settings), RobotKnowledge(spec, preview))
+
+
+def hold(target, preview=20):
+    return np.tile(np.asarray(target, dtype=float), (preview + 1, 1))
+
+
+def random_jacobian(seed, m=3, n=6):
+    return np.random.default_rng(seed).normal(scale=0.4, size=(m, n))
+
+
+def program(n=4, m=2, horizon=5, constant=False, acceleration=True, view=False, solver="daqp", seed=0):
+    rng = np.random.default_rng(seed)
+    shape = QpShape(
+        n=n,
+        m=m,
+        weights=move_weights(horizon, 0.9, 1.0),
+        move_weight=rng.uniform(0.05, 0.2, n),
+        constant_gain=40.0 if constant else None,
+        limit_acceleration=acceleration and not constant,
+        limit_position=True,
+        view_rows=rng.normal(size=(3, m)) if view else np.zeros((0, m)),
+    )
+    return QpProgram(shape, solver), shape
+
+
+def make_bounds(shape, move=1e3, change=1e3, travel=1e3, margin=-1e3):
+    return QpBounds(
+        move_lower=np.full((shape.moves, shape.n), -move),
+        move_upper=np.full((shape.moves, shape.n), move),
+        change=np.full(shape.n, change),
+        travel_lower=np.full(shape.n, -travel),
+        travel_upper=np.full(shape.n, travel),
+        view_margin=np.full(len(shape.view_rows), margin),
+    )
+
+
+def test_first_step_of_the_constant_mode_by_hand():
+    # One joint, J = 1, α = 1, H = 2: a = 8/3, b = 2, c = ∫ τ e^{−τ} dτ = 1 − 3 e^{−2}; with q = 1/3 dq = (b − c) e / 3.
+    spec = make_spec(1, 1, speed=10.0)
+    law = make_law(spec, mode="constant", horizon=2, rho=1.0, move_weight=1 / 3)
+    velocity = law.command(np.array([[1.0]]), observe(spec), hold([0.3]))
+    np.testing.assert_allclose(velocity, [(1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0 / PERIOD], rtol=1e-9)
+
+
+def test_first_step_of_free_moves_by_hand():
+    # H = 1, J = 2, q = 1, β = ½: min ½ (0.5·0.2 − 2 dq)² + ½ dq², so dq = 2·0.1 / (4 + 1) = 0.04.
+    spec = make_spec(1, 1)
+    law = make_law(spec, horizon=1, rho=math.log(2.0), move_weight=1.0)
+    velocity = law.command(np.array([[2.0]]), observe(spec), hold([0.2]))
+    np.testing.assert_allclose(velocity, [0.04 / PERIOD], rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("solver", ["daqp", "qpoases"])
+def test_constant_mode_without_active_limits_is_equation_46(seed, solver):
+    spec = make_spec(speed=1e3, reach=1e3)
+    law = make_law(spec, mode="constant", alpha=0.9, solver=solver, move_weight=0.5, use_preview=False)
+    J, e = random_jacobian(seed), np.random.default_rng(seed + 9).normal(scale=0.2, size=3)
+    abc = horizon_integrals(10, 0.9, MpcConfig.rho)
+    printed = np.linalg.pinv(abc.a * J + np.linalg.pinv(J.T) * 0.5) @ ((abc.b - abc.c) * e)
+    np.testing.assert_allclose(law.command(J, observe(spec), hold(e)) * PERIOD, printed, atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", ["daqp", "qpoases"])
+@pytest.mark.parametrize("seed", range(3))
+def test_program_without_active_limits_is_the_closed_form(solver, seed):
+    qp, shape = program(solver=solver, view=True, seed=seed)
+    J, targets = random_jacobian(seed, 2, 4), np.random.default_rng(seed).normal(size=(5, 2))
+    expected = free_moves(J, targets, shape.weights, shape.move_weight)
+    np.testing.assert_allclose(qp.solve(J, targets, make_bounds(shape)).moves, expected, atol=1e-8)
+
+    qp, shape = program(constant=True, solver=solver, seed=seed)
+    expected = constant_step(J, targets[0], 40.0, shape.move_weight)
+    np.testing.assert_allclose(qp.solve(J, targets[:1], make_bounds(shape)).moves[0], expected, atol=1e-8)
+
+
+def tight(shape):
+    return make_bounds(shape, move=0.3, change=0.12, travel=0.7, margin=-0.2)
+
+
+@pytest.mark.parametrize("solver", ["daqp", "qpoases"])
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("seed", range(4))
+def test_solution_with_active_limits_satisfies_the_kkt_conditions(solver, constant, seed):
+    qp, shape = program(solver=solver, constant=constant, view=True, seed=seed)
+    bounds = tight(shape)
+    J, targets = random_jacobian(seed, 2, 4), np.random.default_rng(seed).normal(size=(shape.moves, 2))
+    targets *= 40.0 if constant else 1.0
+    solution = qp.solve(J, targets, bounds)
+    assert solution.success
+
+    expressions = casadi.Function(
+        "expressions", [qp.x, qp.p], [casadi.gradient(qp.objective, qp.x), qp.rows, casadi.jacobian(qp.rows, qp.x)]
+    )
+    parameters = np.concatenate([J.ravel(order="F"), targets.ravel()])
+    gradient, rows, row_jacobian = (np.asarray(part) for part in expressions(solution.moves.ravel(), parameters))
+    stationarity = gradient[:, 0] + solution.bound_multiplier + row_jacobian.T @ solution.row_multiplier
+    np.testing.assert_allclose(stationarity, 0.0, atol=1e-8)
+
+    lower, upper = qp._row_bounds(bounds)
+    active = 0
+    for value, low, high, multiplier in (
+        (solution.moves.ravel(), bounds.move_lower.ravel(), bounds.move_upper.ravel(), solution.bound_multiplier),
+        (rows[:, 0], lower, upper, solution.row_multiplier),
+    ):
+        assert (value >= low - 1e-8).all()
+        assert (value <= high + 1e-8).all()
+        slack = np.where(multiplier > 0.0, high - value, value - low)
+        np.testing.assert_allclose(multiplier * np.where(multiplier == 0.0, 0.0, slack), 0.0, atol=1e-7)
+        active += np.count_nonzero(np.abs(multiplier) > 1e-6)
+    assert active > 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_daqp_equals_qpoases(seed):
+    J, targets = random_jacobian(seed, 2, 4), np.random.default_rng(seed).normal(size=(5, 2))
+    solutions = []
+    for solver in ("daqp", "qpoases"):
+        qp, shape = program(solver=solver, view=True, seed=seed)
+        solutions.append(qp.solve(J, targets, tight(shape)))
+    np.testing.assert_allclose(solutions[0].moves, solutions[1].moves, atol=1e-8)
+    assert solutions[0].objective == pytest.approx(solutions[1].objective, abs=1e-8)
+    assert math.isnan(solutions[0].iterations)
+    assert solutions[1].iterations > 0
+
+
+@pytest.mark.parametrize("constant", [False, True])
+@pytest.mark.parametrize("travel", [0.4, 1.4, 1.6])
+def test_position_rows_out_of_reach_change_nothing(constant, travel):
+    # Five moves of at most 0.3 rad reach 1.5 rad: a limit at 1.6 rad is left out, nearer ones are not.
+    qp, shape = program(constant=constant)
+    limited = LimitedProgram(shape, "daqp")
+    bounds = make_bounds(shape, move=0.3, travel=travel)
+    J, targets = random_jacobian(1, 2, 4), np.full((shape.moves, 2), 3.0 * (40.0 if constant else 1.0))
+    found = limited.solve(J, targets, bounds)
+    np.testing.assert_allclose(found.moves, qp.solve(J, targets, bounds).moves, atol=1e-9)
+    dropped = found.row_multiplier.size < qp.solve(J, targets, bounds).row_multiplier.size
+    assert dropped == (travel > 1.5)
+
+
+def test_the_preset_starts_as_the_law_on_the_nominal_jacobian():
+    J, spec = random_jacobian(5), make_spec()
+    knowledge = RobotKnowledge(spec, 20, nominal_jacobian=lambda q: J)
+    controller = ukf_mpc.ENTRY.build(ukf_mpc.UkfMpcConfig(), knowledge)
+    controller.reset(observe(spec), 0)
+    command = controller.step(observe(spec), hold([0.2, 0.1, -0.1]))
+    expected = make_law(spec).command(J, observe(spec), hold([0.2, 0.1, -0.1]))
+    np.testing.assert_array_equal(command.joint_velocity, expected)
+    assert controller.diagnostics()["solver_success"] == 1.0
+
+
+def test_solvers_print_nothing(capfd):
+    for solver in ("daqp", "qpoases"):
+        qp, shape = program(solver=solver)
+        qp.solve(random_jacobian(0, 2, 4), np.ones((5, 2)), tight(shape))
+        qp.reset()
+        qp.solve(random_jacobian(0, 2, 4), np.ones((5, 2)), tight(shape))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_moving_reference_is_met_with_the_feedforward_of_its_preview():
+    spec = make_spec(2, 2, speed=10.0)
+    ramp = np.outer(np.arange(21), [0.01, -0.02])
+    J = np.eye(2)
+    for mode in ("moves", "constant"):
+        law = make_law(spec, mode=mode, move_weight=1e-9)
+        np.testing.assert_allclose(law.command(J, observe(spec), ramp) * PERIOD, [0.01, -0.02], rtol=1e-6)
+    held = make_law(spec, preview=0, use_preview=False)
+    np.testing.assert_allclose(held.command(J, observe(spec), ramp[:1]), 0.0, atol=1e-12)
+
+
+def test_commands_already_sent_bridge_the_delay():
+    # A pure delay of two periods, exact J: with the bridge the error decays as β^τ from the first command on.
+    spec = make_spec(2, 2, speed=10.0)
+    law = make_law(spec, delay_periods=2, horizon=1, rho=0.5, move_weight=1e-9)
+    q, queue, errors = np.zeros(2), [np.zeros(2)] * 2, []
+    for _ in range(8):
+        errors.append(np.array([0.3, -0.2]) - q)
+        queue.append(law.command(np.eye(2), observe(spec, q, q), hold([0.3, -0.2])) * PERIOD)
+        q = q + queue.pop(0)
+    for k in range(2, 7):
+        np.testing.assert_allclose(errors[k + 1], np.exp(-0.5) * errors[k], rtol=1e-6)
+
+
+def test_acceleration_is_limited_between_commands():
+    spec = make_spec()
+    law = make_law(spec, joint_acceleration_limit=2.0)
+    J = random_jacobian(3)
+    last = np.zeros(6)
+    for target in ([0.5, 0.5, 0.5], [0.5, 0.5, 0.5], [-0.5, 0.5, 0.0], [-0.5, 0.0, 0.0]):
+        velocity = law.command(J, observe(spec), hold(target))
+        assert np.abs(velocity - last).max() <= 2.0 * PERIOD + 1e-8
+        last = velocity
+    assert law.diagnostics()["active_limits"] > 0
+    assert law.diagnostics()["fallbacks"] == 0
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+def test_position_limits_are_kept_and_an_arm_outside_may_return(mode):
+    spec = make_spec(1, 1, reach=1.0)
+    law = make_law(spec, mode=mode)
+    near = law.command(np.array([[1.0]]), observe(spec, np.array([0.99])), hold([5.0]))
+    assert 0.0 < near[0] <= 0.01 / PERIOD + 1e-7
+    outside = observe(spec, np.array([1.2]))
+    assert law.command(np.array([[1.0]]), outside, hold([5.0]))[0] == pytest.approx(0.0, abs=1e-7)
+    assert law.command(np.array([[1.0]]), outside, hold([-5.0]))[0] < -0.1
+    assert law.diagnostics()["solver_success"] == 1.0
+    free = make_law(spec, mode=mode, limit_position=False)
+    assert free.command(np.array([[1.0]]), outside, hold([5.0]))[0] > 0.1
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+def test_the_predicted_feature_stays_in_the_pyramid_of_view(mode):
+    spec = make_spec(3, 3)
+    settings = {"mode": mode, "view_tangent": (0.5, 0.4), "rho": 3.0, "horizon": 4}
+    law = make_law(spec, **settings)
+    y = np.array([0.46, 0.0, 1.0])
+    velocity = law.command(np.eye(3), observe(spec, feature=y), hold([0.9, 0.0, 1.0]))
+    reached = y + velocity * PERIOD
+    assert reached[0] <= 0.5 * reached[2] + 1e-8
+    assert law.diagnostics()["active_limits"] > 0
+    unlimited = make_law(spec, **{**settings, "view_tangent": ()})
+    reached = y + unlimited.command(np.eye(3), observe(spec, feature=y), hold([0.9, 0.0, 1.0])) * PERIOD
+    assert reached[0] > 0.5 * reached[2] + 1e-3 or mode == "constant"
+    back = law.command(np.eye(3), observe(spec, feature=[0.6, 0.0, 1.0]), hold([0.0, 0.0, 1.0]))
+    assert back[0] < 0.0
+
+
+def infeasible(fallback, mode="moves"):
+    """A joint at full speed right before its limit cannot brake in time at so low an acceleration."""
+    spec = make_spec(2, 2, reach=1.0)
+    config = {"fallback": fallback, "mode": mode, "joint_acceleration_limit": 0.5, "rho": 3.0, "horizon": 5}
+    law = make_law(spec, **config)
+    J = np.eye(2)
+    for _ in range(40):
+        law.command(J, observe(spec, [-0.9, 0.0], [-0.9, 0.0]), hold([5.0, 0.0]))
+    assert law.diagnostics()["fallbacks"] == 0
+    return law, J, observe(spec, [0.99, 0.0], [0.99, 0.0]), hold([5.0, 0.0])
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+def test_without_a_solution_the_arm_holds_and_it_is_counted(mode):
+    law, J, observation, reference = infeasible("hold", mode)
+    for count in (1, 1):
+        np.testing.assert_array_equal(law.command(J, observation, reference), 0.0)
+        diagnostics = law.diagnostics()
+        assert diagnostics["fallbacks"] == count
+        assert diagnostics["solver_success"] == 0.0
+        assert math.isnan(diagnostics["objective"])
+        law.reset(observation)
+        assert law.command(J, observation, reference).any()
+        law, J, observation, reference = infeasible("hold", mode)
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+def test_without_a_solution_the_closed_form_is_scaled_to_the_speed_limit(mode):
+    law, J, observation, reference = infeasible("closed_form", mode)
+    velocity = law.command(J, observation, reference)
+    assert law.diagnostics()["fallbacks"] == 1
+    assert velocity[0] == pytest.approx(1.0)  # 4 m away: the limit binds, the direction stays
+    assert abs(velocity[1]) < 1e-6
+
+
+def test_without_a_solution_and_fallback_it_is_a_named_failure():
+    law, J, observation, reference = infeasible("raise")
+    with pytest.raises(SolverFailed, match="daqp found no solution within the limits"):
+        law.command(J, observation, reference)
+    assert SolverFailed.status == "solver_failed"
+
+
+@pytest.mark.parametrize("solver", ["daqp", "qpoases"])
+def test_reset_forgets_everything_bit_for_bit(solver):
+    spec = make_spec()
+    law, fresh = (make_law(spec, solver=solver, joint_acceleration_limit=3.0, delay_periods=2) for _ in range(2))
+    for k in range(5):
+        law.command(random_jacobian(k), observe(spec), hold([1.0, k, -0.3]))
+    law.reset(observe(spec))
+    assert law.diagnostics() == {}
+    for k in range(5):
+        arguments = (random_jacobian(k + 9), observe(spec), hold([0.2, -0.1, 0.3 * k]))
+        np.testing.assert_array_equal(law.command(*arguments), fresh.command(*arguments))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    n=st.integers(2, 8), m=st.integers(1, 4), mode=st.sampled_from(["moves", "constant"]), seed=st.integers(0, 2**32)
+)
+def test_commands_are_finite_and_within_the_limits_for_any_size(n, m, mode, seed):
+    rng = np.random.default_rng(seed)
+    spec = make_spec(n, m, speed=float(rng.uniform(0.1, 3.0)))
+    law = make_law(spec, mode=mode, horizon=4, joint_acceleration_limit=8.0, fallback="closed_form")
+    scale = 10.0 ** rng.uniform(-6, 3)
+    for _ in range(3):
+        observation = observe(spec, rng.uniform(-7.0, 7.0, n), scale * rng.normal(size=m))
+        velocity = law.command(rng.normal(size=(m, n)), observation, scale * rng.normal(size=(21, m)))
+        assert np.isfinite(velocity).all()
+        assert (np.abs(velocity) <= spec.joint_velocity_limit).all()
+
+
+def test_a_jacobian_of_zeros_asks_for_nothing():
+    spec = make_spec()
+    for mode in ("moves", "constant"):
+        np.testing.assert_allclose(
+            make_law(spec, mode=mode).command(np.zeros((3, 6)), observe(spec), hold([1, 2, 3])), 0
+        )
+
+
+def test_diagnostics_tell_the_predicted_error_of_the_plan():
+    spec = make_spec(1, 1, speed=100.0)
+    law = make_law(spec, horizon=3, rho=0.4, move_weight=1e-10)
+    law.command(np.array([[1.0]]), observe(spec), hold([0.5]))
+    diagnostics = law.diagnostics()
+    assert diagnostics["predicted_terminal_error"] == pytest.approx(np.exp(-1.2) * 0.5, rel=1e-6)
+    assert diagnostics["objective"] == pytest.approx(0.0, abs=1e-9)
+    assert diagnostics["active_limits"] == 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+        ({"alpha": 0.0}, "alpha must be above 0 and at most 1, got 0.0"),
+        ({"alpha": 1.01}, "alpha must be above 0 and at most 1, got 1.01"),
+        ({"rho": 0.0}, "rho must be above 0, got 0.0"),
+        ({"move_weight": 0.0}, "move_weight must be above 0, got 0.0"),
+        ({"move_weight": math.nan}, "move_weight must be above 0, got nan"),
+        ({"joint_weight": (1.0, -1.0)}, "joint_weight must be above 0, got -1.0"),
+        ({"terminal_weight": -1.0}, "terminal_weight must be at least 0, got -1.0"),
+        ({"delay_periods": -1}, "delay_periods must be at least 0, got -1"),
+        ({"joint_acceleration_limit": 0.0}, "joint_acceleration_limit must be above 0, got 0.0"),
+        ({"joint_acceleration_limit": math.nan}, "joint_acceleration_limit must be above 0, got nan"),
+        ({"view_tangent": (0.5,)}, "view_tangent must be empty or"),
+        ({"view_tangent": (0.5, 0.0)}, "view_tangent must be above 0, got 0.0"),
+        ({"mode": "free"}, "mode must be one of moves, constant, got 'free'"),
+        ({"solver": "ipopt"}, "solver must be one of daqp, qpoases, got 'ipopt'"),
+        ({"fallback": "ignore"}, "fallback must be one of hold, closed_form, raise, got 'ignore'"),
+    ],
+)
+def test_a_bad_setting_is_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        MpcConfig(**settings)
+
+
+def test_settings_that_do_not_fit_the_plant_are_named():
+    config = MpcConfig()
+    with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 10, got 9"):
+        MpcLaw(config, RobotKnowledge(make_spec(), 9))
+    with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 13, got 10"):
+        MpcLaw(replace(config, delay_periods=3), RobotKnowledge(make_spec(), 10))
+    with pytest.raises(ValueError, match="view_tangent needs the 3 features x, y, z, got 2 features"):
+        MpcLaw(replace(config, view_tangent=(0.5, 0.5)), RobotKnowledge(make_spec(m=2), 10))
+    with pytest.raises(ValueError, match=r"joint_weight must have shape \(6,\), got \(2,\)"):
+        MpcLaw(replace(config, joint_weight=(1.0, 2.0)), RobotKnowledge(make_spec(), 10))
+    with pytest.raises(ValueError, match="solver must be one of daqp, qpoases, got 'osqp'"):
+        QpProgram(program()[1], "osqp")

@@ -1,0 +1,163 @@
+"""Tests of the two radial-basis networks against their formulas, plain loops and their own sizes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers.networks.rbf import (
+    ControllerNetwork,
+    JacobianNetwork,
+    LatestFeatures,
+    controller_output,
+    hidden_features,
+    information_vector,
+    jacobian_features,
+)
+
+
+def jacobian_network(n=3, m=2, units=5, seed=0):
+    rng = np.random.default_rng(seed)
+    return JacobianNetwork(
+        rng.normal(size=(n, units, n)), rng.uniform(0.5, 2.0, (n, units)), rng.normal(size=(n, m, units))
+    )
+
+
+def controller_network(n=3, m=2, hidden=5, error_history=2, position_history=1, kernel="exponential", seed=0):
+    rng, p = np.random.default_rng(seed), m * error_history + n * position_history
+    centres, widths, weights = (
+        rng.normal(size=(hidden, p)),
+        rng.uniform(1.0, 2.0, hidden),
+        rng.normal(size=(n, p, hidden)),
+    )
+    return ControllerNetwork(centres, widths, weights, error_history, position_history, kernel)
+
+
+def test_the_jacobian_equals_a_plain_loop_over_columns_and_units():
+    network, q = jacobian_network(), np.array([0.3, -0.2, 0.9])
+    J = np.zeros((2, 3))
+    for i in range(3):
+        for unit in range(5):
+            distance = np.linalg.norm(q - network.centres[i, unit])
+            theta = np.exp(-((distance / network.widths[i, unit]) ** 2))
+            J[:, i] += network.weights[i, :, unit] * theta
+    np.testing.assert_allclose(network.jacobian(q), J, atol=1e-12)
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("shape", [(), (4, 2)])
+def test_the_quick_features_of_the_jacobian_network_are_those_of_the_plain_formula(shared, shape):
+    network = jacobian_network(units=20)
+    if shared:
+        centres = np.broadcast_to(network.centres[0], network.centres.shape)
+        network = JacobianNetwork(centres, network.widths, network.weights)
+    for q in (np.random.default_rng(4).normal(scale=3.0, size=(*shape, 3)), np.full((*shape, 3), 1e3)):
+        plain = jacobian_features(q, network.centres, network.widths)
+        np.testing.assert_allclose(network.features(q), plain, rtol=1e-12)
+    np.testing.assert_array_equal(network.features(network.centres[1, 2])[1, 2], 1.0)
+
+
+@pytest.mark.parametrize("kernel", ["exponential", "gaussian"])
+@pytest.mark.parametrize("shape", [(), (4, 2)])
+def test_the_quick_features_of_the_controller_network_are_those_of_the_plain_formula(kernel, shape):
+    network = controller_network(hidden=20, kernel=kernel)
+    for xi in (np.random.default_rng(4).normal(scale=3.0, size=(*shape, 7)), np.full((*shape, 7), 1e3)):
+        plain = hidden_features(xi, network.centres, network.widths, kernel)
+        np.testing.assert_allclose(network.features(xi), plain, rtol=1e-12)
+    np.testing.assert_array_equal(network.features(network.centres[3])[3], 1.0)
+
+
+def test_the_latest_features_are_those_of_the_position_asked_for():
+    network, (first, second) = jacobian_network(), np.random.default_rng(5).normal(size=(2, 3))
+    latest = LatestFeatures(network)
+    for q in (first, first, second, first):
+        np.testing.assert_array_equal(latest.at(q), network.features(q))
+    q = first.copy()
+    latest.at(q)
+    q[0] += 1.0
+    np.testing.assert_array_equal(latest.at(q), network.features(q))
+
+
+def test_many_joint_positions_at_once_give_what_each_gives_alone():
+    network, q = jacobian_network(), np.random.default_rng(1).normal(size=(4, 2, 3))
+    together = network.jacobian(q)
+    assert together.shape == (4, 2, 2, 3)
+    np.testing.assert_allclose(together[3, 1], network.jacobian(q[3, 1]), atol=1e-14)
+
+
+@pytest.mark.parametrize(("kernel", "power"), [("exponential", 1), ("gaussian", 2)])
+def test_the_controller_equals_a_plain_loop_with_the_norm_squared_only_on_request(kernel, power):
+    network, xi = controller_network(kernel=kernel), np.random.default_rng(2).normal(size=7)
+    q = np.zeros(3)
+    for j in range(7):
+        for unit in range(5):
+            distance = np.linalg.norm(xi - network.centres[unit])
+            q += network.weights[:, j, unit] * np.exp(-(distance**power) / network.widths[unit] ** 2) * xi[j]
+    np.testing.assert_allclose(network.command(xi), q, atol=1e-12)
+
+
+def test_the_information_vector_holds_the_errors_first_and_the_newest_of_each_first():
+    xi = information_vector(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[5.0, 6.0, 7.0]]))
+    np.testing.assert_array_equal(xi, [1, 2, 3, 4, 5, 6, 7])
+
+
+@settings(max_examples=50, deadline=None, derandomize=True)
+@given(n=st.integers(2, 8), m=st.integers(1, 4), scale=st.floats(1e-6, 1e9))
+def test_features_lie_between_zero_and_one_at_any_distance(n, m, scale):
+    network, controller = jacobian_network(n, m), controller_network(n, m)
+    q = np.full(n, scale)
+    theta = jacobian_features(q, network.centres, network.widths)
+    h = controller.features(np.full(2 * m + n, scale))
+    assert ((theta > 0.0) & (theta <= 1.0)).all()
+    assert ((h > 0.0) & (h <= 1.0)).all()
+    assert network.jacobian(q).shape == (m, n)
+    assert (controller.n, controller.m) == (n, m)
+
+
+def test_a_unit_is_one_at_its_centre():
+    centres = np.array([[0.5, 1.0], [2.0, 2.0]])
+    assert hidden_features(centres[0], centres, np.ones(2), "exponential")[0] == 1.0
+
+
+def test_a_batch_of_commands_equals_single_commands():
+    network, xi = controller_network(), np.random.default_rng(3).normal(size=(6, 7))
+    h = network.features(xi)
+    np.testing.assert_allclose(controller_output(network.weights, xi, h)[4], network.command(xi[4]), atol=1e-14)
+
+
+def test_networks_are_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        jacobian_network().weights[0, 0, 0] = 1.0
+
+
+def test_arrays_that_do_not_fit_together_are_refused():
+    good = jacobian_network()
+    with pytest.raises(ValueError, match=r"centres must have shape \(3, 5, 3\), got \(3, 5, 2\)"):
+        JacobianNetwork(good.centres[:, :, :2], good.widths, good.weights)
+    with pytest.raises(ValueError, match=r"weights must have shape \(3, 2, 5\)"):
+        JacobianNetwork(good.centres, good.widths, good.weights[:, :, :4])
+    with pytest.raises(ValueError, match=r"widths must have shape \(3, 5\)"):
+        JacobianNetwork(good.centres, good.widths[:, :4], good.weights)
+    with pytest.raises(ValueError, match="widths must be positive"):
+        JacobianNetwork(good.centres, 0.0 * good.widths, good.weights)
+    with pytest.raises(ValueError, match="weights of a network must be finite"):
+        JacobianNetwork(good.centres, good.widths, good.weights * np.nan)
+    with pytest.raises(ValueError, match="centres and weights must be"):
+        JacobianNetwork(good.centres[0], good.widths, good.weights)
+
+
+def test_controller_networks_that_do_not_fit_their_histories_are_refused():
+    good = controller_network()
+    parts = good.centres, good.widths, good.weights
+    with pytest.raises(ValueError, match=r"weights must have m L_e \+ n L_c columns"):
+        ControllerNetwork(*parts, 3, 1)
+    with pytest.raises(ValueError, match="weights must have m L_e"):
+        ControllerNetwork(*parts, 0, 1)
+    with pytest.raises(ValueError, match="kernel must be one of exponential, gaussian, got 'cubic'"):
+        ControllerNetwork(*parts, 2, 1, "cubic")
+    with pytest.raises(ValueError, match=r"centres must have shape \(5, 7\)"):
+        ControllerNetwork(good.centres[:, :5], good.widths, good.weights, 2, 1)
+    with pytest.raises(ValueError, match=r"weights must be \(n, p, N_h\)"):
+        ControllerNetwork(good.centres, good.widths, good.weights[0], 2, 1)
+    with pytest.raises(ValueError, match="widths must be positive"):
+        ControllerNetwork(good.centres, -good.widths, good.weights, 2, 1)

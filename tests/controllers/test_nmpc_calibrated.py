@@ -1,0 +1,219 @@
+import math
+
+import casadi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers.controller import RobotKnowledge, SolverFailed
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.controllers.nmpc_calibrated import ENTRY, NmpcCalibrated, NmpcCalibratedConfig
+from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.symbolic import symbolic_feature
+from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.plant.signals import Observation, PlantSpec
+
+MODEL = nominal_ur5()
+SYMBOLIC = symbolic_feature(MODEL)
+SPEC = hand_eye_spec(MODEL, 0.05, 1.0, 2 * np.pi)
+START = np.array([2.79, -1.45, 2.34, 2.25, -1.22, -0.19])
+
+
+def knowledge(spec=SPEC, symbolic=SYMBOLIC, preview=12):
+    return RobotKnowledge(spec, preview, true_symbolic=symbolic)
+
+
+def make(**changes):
+    return NmpcCalibrated(NmpcCalibratedConfig(**changes), knowledge())
+
+
+def small_spec(n, m, speed=1.0, reach=6.0):
+    names = [tuple(f"{word}_{i}" for i in range(size)) for word, size in (("joint", n), ("feature", m))]
+    return PlantSpec(*names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), 0.05)
+
+
+def hold(target, preview=12):
+    return np.tile(np.asarray(target, dtype=float), (preview + 1, 1))
+
+
+def test_first_step_by_hand():
+    # h(q) = sin q at q = 0, H = 1, β = ½, q = 1e-9: sin(dq) = ½·0.4, so dq = asin 0.2.
+    config = NmpcCalibratedConfig(horizon=1, delay_periods=0, rho=math.log(2.0), move_weight=1e-9, iterations=20)
+    controller = NmpcCalibrated(config, knowledge(small_spec(1, 1, speed=10.0), casadi.sin))
+    command = controller.step(Observation(0.0, [0.0], [0.0]), hold([0.4]))
+    np.testing.assert_allclose(command.joint_velocity * 0.05, [math.asin(0.2)], rtol=1e-7)
+
+
+def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
+    rng = np.random.default_rng(0)
+    J, offset = rng.normal(size=(2, 4)), rng.normal(size=2)
+    spec = small_spec(4, 2)
+    common = {"horizon": 6, "rho": 0.4, "move_weight": 0.05, "delay_periods": 2, "joint_acceleration_limit": 8.0}
+    law = MpcLaw(MpcConfig(**common), RobotKnowledge(spec, 12))
+    controller = NmpcCalibrated(
+        NmpcCalibratedConfig(**common), knowledge(spec, lambda q: casadi.DM(J) @ q + casadi.DM(offset))
+    )
+    q = np.zeros(4)
+    for k in range(10):
+        reference = offset + rng.normal(scale=0.02, size=(13, 2)) + [0.3, -0.2]
+        observation = Observation(0.05 * k, q, J @ q + offset)
+        linear = law.command(J, observation, reference)
+        np.testing.assert_allclose(controller.step(observation, reference).joint_velocity, linear, atol=1e-7)
+        q = q + 0.05 * linear
+
+
+def test_the_plan_minimises_the_nonlinear_criterion():
+    config = NmpcCalibratedConfig(horizon=4, delay_periods=0, move_weight=0.01, iterations=50)
+    controller = NmpcCalibrated(config, knowledge())
+    y = MODEL.feature(START)
+    reference = y + np.linspace(0.0, 1.0, 13)[:, None] * [0.1, -0.08, 0.05]
+    command = controller.step(Observation(0.0, START, y), reference)
+    assert controller.diagnostics()["plan_change"] < 1e-8
+
+    dq = casadi.SX.sym("dq", 6, 4)
+    feature = symbolic_feature(MODEL)
+    cost = 0.005 * casadi.sumsqr(dq)
+    for t in range(1, 5):
+        error = reference[t] - np.exp(-config.rho * t) * (reference[0] - y)
+        cost += 0.5 * casadi.sumsqr(casadi.DM(error) - feature(START + casadi.sum2(dq[:, :t])))
+    quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-12}}
+    solver = casadi.nlpsol("oracle", "ipopt", {"x": casadi.vec(dq), "f": cost}, quiet)
+    best = np.asarray(solver(x0=np.zeros(24), lbx=-0.05, ubx=0.05)["x"])[:6, 0]
+    np.testing.assert_allclose(command.joint_velocity * 0.05, best, atol=1e-5)
+
+
+def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
+    plant = KinematicPlant(KinematicConfig(), PlantSetup(MODEL, START, 0.05))
+    controller = NmpcCalibrated(NmpcCalibratedConfig(), knowledge())
+    angle = 2 * np.pi * np.arange(110) / 200
+    path = MODEL.feature(START) + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros_like(angle)], axis=-1)
+    observation = plant.reset(0)
+    controller.reset(observation, 0)
+    errors = []
+    for k in range(90):
+        errors.append(np.linalg.norm(path[k] - plant.truth().feature))
+        observation = plant.step(controller.step(observation, path[k : k + 13]))
+    assert errors[0] > 0.1
+    assert max(errors[40:]) < 1e-3
+    assert controller.diagnostics()["fallbacks"] == 0
+
+
+def test_a_disturbance_of_the_camera_is_followed_only_with_a_gain():
+    y = MODEL.feature(START)
+    shifted = Observation(0.0, START, y + np.array([0.01, 0.0, 0.0]))
+    for gain, moves in ((0.0, False), (1.0, True)):
+        command = make(disturbance_gain=gain).step(shifted, hold(y))
+        assert (np.abs(command.joint_velocity).max() > 1e-3) == moves
+    lost = Observation(0.0, START, y + np.array([0.01, 0.0, 0.0]), feature_valid=False)
+    assert np.abs(make(disturbance_gain=1.0).step(lost, hold(y)).joint_velocity).max() < 1e-6
+
+
+def infeasible(fallback):
+    """A joint at full speed right before its limit cannot brake in time at so low an acceleration."""
+    spec = small_spec(1, 1, reach=1.0)
+    config = NmpcCalibratedConfig(delay_periods=0, joint_acceleration_limit=0.5, fallback=fallback)
+    controller = NmpcCalibrated(config, knowledge(spec, lambda q: 1.0 * q))
+    for _ in range(40):
+        controller.step(Observation(0.0, [-0.9], [-0.9]), hold([5.0]))
+    assert controller.diagnostics()["fallbacks"] == 0
+    return controller, Observation(0.0, [0.99], [0.99])
+
+
+def test_without_a_solution_the_arm_holds_and_it_is_counted():
+    controller, observation = infeasible("hold")
+    np.testing.assert_array_equal(controller.step(observation, hold([5.0])).joint_velocity, 0.0)
+    diagnostics = controller.diagnostics()
+    assert diagnostics["fallbacks"] == 1
+    assert diagnostics["solver_success"] == 0.0
+
+
+def test_without_a_solution_and_fallback_it_is_a_named_failure():
+    controller, observation = infeasible("raise")
+    with pytest.raises(SolverFailed, match="daqp found no solution within the limits"):
+        controller.step(observation, hold([5.0]))
+
+
+def test_reset_forgets_everything_bit_for_bit():
+    used, fresh = (make(joint_acceleration_limit=5.0, disturbance_gain=0.1) for _ in range(2))
+    y = MODEL.feature(START)
+    for k in range(4):
+        used.step(Observation(0.0, START + 0.1 * k, y), hold(y + np.array([0.3, 0.1 * k, 0.0])))
+    used.reset(Observation(0.0, START, y), 1)
+    assert used.diagnostics() == {}
+    assert used.estimated_jacobian() is None
+    for k in range(4):
+        observation = Observation(0.0, START + 0.01 * k, y)
+        commands = [c.step(observation, hold(y + np.array([0.1, 0.0, -0.1]))).joint_velocity for c in (used, fresh)]
+        np.testing.assert_array_equal(*commands)
+    np.testing.assert_allclose(used.estimated_jacobian(), MODEL.jacobian(START + 0.03), atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 2**32))
+def test_commands_are_finite_and_within_the_limits_for_any_size(n, m, seed):
+    rng = np.random.default_rng(seed)
+    A, B = (casadi.DM(rng.normal(size=(m, n))) for _ in range(2))
+    spec = small_spec(n, m, speed=float(rng.uniform(0.1, 3.0)))
+    config = NmpcCalibratedConfig(horizon=3, iterations=2, joint_acceleration_limit=8.0)
+    controller = NmpcCalibrated(config, knowledge(spec, lambda q: A @ casadi.sin(q) + B @ casadi.cos(q)))
+    for _ in range(3):
+        observation = Observation(0.0, rng.uniform(-7.0, 7.0, n), rng.normal(size=m))
+        velocity = controller.step(observation, 10.0 ** rng.uniform(-3, 3) * rng.normal(size=(13, m))).joint_velocity
+        assert np.isfinite(velocity).all()
+        assert (np.abs(velocity) <= spec.joint_velocity_limit).all()
+
+
+def test_its_entry_asks_for_the_truth():
+    assert ENTRY.needs_truth
+    assert isinstance(ENTRY.build(ENTRY.config(), knowledge()), NmpcCalibrated)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"horizon": 0}, "horizon must be at least 1, got 0"),
+        ({"delay_periods": -1}, "delay_periods must be at least 0, got -1"),
+        ({"rho": 0.0}, "rho must be above 0, got 0.0"),
+        ({"move_weight": 0.0}, "move_weight must be above 0, got 0.0"),
+        ({"terminal_weight": -1.0}, "terminal_weight must be at least 0, got -1.0"),
+        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"disturbance_gain": 1.5}, "disturbance_gain must be at least 0 and at most 1, got 1.5"),
+        ({"joint_acceleration_limit": -1.0}, "joint_acceleration_limit must be above 0, got -1.0"),
+        ({"solver": "ipopt"}, "solver must be one of daqp, qpoases, got 'ipopt'"),
+        ({"fallback": "closed_form"}, "fallback must be one of hold, raise, got 'closed_form'"),
+    ],
+)
+def test_a_bad_setting_is_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        NmpcCalibratedConfig(**changes)
+
+
+def test_knowledge_that_does_not_suffice_is_named():
+    config = NmpcCalibratedConfig()
+    with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 10, got 9"):
+        NmpcCalibrated(config, knowledge(preview=9))
+    with pytest.raises(ValueError, match="true_symbolic must be known for nmpc_calibrated"):
+        NmpcCalibrated(config, knowledge(symbolic=None))
+    with pytest.raises(ValueError, match=r"true_symbolic must give an expression of shape \(3, 1\), got \(6, 1\)"):
+        NmpcCalibrated(config, knowledge(symbolic=lambda q: q))
+
+
+@pytest.mark.parametrize(
+    ("observation", "reference", "message"),
+    [
+        (Observation(0.0, np.zeros(5), np.zeros(3)), hold(np.zeros(3)), "observation.joint_position must have shape"),
+        (Observation(0.0, START, np.zeros(2)), hold(np.zeros(3)), "observation.feature must have shape"),
+        (
+            Observation(0.0, START, np.zeros(3)),
+            hold(np.zeros(3), 3),
+            r"reference must have shape \(13, 3\), got \(4, 3\)",
+        ),
+        (Observation(0.0, START, np.zeros(3)), hold([0.0, np.nan, 0.0]), "reference must be finite"),
+    ],
+)
+def test_a_step_with_the_wrong_size_is_refused(observation, reference, message):
+    with pytest.raises(ValueError, match=message):
+        make().step(observation, reference)

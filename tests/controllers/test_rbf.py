@@ -1,0 +1,187 @@
+"""Tests of the windowed estimator: automatic differentiation, plain loops, hand arithmetic and the Lyapunov proof."""
+
+import casadi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers.estimators.estimator import Motion
+from servobench.controllers.estimators.rbf import (
+    RbfConfig,
+    RbfEstimator,
+    window_gradient,
+    window_step,
+)
+from servobench.controllers.networks.rbf import JacobianNetwork, jacobian_features
+
+
+def network(n=3, m=2, units=4, seed=0):
+    rng = np.random.default_rng(seed)
+    return JacobianNetwork(
+        rng.normal(size=(n, units, n)), rng.uniform(1.0, 2.0, (n, units)), rng.normal(size=(n, m, units))
+    )
+
+
+def motion(q, dq, dy, duration=0.05):
+    return Motion(np.asarray(q), np.asarray(dq), np.asarray(dy), np.zeros(len(dy)), duration)
+
+
+def as_matrix(weights):
+    """Return [W_1 … W_n], (m, n L), of weights (n, m, L)."""
+    return np.concatenate(weights, axis=1)
+
+
+def moved_by(theta, dq):
+    """Return μ_t, (T, n L)."""
+    return np.array([np.concatenate([dq[t, i] * theta[t, i] for i in range(len(dq[t]))]) for t in range(len(dq))])
+
+
+def squares(theta, dq):
+    """Return the mean of ‖θ_i(q_t)‖² over the columns and ‖μ_t‖² of each motion."""
+    sizes = (theta**2).sum(axis=2)
+    return list(zip(sizes.mean(axis=1), (dq**2 * sizes).sum(axis=1), strict=True))
+
+
+def window(net, count, seed=1):
+    rng = np.random.default_rng(seed)
+    q, dq, dy = rng.normal(size=(count, net.n)), rng.normal(size=(count, net.n)), rng.normal(size=(count, net.m))
+    return jacobian_features(q, net.centres, net.widths), dq, dy
+
+
+def test_the_gradient_is_that_of_automatic_differentiation():
+    net = network()
+    theta, dq, dy = window(net, 5)
+    n, m, units = net.weights.shape
+    W = casadi.SX.sym("W", n * m * units)
+    Q = 0
+    for t in range(5):
+        predicted = sum(
+            casadi.reshape(W[i * m * units : (i + 1) * m * units], units, m).T @ casadi.DM(theta[t, i]) * dq[t, i]
+            for i in range(n)
+        )
+        Q += casadi.sumsqr(casadi.DM(dy[t]) - predicted)
+    expected = casadi.Function("g", [W], [casadi.gradient(Q, W)])(net.weights.ravel())
+    gradient, _ = window_gradient(as_matrix(net.weights), moved_by(theta, dq), dy)
+    np.testing.assert_allclose(-2.0 * gradient, as_matrix(np.asarray(expected).reshape(n, m, units)), atol=1e-12)
+
+
+def test_matrices_and_plain_loops_give_the_same_update():
+    net, config = network(), RbfConfig(window=3, k2=0.7, epsilon=0.01)
+    theta, dq, dy = window(net, 3)
+    gradient, size, norms = np.zeros(net.weights.shape), 0.0, []
+    for t in range(3):
+        J = np.column_stack([net.weights[i] @ theta[t, i] for i in range(net.n)])
+        for i in range(net.n):
+            size += dq[t, i] ** 2 * theta[t, i] @ theta[t, i]
+            norms.append(theta[t, i] @ theta[t, i])
+            for unit in range(4):
+                gradient[i, :, unit] += (dy[t] - J @ dq[t]) * dq[t, i] * theta[t, i, unit]
+    moved = moved_by(theta, dq)
+    matrix, _ = window_gradient(as_matrix(net.weights), moved, dy)
+    np.testing.assert_allclose(matrix, as_matrix(gradient), atol=1e-12)
+    step = window_step(squares(theta, dq), config.k2, config.epsilon)
+    assert step == pytest.approx(0.7 / (0.01 * np.mean(norms) + size), rel=1e-12)
+
+
+def test_the_first_update_equals_the_one_computed_by_hand():
+    net = JacobianNetwork(np.zeros((1, 1, 1)), np.ones((1, 1)), np.full((1, 1, 1), 2.0))
+    estimator = RbfEstimator(RbfConfig(window=4, k2=0.5, epsilon=0.01), net)
+    # θ(0) = 1, Ĵ = 2, error 0.5 − 2 · 0.1 = 0.3, α₂ = 0.5 / (0.01 + 0.01) = 25, W = 2 + 25 · 0.3 · 0.1
+    estimator.update(motion([0.0], [0.1], [0.5]))
+    np.testing.assert_allclose(estimator.weights, [[[2.75]]], atol=1e-14)
+    np.testing.assert_allclose(estimator.jacobian(np.zeros(1)), [[2.75]], atol=1e-14)
+    assert estimator.diagnostics()["estimator_step_size"] == pytest.approx(25.0)
+    assert estimator.diagnostics()["window_error"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("k2", [0.1, 1.0, 1.9])
+def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
+    true, rng = network(seed=5), np.random.default_rng(6)
+    start = JacobianNetwork(true.centres, true.widths, true.weights + rng.normal(size=true.weights.shape))
+    estimator = RbfEstimator(RbfConfig(window=1, k2=k2, epsilon=0.0), start)
+    V = np.sum((estimator.weights - true.weights) ** 2)
+    first = V
+    for _ in range(200):
+        q, dq = rng.normal(size=3), rng.normal(size=3)
+        estimator.update(motion(q, dq, true.jacobian(q) @ dq))
+        V, before = np.sum((estimator.weights - true.weights) ** 2), V
+        assert before * (1 + 1e-12) >= V
+    assert first * 0.9 > V
+
+
+def test_beyond_a_step_size_of_two_the_weights_do_move_away():
+    true, rng = network(seed=5), np.random.default_rng(6)
+    weights = true.weights + rng.normal(size=true.weights.shape)
+    q, dq = rng.normal(size=3), rng.normal(size=3)
+    theta = jacobian_features(q, true.centres, true.widths)[None]
+    row, W, W_true = moved_by(theta, dq[None]), as_matrix(weights), as_matrix(true.weights)
+    gradient, _ = window_gradient(W, row, (true.jacobian(q) @ dq)[None])
+    after = W + window_step(squares(theta, dq[None]), 2.1, 0.0) * gradient
+    assert np.sum((after - W_true) ** 2) > np.sum((W - W_true) ** 2)
+
+
+def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
+    moved = []
+    for epsilon in (0.0, 1e-3):
+        estimator = RbfEstimator(RbfConfig(epsilon=epsilon), network())
+        rng = np.random.default_rng(8)
+        for _ in range(30):
+            estimator.update(motion(np.zeros(3), 1e-5 * rng.normal(size=3), 1e-3 * rng.normal(size=2)))
+        moved.append(np.linalg.norm(estimator.weights - network().weights))
+    assert moved[1] < 1e-3 * moved[0]
+
+
+def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
+    estimator = RbfEstimator(RbfConfig(epsilon=0.0), network())
+    estimator.update(motion(np.zeros(3), np.zeros(3), [1e-3, 0.0]))
+    np.testing.assert_array_equal(estimator.weights, network().weights)
+
+
+def test_only_the_last_motions_of_the_window_count():
+    net, rng = network(), np.random.default_rng(9)
+    motions = [motion(rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)) for _ in range(5)]
+    estimator = RbfEstimator(RbfConfig(window=2), net)
+    for each in motions[:-1]:
+        estimator.update(each)
+    weights = estimator.weights
+    estimator.update(motions[-1])
+    theta = np.array([jacobian_features(each.joint_position, net.centres, net.widths) for each in motions[-2:]])
+    dq, dy = (np.array([getattr(each, name) for each in motions[-2:]]) for name in ("joint_step", "feature_step"))
+    moved = moved_by(theta, dq)
+    gradient, _ = window_gradient(as_matrix(weights), moved, dy)
+    expected = as_matrix(weights) + window_step(squares(theta, dq), 0.5, 1e-3) * gradient
+    np.testing.assert_allclose(as_matrix(estimator.weights), expected, atol=1e-13)
+
+
+def test_reset_restores_the_offline_network_whatever_the_initial_jacobian():
+    net = network()
+    estimator = RbfEstimator(RbfConfig(), net)
+    estimator.update(motion(np.zeros(3), np.ones(3), np.ones(2)))
+    estimator.reset(np.full((2, 3), 7.0))
+    np.testing.assert_array_equal(estimator.weights, net.weights)
+    assert estimator.diagnostics()["estimator_step_size"] == 0.0
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-6, 3))
+def test_the_jacobian_stays_finite_for_any_sizes_and_motions(n, m, seed, exponent):
+    estimator, rng = RbfEstimator(RbfConfig(), network(n, m, seed=seed)), np.random.default_rng(seed)
+    scale = 10.0**exponent
+    for _ in range(12):
+        estimator.update(motion(rng.normal(size=n), scale * rng.normal(size=n), rng.normal(size=m)))
+    J = estimator.jacobian(rng.normal(size=n))
+    assert J.shape == (m, n)
+    assert np.isfinite(J).all()
+
+
+def test_bad_settings_and_sizes_are_refused():
+    for k2 in (0.0, 2.0, float("nan")):
+        with pytest.raises(ValueError, match="k2 must be above 0 and below 2"):
+            RbfConfig(k2=k2)
+    with pytest.raises(ValueError, match="window must be at least 1, got 0"):
+        RbfConfig(window=0)
+    with pytest.raises(ValueError, match="epsilon must be at least 0"):
+        RbfConfig(epsilon=-1e-9)
+    with pytest.raises(ValueError, match=r"jacobian must have shape \(2, 3\), got \(3, 6\)"):
+        RbfEstimator(RbfConfig(), network()).reset(np.zeros((3, 6)))

@@ -1,0 +1,285 @@
+"""Tests of the proposed law: automatic differentiation, contraction, plain loops, a step by hand and refusals."""
+
+import casadi
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.laws.law import scale_to_limit
+from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from servobench.controllers.laws.roll_out import (
+    RollOut,
+    descent_direction,
+    roll_out,
+    update_step,
+)
+from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
+from servobench.plant.signals import Observation, PlantSpec
+
+PREVIEW, PERIOD = 10, 0.05
+
+
+def network(n=3, m=2, hidden=4, error_history=1, position_history=1, seed=0):
+    """A network whose output stays near the newest joint position: ψ = [small, I, 0] plus small random weights."""
+    rng, p = np.random.default_rng(seed), m * error_history + n * position_history
+    centres, widths = rng.normal(size=(hidden, p)), rng.uniform(2.0, 3.0, hidden)
+    weights = 0.02 * rng.normal(size=(n, p, hidden))
+    start = m * error_history
+    weights[:, start : start + n, :] += np.eye(n)[:, :, None] / hidden
+    return ControllerNetwork(centres, widths, weights, error_history, position_history)
+
+
+def knowledge(n=3, m=2, limit=1e6, preview=PREVIEW):
+    names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
+    return RobotKnowledge(PlantSpec(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), PERIOD), preview)
+
+
+def law(net, limit=1e6, preview=PREVIEW, **config):
+    made = RbfnnLaw(RbfnnConfig(**config), net, knowledge(net.n, net.m, limit, preview))
+    made.reset(seen(np.zeros(net.n), np.zeros(net.m)))
+    return made
+
+
+def seen(q, y, valid=True):
+    return Observation(0.0, np.asarray(q, dtype=float), np.asarray(y, dtype=float), valid)
+
+
+def case(net, seed=1, horizon=4, limit=1e6):
+    """Return a random roll-out: Jacobian, histories, reference steps and what came out."""
+    rng = np.random.default_rng(seed)
+    J = rng.normal(size=(net.m, net.n))
+    history = rng.normal(size=(net.error_history, net.m)), rng.normal(size=(net.position_history, net.n))
+    steps = 0.1 * rng.normal(size=(horizon, net.m))
+    ahead = roll_out(net, net.weights, J, history, steps, np.full(net.n, limit))
+    return J, history, steps, ahead
+
+
+@pytest.mark.parametrize(("error_history", "position_history"), [(1, 1), (2, 2), (3, 1), (1, 3)])
+@pytest.mark.parametrize("limit", [1e6, 0.02])
+def test_the_roll_out_equals_a_plain_loop(error_history, position_history, limit):
+    net = network(error_history=error_history, position_history=position_history)
+    J, (errors, positions), steps, ahead = case(net, limit=limit)
+    e_list, q_list, wanted = list(errors), list(positions), []
+    for t in range(4):
+        xi = np.concatenate([*e_list[:error_history], *q_list[:position_history]])
+        h = np.exp(-np.linalg.norm(xi - net.centres, axis=1) / net.widths**2)
+        wanted.append(sum(net.weights[:, j] @ h * xi[j] for j in range(len(xi))) - q_list[0])
+        dq = scale_to_limit(wanted[t], np.full(net.n, limit))
+        e_list, q_list = [e_list[0] + steps[t] - J @ dq, *e_list], [q_list[0] + dq, *q_list]
+        np.testing.assert_allclose(ahead.errors[t], e_list[0], atol=1e-12)
+        np.testing.assert_allclose(ahead.xi[t], xi, atol=1e-12)
+        np.testing.assert_allclose(ahead.h[t], h, atol=1e-12)
+    np.testing.assert_allclose(ahead.wanted, wanted[0], atol=1e-12)
+
+
+def test_the_roll_out_keeps_the_joint_step_limit():
+    net = network()
+    _, (_, positions), _, ahead = case(net, limit=0.01)
+    q = np.vstack([positions[0], ahead.xi[1:, net.m :]])
+    moves = np.abs(np.diff(q, axis=0)).max(axis=1)
+    np.testing.assert_allclose(moves, 0.01, rtol=1e-12)
+
+
+def test_the_direction_is_that_of_automatic_differentiation_of_each_term_through_its_own_step():
+    net = network(error_history=2)
+    J, (errors, _), steps, ahead = case(net)
+    n, p, hidden = net.weights.shape
+    W = casadi.SX.sym("W", n * p * hidden)
+    criterion = 0
+    before = np.vstack([errors[:1], ahead.errors[:-1]])
+    for t in range(4):
+        outer = casadi.DM(np.outer(ahead.xi[t], ahead.h[t]).ravel())
+        q_cmd = casadi.vertcat(*[casadi.dot(W[i * p * hidden : (i + 1) * p * hidden], outer) for i in range(n)])
+        q = ahead.xi[t, net.m * 2 : net.m * 2 + n]
+        e = casadi.DM(before[t] + steps[t]) - casadi.DM(J) @ (q_cmd - casadi.DM(q))
+        criterion += 0.5 * casadi.sumsqr(e)
+    function = casadi.Function("g", [W], [criterion, casadi.gradient(criterion, W)])
+    value, gradient = function(net.weights.ravel())
+    np.testing.assert_allclose(ahead.criterion, float(value), rtol=1e-12)
+    np.testing.assert_allclose(descent_direction(J, ahead).ravel(), -np.asarray(gradient)[:, 0], atol=1e-12)
+
+
+def test_tensors_and_plain_loops_give_the_same_direction_and_step():
+    net = network(error_history=2)
+    J, _, _, ahead = case(net)
+    n, p, hidden = net.weights.shape
+    direction = np.zeros((n, p, hidden))
+    for j in range(p):
+        for unit in range(hidden):
+            for t in range(4):
+                direction[:, j, unit] += J.T @ ahead.errors[t] * ahead.xi[t, j] * ahead.h[t, unit]
+    tensor = descent_direction(J, ahead)
+    np.testing.assert_allclose(tensor, direction, atol=1e-12)
+    alpha = 0.3 * sum(e @ e for e in ahead.errors) / (0.01 + np.sum(direction**2))
+    assert update_step(tensor, ahead, 0.3, 0.01) == pytest.approx(alpha, rel=1e-12)
+
+
+@pytest.mark.parametrize("k", [0.1, 1.0, 1.7])
+@pytest.mark.parametrize("row_space_only", [True, False])
+def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself(k, row_space_only):
+    net = network()
+    rng = np.random.default_rng(2)
+    J, q, y, ref = rng.normal(size=(2, 3)), rng.normal(size=3), rng.normal(size=2), rng.normal(size=2)
+    made = law(net, horizon=1, k=k, epsilon=0.0, row_space_only=row_space_only)
+    xi = information_vector((ref - y)[None], q[None])
+    before = ref - y - J @ (net.command(xi) - q)
+    u = made.command(J, seen(q, y), np.tile(ref, (PREVIEW + 1, 1)))
+    after = ref - y - J @ u * PERIOD
+    assert after @ before / (before @ before) == pytest.approx(1.0 - k, abs=1e-10)
+    assert made.diagnostics()["predicted_error"] == pytest.approx(np.linalg.norm(before))
+
+
+def test_the_first_step_equals_the_one_computed_by_hand():
+    # ξ = [e, q] = [0.4, 1], h = exp(−0) = 1 with the centre on ξ; ψ = [0.5, 1]: q_cmd = 1.2, e(k+1) = 0.4 − 2 · 0.2 = 0
+    net = ControllerNetwork(np.array([[0.4, 1.0]]), np.ones(1), np.array([[[0.5], [1.0]]]), 1, 1)
+    u = law(net, horizon=1, k=0.5, epsilon=0.0).command(
+        np.array([[2.0]]), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
+    )
+    np.testing.assert_allclose(u, [0.2 / PERIOD], rtol=1e-12)
+    # with Ĵ = 1: e(k+1) = 0.2, G = 0.2 · [0.4, 1], α = 0.5 · 0.04 / 0.0464, dq = 0.2 + α · 0.2 · 1.16 = 0.3
+    u = law(net, horizon=1, k=0.5, epsilon=0.0).command(
+        np.array([[1.0]]), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
+    )
+    np.testing.assert_allclose(u, [0.3 / PERIOD], rtol=1e-12)
+
+
+def null_motion(row_space_only):
+    """Return how fast a law, taught under one Jacobian, moves in the null space of another at zero error."""
+    made, rng = law(network(), row_space_only=row_space_only), np.random.default_rng(6)
+    J, J_later = rng.normal(size=(2, 2, 3))
+    for _ in range(20):
+        made.command(J, seen(np.zeros(3) + 0.5, np.zeros(2)), np.ones((PREVIEW + 1, 2)))
+    before = law(network()).command(J_later, seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2)))
+    u = made.command(J_later, seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))) - before
+    return np.linalg.norm(u - np.linalg.pinv(J_later) @ J_later @ u)
+
+
+def test_without_the_projection_what_was_learned_leaks_into_the_null_space():
+    assert null_motion(row_space_only=True) < 1e-9
+    assert null_motion(row_space_only=False) > 1e-2
+
+
+def run_affine(made, J, y_ref, steps, limit=np.inf):
+    q, y, worst = np.zeros(J.shape[1]), np.zeros(J.shape[0]), 0.0
+    for _ in range(steps):
+        u = made.command(J, seen(q, y), np.tile(y_ref, (PREVIEW + 1, 1)))
+        assert np.isfinite(u).all()
+        assert (np.abs(u) <= limit * (1 + 1e-12)).all()
+        q, y = q + u * PERIOD, y + J @ u * PERIOD
+        worst = max(worst, float((y / y_ref).max()))
+    return np.linalg.norm(y_ref - y), worst
+
+
+def test_the_learning_removes_a_standing_error_that_the_offline_network_leaves():
+    J = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
+    net, target = network(), np.array([0.3, 0.2])
+    assert run_affine(law(net, k=0.1), J, target, 200)[0] < 1e-3
+    frozen, _ = run_affine(law(net, k=0.1, epsilon=1e12), J, target, 200)
+    assert frozen > 0.05
+
+
+def test_anti_windup_lessens_the_overshoot_of_a_limited_loop():
+    J, target = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]]), np.array([1.0, 0.8])
+    with_it, without = (
+        run_affine(law(network(), limit=0.3, anti_windup=on, k=0.2), J, target, 400, limit=0.3)[1]
+        for on in (True, False)
+    )
+    assert with_it < without
+
+
+def test_a_lost_feature_teaches_nothing():
+    made = law(network())
+    u = made.command(np.ones((2, 3)), seen(np.zeros(3), np.zeros(2), valid=False), np.ones((PREVIEW + 1, 2)))
+    np.testing.assert_array_equal(made.weights, network().weights)
+    assert made.diagnostics()["step_size"] == 0.0
+    assert np.isfinite(u).all()
+
+
+def without_preview():
+    net = network()
+    made = RbfnnLaw(RbfnnConfig(preview=False), net, knowledge(preview=0))
+    made.reset(seen(np.zeros(3), np.zeros(2)))
+    return made
+
+
+def test_the_preview_is_used_only_where_it_is_switched_on():
+    ramp = np.linspace(0.1, 1.0, PREVIEW + 1)[:, None] * np.ones(2)
+    flat = np.tile(ramp[0], (PREVIEW + 1, 1))
+    J, look = np.ones((2, 3)) + np.eye(2, 3), seen(np.zeros(3), np.zeros(2))
+    on = [law(network()).command(J, look, reference) for reference in (ramp, flat)]
+    off = [without_preview().command(J, look, reference) for reference in (ramp, flat[:1])]
+    assert not np.allclose(on[0], on[1])
+    np.testing.assert_array_equal(off[0], off[1])
+    np.testing.assert_array_equal(off[0], on[1])
+
+
+def test_the_commanded_position_may_stand_in_for_the_measured_one():
+    """Where every command is carried out in full, both are the same."""
+    J, target = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]]), np.array([0.3, 0.2])
+    ends = [run_affine(law(network(), position=position), J, target, 30) for position in ("measured", "commanded")]
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-9)
+
+
+def test_reset_forgets_what_was_learned():
+    made, reference = law(network()), np.ones((PREVIEW + 1, 2))
+    first = [made.command(np.ones((2, 3)), seen(np.full(3, 0.1 * k), np.zeros(2)), reference) for k in range(5)]
+    made.reset(seen(np.zeros(3), np.zeros(2)))
+    np.testing.assert_array_equal(made.weights, network().weights)
+    again = [made.command(np.ones((2, 3)), seen(np.full(3, 0.1 * k), np.zeros(2)), reference) for k in range(5)]
+    np.testing.assert_array_equal(first, again)
+
+
+def test_saturation_and_weight_norms_are_told():
+    made = law(network(), limit=1e-3)
+    made.command(np.ones((2, 3)), seen(np.ones(3), np.zeros(2)), np.full((PREVIEW + 1, 2), 5.0))
+    told = made.diagnostics()
+    assert told["saturated"] == 1.0
+    assert told["controller_weight_norm"] == pytest.approx(np.linalg.norm(made.weights))
+    assert set(told) >= {"criterion", "step_size", "predicted_error", "learned_weight_norm"}
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    n=st.integers(2, 8),
+    m=st.integers(1, 4),
+    error_history=st.integers(1, 3),
+    position_history=st.integers(1, 3),
+    seed=st.integers(0, 10**6),
+    exponent=st.integers(-6, 3),
+)
+def test_commands_are_finite_and_limited_for_any_sizes(n, m, error_history, position_history, seed, exponent):
+    rng = np.random.default_rng(seed)
+    made = law(network(n, m, 5, error_history, position_history, seed), limit=1.5)
+    for _ in range(8):
+        y, reference = 10.0**exponent * rng.normal(size=m), rng.normal(size=(PREVIEW + 1, m))
+        u = made.command(rng.normal(size=(m, n)), seen(rng.normal(size=n), y), reference)
+        assert u.shape == (n,)
+        assert np.isfinite(u).all()
+        assert (np.abs(u) <= 1.5 * (1 + 1e-12)).all()
+
+
+def test_nothing_to_descend_gives_no_step():
+    ahead = RollOut(np.zeros((2, 2)), np.ones((2, 5)), np.ones((2, 4)), np.zeros(3))
+    assert update_step(descent_direction(np.ones((2, 3)), ahead), ahead, 0.5, 0.0) == 0.0
+    assert controller_output(np.zeros((3, 5, 4)), ahead.xi[0], ahead.h[0]).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_bad_settings_are_refused():
+    for k in (0.0, 2.0, -0.1):
+        with pytest.raises(ValueError, match="k must be above 0 and below 2"):
+            RbfnnConfig(k=k)
+    with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
+        RbfnnConfig(horizon=0)
+    with pytest.raises(ValueError, match="epsilon must be at least 0"):
+        RbfnnConfig(epsilon=-1.0)
+    with pytest.raises(ValueError, match="position must be one of measured, commanded, got 'guessed'"):
+        RbfnnConfig(position="guessed")
+
+
+def test_a_network_of_another_robot_and_a_short_preview_are_refused():
+    with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
+        RbfnnLaw(RbfnnConfig(), network(), knowledge(6, 3))
+    with pytest.raises(ValueError, match="preview must be at least the horizon of 8 rows, got 7"):
+        RbfnnLaw(RbfnnConfig(horizon=8), network(), knowledge(preview=7))

@@ -1,0 +1,125 @@
+"""Tests of the composed controller: what it tells its parts, what it refuses, what it forgets."""
+
+import numpy as np
+import pytest
+
+from servobench.controllers.controller import ControllerDiverged, RobotKnowledge
+from servobench.controllers.estimators.constant import ConstantEstimator
+from servobench.controllers.estimators.estimator import Estimator
+from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
+from servobench.controllers.servo import ServoController
+from servobench.plant.signals import Observation, PlantSpec
+
+SPEC = PlantSpec(("a", "b", "c"), ("x", "y"), np.ones(3), -np.ones(3), np.ones(3), 0.05)
+J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
+KNOWLEDGE = RobotKnowledge(SPEC, 1, nominal_jacobian=lambda q: J0)
+
+
+class Recorder(Estimator):
+    def __init__(self):
+        self.motions = []
+
+    def reset(self, jacobian):
+        self.J = jacobian
+
+    def update(self, motion):
+        self.motions.append(motion)
+
+    def jacobian(self, joint_position):
+        return self.J.copy()
+
+    def diagnostics(self):
+        return {"motions": float(len(self.motions))}
+
+
+class Broken(Law):
+    def reset(self, observation):
+        pass
+
+    def command(self, jacobian, observation, reference):
+        return np.array([0.0, np.nan, 0.0])
+
+    def diagnostics(self):
+        return {}
+
+
+def servo(estimator, law=None):
+    law = MfacLaw(MfacConfig(), KNOWLEDGE) if law is None else law
+    return ServoController(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE)
+
+
+def seen(k, q, y, valid=True):
+    return Observation(k * 0.05, np.asarray(q, dtype=float), np.asarray(y, dtype=float), valid)
+
+
+def test_a_motion_spans_the_gap_that_lost_frames_leave():
+    estimator = Recorder()
+    controller, reference = servo(estimator), np.full((2, 2), 0.3)
+    first = seen(0, [0.0, 0.0, 0.0], [0.1, 0.1])
+    controller.reset(first, 0)
+    controller.step(first, reference)
+    controller.step(seen(1, [0.01, 0.0, 0.0], [0.1, 0.1], valid=False), reference)
+    controller.step(seen(2, [0.02, 0.0, 0.0], [0.1, 0.1], valid=False), reference)
+    controller.step(seen(3, [0.03, 0.0, 0.01], [0.12, 0.11]), reference)
+    (motion,) = estimator.motions
+    np.testing.assert_array_equal(motion.joint_position, [0.0, 0.0, 0.0])
+    np.testing.assert_allclose(motion.joint_step, [0.03, 0.0, 0.01])
+    np.testing.assert_allclose(motion.feature_step, [0.02, 0.01])
+    np.testing.assert_allclose(motion.error, [0.18, 0.19])
+    assert motion.duration == pytest.approx(0.15)
+    expected = np.linalg.norm([0.02 - 0.5 * 0.03, 0.01 - 0.2 * 0.01])
+    assert controller.diagnostics()["jacobian_prediction_error"] == pytest.approx(expected)
+
+
+def test_nothing_is_learnt_before_a_second_valid_feature():
+    estimator = Recorder()
+    controller, reference = servo(estimator), np.zeros((2, 2))
+    first = seen(0, np.zeros(3), np.zeros(2), valid=False)
+    controller.reset(first, 0)
+    assert controller.estimated_jacobian() is None
+    controller.step(first, reference)
+    controller.step(seen(1, np.ones(3) * 0.01, np.ones(2) * 0.01), reference)
+    assert estimator.motions == []
+    assert np.isnan(controller.diagnostics()["jacobian_prediction_error"])
+    np.testing.assert_array_equal(controller.estimated_jacobian(), J0)
+
+
+def test_the_first_step_equals_the_law_at_the_first_jacobian():
+    controller, law = servo(ConstantEstimator()), MfacLaw(MfacConfig(), KNOWLEDGE)
+    first, reference = seen(0, np.zeros(3), [0.1, 0.0]), np.full((2, 2), 0.12)
+    controller.reset(first, 0)
+    expected = law.command(J0, first, reference)
+    np.testing.assert_array_equal(controller.step(first, reference).joint_velocity, expected)
+    assert controller.diagnostics()["probing"] == 0.0
+
+
+def test_a_command_that_is_not_finite_is_a_named_fault():
+    controller, first = servo(ConstantEstimator(), Broken()), seen(0, np.zeros(3), np.zeros(2))
+    controller.reset(first, 0)
+    with pytest.raises(ControllerDiverged, match="joint_velocity is not finite at 0 s"):
+        controller.step(first, np.zeros((2, 2)))
+
+
+def test_an_estimate_that_is_not_finite_is_a_named_fault():
+    estimator, first = Recorder(), seen(0, np.zeros(3), np.zeros(2))
+    controller = servo(estimator)
+    controller.reset(first, 0)
+    controller.step(first, np.zeros((2, 2)))
+    estimator.J = np.full((2, 3), np.nan)
+    with pytest.raises(ControllerDiverged, match="jacobian is not finite at 0 s"):
+        controller.step(first, np.zeros((2, 2)))
+
+
+def test_observations_and_references_of_the_wrong_size_are_refused():
+    controller, first = servo(ConstantEstimator()), seen(0, np.zeros(3), np.zeros(2))
+    controller.reset(first, 0)
+    with pytest.raises(ValueError, match=r"observation.joint_position must have shape \(3,\)"):
+        controller.step(seen(0, np.zeros(2), np.zeros(2)), np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"observation.feature must have shape \(2,\)"):
+        controller.reset(seen(0, np.zeros(3), np.zeros(3)), 0)
+    with pytest.raises(ValueError, match=r"reference must have shape \(2, 2\) for a preview of 1"):
+        controller.step(first, np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="reference must be finite"):
+        controller.step(first, np.full((2, 2), np.nan))

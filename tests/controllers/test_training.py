@@ -1,0 +1,356 @@
+"""Tests of the offline fits, of their cache and of the file that holds the networks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from servobench.controllers import rbf_pid, rbfnn_mfac, rbfnn_mfac_plus
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from servobench.controllers.networks.file import (
+    FORMAT,
+    TrainedNetworks,
+    load_networks,
+    save_networks,
+)
+from servobench.controllers.networks.fit import (
+    controller_region,
+    ideal_controller_matrix,
+    obtain_networks,
+    ridge_path,
+    train,
+    train_cached,
+    training_digest,
+)
+from servobench.controllers.networks.rbf import (
+    ControllerNetwork,
+    JacobianNetwork,
+    jacobian_features,
+    jacobian_output,
+)
+from servobench.controllers.networks.samples import (
+    choose_centres,
+    controller_samples,
+    pool_size,
+    unit_points,
+)
+from servobench.plant.signals import PlantSpec
+
+N, M, PERIOD = 3, 2, 0.05
+SPEC = PlantSpec(("a", "b", "c"), ("x", "y"), np.ones(N), np.full(N, -6.0), np.full(N, 6.0), PERIOD)
+JACOBIAN = JacobianTraining(centres=40, samples=400)
+CONTROLLER = ControllerTraining(hidden=12, samples=500)
+CONFIG = TrainingConfig((0.5,) * N, (1.5,) * N, jacobian=JACOBIAN, controller=CONTROLLER)
+
+
+def planar_jacobian(q):
+    """The tip of a planar arm with three links of 0.5, 0.4 and 0.3 m."""
+    angle = np.cumsum(q, axis=-1)
+    x, y = np.array([0.5, 0.4, 0.3]) * np.sin(angle), np.array([0.5, 0.4, 0.3]) * np.cos(angle)
+    columns = [np.stack([-x[..., i:].sum(-1), y[..., i:].sum(-1)], axis=-1) for i in range(N)]
+    return np.stack(columns, axis=-1)
+
+
+def longer_jacobian(q):
+    return 1.1 * planar_jacobian(q)
+
+
+@pytest.fixture(scope="module")
+def networks():
+    return train(CONFIG, planar_jacobian, SPEC)
+
+
+def test_the_jacobian_network_is_as_good_on_fresh_joint_positions_as_it_says(networks):
+    q = np.random.default_rng(7).uniform(0.5, 1.5, (500, N))
+    J = planar_jacobian(q)
+    error = np.linalg.norm(networks.jacobian.jacobian(q) - J) / np.linalg.norm(J)
+    assert error < 0.01
+    assert 0.5 * networks.jacobian_error < error < 2.0 * networks.jacobian_error
+
+
+def test_the_controller_network_is_as_good_on_fresh_samples_as_it_says(networks):
+    region = controller_region(CONFIG, SPEC)
+    unit = np.random.default_rng(8).uniform(size=(500, region.dimension))
+    plan = CONFIG.controller
+    samples = controller_samples(unit, region, planar_jacobian, plan.gain * PERIOD, plan.posture_gain * PERIOD)
+    error = np.sqrt(np.mean((networks.controller.command(samples.xi) - samples.command) ** 2))
+    assert 0.5 * networks.controller_error < error < 2.0 * networks.controller_error
+    assert error < 0.25 * np.sqrt(np.mean((samples.command - samples.position) ** 2))
+
+
+def test_training_twice_gives_the_same_bits(networks):
+    again = train(CONFIG, planar_jacobian, SPEC)
+    np.testing.assert_array_equal(again.jacobian.weights, networks.jacobian.weights)
+    np.testing.assert_array_equal(again.controller.weights, networks.controller.weights)
+    assert again.digest == networks.digest
+
+
+def test_the_jacobian_network_does_not_depend_on_the_controller_s_settings(networks):
+    other = dataclasses.replace(CONFIG, controller=dataclasses.replace(CONTROLLER, hidden=5))
+    trained = train(other, planar_jacobian, SPEC)
+    np.testing.assert_array_equal(trained.jacobian.weights, networks.jacobian.weights)
+    assert trained.controller.weights.shape == (N, M + N, 5)
+    assert trained.digest != networks.digest
+
+
+def test_samples_of_the_controller_follow_from_the_model():
+    plan = dataclasses.replace(CONTROLLER, error_history=2, position_history=2)
+    region = controller_region(dataclasses.replace(CONFIG, controller=plan), SPEC)
+    unit = unit_points(50, region.dimension, np.random.default_rng(0))
+    samples = controller_samples(unit, region, planar_jacobian, 0.15, 0.025)
+    e, e_old, q, q_old = np.split(samples.xi, [M, 2 * M, 2 * M + N], axis=1)
+    J = planar_jacobian(q)
+    np.testing.assert_array_equal(e, samples.error)
+    np.testing.assert_allclose(e_old - e, np.einsum("smn,sn->sm", J, q - q_old), atol=1e-12)
+    assert (np.abs(q - q_old) <= SPEC.joint_velocity_limit * PERIOD).all()
+    assert (np.abs(e) <= plan.error_range).all()
+    np.testing.assert_allclose(np.einsum("smn,sn->sm", J, samples.command - q), 0.15 * e, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("smn,sn->sm", J, samples.posture_step), 0.0, atol=1e-12)
+    assert (np.einsum("sn,sn->s", samples.posture_step, 1.0 - q) >= -1e-12).all()
+    ideal = ideal_controller_matrix(samples.gain, 2, 2)
+    wanted = samples.command - samples.posture_step
+    np.testing.assert_allclose(np.einsum("snp,sp->sn", ideal, samples.xi), wanted, atol=1e-12)
+
+
+def test_ridge_solutions_equal_least_squares_on_augmented_rows():
+    rng = np.random.default_rng(1)
+    F, Y = rng.normal(size=(30, 5)), rng.normal(size=(30, 2))
+    scale = np.linalg.eigvalsh(F.T @ F)[-1]
+    for relative, W in zip((1e-3, 0.1), ridge_path(F, Y, (1e-3, 0.1)), strict=True):
+        rows = np.vstack([F, np.sqrt(relative * scale) * np.eye(5)])
+        expected = np.linalg.lstsq(rows, np.vstack([Y, np.zeros((5, 2))]), rcond=None)[0]
+        np.testing.assert_allclose(W, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("placement", ["halton", "sobol", "kmeans"])
+def test_centres_lie_in_the_region_wherever_they_come_from(placement):
+    rng = np.random.default_rng(0)
+    centres = choose_centres(unit_points(pool_size(9, placement), 4, rng, placement), 9, rng, placement)
+    assert centres.shape == (9, 4)
+    assert ((centres >= 0.0) & (centres <= 1.0)).all()
+    assert len(np.unique(centres.round(9), axis=0)) == 9
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"fit": "entries"}, {"kernel": "gaussian"}, {"placement": "kmeans"}, {"error_history": 2, "position_history": 2}],
+    ids=str,
+)
+def test_every_choice_of_the_controller_s_fit_trains(change):
+    plan = dataclasses.replace(CONTROLLER, **change)
+    trained = train(dataclasses.replace(CONFIG, controller=plan), planar_jacobian, SPEC)
+    assert trained.controller.kernel == plan.kernel
+    assert trained.controller_error < 0.1
+
+
+def test_progress_is_told_from_none_to_all():
+    told = []
+    train(CONFIG, planar_jacobian, SPEC, lambda share, what: told.append((share, what)))
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert {what for _, what in told} == {"Jacobian network", "controller network", "done"}
+
+
+def test_the_digest_tells_models_sizes_and_settings_apart():
+    digests = {
+        training_digest(CONFIG, planar_jacobian, SPEC),
+        training_digest(CONFIG, longer_jacobian, SPEC),
+        training_digest(dataclasses.replace(CONFIG, seed=1), planar_jacobian, SPEC),
+        training_digest(CONFIG, planar_jacobian, dataclasses.replace(SPEC, period=0.1)),
+    }
+    assert len(digests) == 4
+
+
+def test_the_cache_trains_once_for_each_configuration_and_model(tmp_path, networks):
+    first = train_cached(CONFIG, planar_jacobian, SPEC, tmp_path)
+    told = []
+    second = train_cached(CONFIG, planar_jacobian, SPEC, tmp_path, lambda share, what: told.append(what))
+    assert told == []
+    np.testing.assert_array_equal(first.controller.weights, second.controller.weights)
+    np.testing.assert_array_equal(networks.jacobian.weights, second.jacobian.weights)
+    train_cached(CONFIG, longer_jacobian, SPEC, tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_file_holds_all_of_the_networks(tmp_path, networks):
+    path = tmp_path / "folder" / "networks.npz"
+    save_networks(networks, path)
+    save_networks(networks, path)
+    loaded = load_networks(path, n=N, m=M, digest=networks.digest)
+    for part in ("jacobian", "controller"):
+        for name in ("centres", "widths", "weights"):
+            stored, kept = (getattr(getattr(trained, part), name) for trained in (loaded, networks))
+            np.testing.assert_array_equal(stored, kept)
+    for name in ("jacobian_error", "controller_error", "digest"):
+        assert getattr(loaded, name) == getattr(networks, name)
+    assert loaded.controller.kernel == "exponential"
+    assert [file.name for file in path.parent.iterdir()] == ["networks.npz"]
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_no_rest(tmp_path, networks, monkeypatch):
+    path = tmp_path / "networks.npz"
+    save_networks(networks, path)
+    content = path.read_bytes()
+
+    def half_written(file, **arrays):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez", half_written)
+    with pytest.raises(OSError, match="disk full"):
+        save_networks(networks, path)
+    assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def stored_arrays(path):
+    with np.load(path) as archive:
+        return dict(archive)
+
+
+def test_corrupt_and_foreign_files_are_refused_in_one_line(tmp_path, networks):
+    path = tmp_path / "networks.npz"
+    save_networks(networks, path)
+    whole, arrays = path.read_bytes(), stored_arrays(path)
+    damaged = bytearray(whole)
+    damaged[len(whole) // 2] ^= 0xFF
+    for content in (b"", b"text", whole[: len(whole) // 2], bytes(damaged), b"\x80\x04N."):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="is corrupt or not a network file") as caught:
+            load_networks(path)
+        assert "\n" not in str(caught.value)
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(ValueError, match="is corrupt or not a network file"):
+        load_networks(path)
+    np.savez(path, weights=np.zeros(3))
+    with pytest.raises(ValueError, match="is not a network file of servobench"):
+        load_networks(path)
+    for name, value in (
+        ("controller_weights", np.zeros((2, 2))),
+        ("history", np.array([1])),
+        ("sizes", np.array([6, 3])),
+    ):
+        np.savez(path, **{**arrays, name: value})
+        with pytest.raises(ValueError, match="is corrupt: "):
+            load_networks(path)
+    np.savez(path, format=np.array(FORMAT), format_version=np.array(1))
+    with pytest.raises(ValueError, match="is corrupt: "):
+        load_networks(path)
+
+
+def test_files_of_another_version_robot_or_configuration_and_missing_ones_are_refused(tmp_path, networks):
+    path = tmp_path / "networks.npz"
+    save_networks(networks, path)
+    with pytest.raises(ValueError, match="joints 3, wanted 6"):
+        load_networks(path, n=6)
+    with pytest.raises(ValueError, match="features 2, wanted 3"):
+        load_networks(path, m=3)
+    with pytest.raises(ValueError, match=r"training digest \w+, wanted 00"):
+        load_networks(path, digest="00")
+    np.savez(path, **{**stored_arrays(path), "format_version": np.array(99)})
+    with pytest.raises(ValueError, match="has format version 99, wanted 1"):
+        load_networks(path)
+    with pytest.raises(ValueError, match="does not exist"):
+        load_networks(tmp_path / "none.npz")
+
+
+def knowledge(**changes):
+    region = (np.full(N, 0.5), np.full(N, 1.5))
+    return dataclasses.replace(RobotKnowledge(SPEC, 10, planar_jacobian, region=region), **changes)
+
+
+def test_an_empty_region_means_the_one_in_which_the_robot_works(networks):
+    empty = dataclasses.replace(CONFIG, lower=(), upper=())
+    assert obtain_networks(empty, knowledge()).digest == networks.digest
+    with pytest.raises(ValueError, match="training needs a region"):
+        obtain_networks(empty, knowledge(region=None))
+    with pytest.raises(ValueError, match="training needs a nominal model"):
+        obtain_networks(CONFIG, knowledge(nominal_jacobian=None))
+
+
+def test_all_presets_take_their_networks_from_the_harness(networks):
+    asked = []
+
+    def source(config):
+        asked.append(config)
+        return networks
+
+    for preset in (rbfnn_mfac, rbfnn_mfac_plus, rbf_pid):
+        preset.ENTRY.build(preset.ENTRY.config(), knowledge(train=source))
+    assert asked[0] == asked[1] == asked[2]
+    assert asked[0].lower == (0.5,) * N
+
+
+def test_networks_of_another_robot_are_refused_at_construction(networks):
+    names = tuple("abcdef"), tuple("xyz")
+    other = PlantSpec(*names, np.ones(6), np.full(6, -6.0), np.full(6, 6.0), PERIOD)
+    told = knowledge(spec=other, train=lambda config: networks)
+    for preset in (rbfnn_mfac, rbfnn_mfac_plus, rbf_pid):
+        with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
+            preset.ENTRY.build(preset.ENTRY.config(), told)
+
+
+def test_networks_of_two_robots_do_not_go_together(networks):
+    rng = np.random.default_rng(0)
+    other = ControllerNetwork(rng.normal(size=(4, 5)), np.ones(4), rng.normal(size=(4, 5, 4)), 1, 1)
+    with pytest.raises(ValueError, match=r"both networks must have the same sizes"):
+        TrainedNetworks(networks.jacobian, other, 0.0, 0.0, "")
+
+
+def test_a_jacobian_that_the_network_can_represent_is_fitted_to_the_last_digits():
+    """Centres and widths are found again by the seed, so the ridge alone is left."""
+    plan = dataclasses.replace(JACOBIAN, centres=8, width_scales=(1.0,), regularisations=(1e-14,))
+    config = dataclasses.replace(CONFIG, jacobian=plan)
+    shape = train(config, planar_jacobian, SPEC).jacobian
+    true = JacobianNetwork(shape.centres, shape.widths, np.random.default_rng(3).normal(size=shape.weights.shape))
+    fitted = train(config, true.jacobian, SPEC)
+    assert fitted.jacobian_error < 1e-6
+    q = np.full(N, 1.1)
+    theta = jacobian_features(q, true.centres, true.widths)
+    np.testing.assert_allclose(fitted.jacobian.jacobian(q), jacobian_output(true.weights, theta), atol=1e-5)
+
+
+def test_bad_settings_are_refused():
+    for name, value, message in (
+        ("error_history", 0, "error_history must be at least 1, got 0"),
+        ("position_history", 0, "position_history must be at least 1, got 0"),
+        ("hidden", 0, "hidden must be at least 1, got 0"),
+        ("gain", 0.0, "gain must be above 0"),
+        ("posture_gain", -0.1, "posture_gain must be at least 0"),
+        ("error_range", 0.0, "error_range must be above 0"),
+        ("kernel", "cubic", "kernel must be one of exponential, gaussian, got 'cubic'"),
+        ("fit", "both", "fit must be one of output, entries, got 'both'"),
+        ("placement", "grid", "controller.placement must be one of halton, sobol, kmeans"),
+        ("samples", 5, "controller.samples must be at least"),
+        ("width_scales", (), "controller.width_scales must hold at least one number"),
+        ("regularisations", (0.0,), "controller.regularisations must be above 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ControllerTraining(**{name: value})
+    with pytest.raises(ValueError, match=r"jacobian.centres must be at least 1"):
+        JacobianTraining(centres=0)
+    with pytest.raises(ValueError, match="held_out must be above 0 and below 1"):
+        TrainingConfig(held_out=1.0)
+    with pytest.raises(ValueError, match="seed must be at least 0"):
+        TrainingConfig(seed=-1)
+
+
+def test_a_region_that_is_no_box_or_of_another_robot_is_refused():
+    with pytest.raises(ValueError, match="lower and upper must be equally long, got 1 and 2"):
+        TrainingConfig((0.0,), (1.0, 1.0))
+    with pytest.raises(ValueError, match="lower must be below upper"):
+        TrainingConfig((1.0,), (1.0,))
+    with pytest.raises(ValueError, match="lower must be finite"):
+        TrainingConfig((float("nan"),), (1.0,))
+    with pytest.raises(ValueError, match="lower and upper must name 3 joints, got 2"):
+        train(TrainingConfig((0.0, 0.0), (1.0, 1.0)), planar_jacobian, SPEC)
+
+
+def test_a_nominal_jacobian_of_the_wrong_shape_or_not_finite_is_refused():
+    with pytest.raises(ValueError, match="nominal_jacobian must return"):
+        train(CONFIG, lambda q: planar_jacobian(q)[..., :2], SPEC)
+    with pytest.raises(ValueError, match="nominal_jacobian must be finite"):
+        train(CONFIG, lambda q: planar_jacobian(q) * np.nan, SPEC)

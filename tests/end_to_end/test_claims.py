@@ -1,0 +1,198 @@
+"""The answers to the paper's claims: the rules on tables with a known outcome, and the command on real runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+from servobench.harness.batch.seed_ranges import TUNING
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.studies.claims.answers import answer_all
+from servobench.harness.studies.claims.figures import draw_answers
+from servobench.harness.studies.claims.measurements import DEPENDS, NOT_REPRODUCED, REPRODUCED
+from servobench.harness.studies.claims.studies import (
+    CIRCLE,
+    ENTRIES,
+    FIRST_SEED,
+    FROZEN,
+    MAIN,
+    MOVES,
+    NO_EPSILON,
+    PROPOSED,
+    studies,
+)
+from servobench.harness.studies.claims.table import (
+    answer_table,
+    differences,
+    markdown_table,
+    read_answers,
+    write_tables,
+)
+
+METHODS = (PROPOSED, "rbf_pid", "ukf_mfac", "ukf_mpc")
+SEEDS = range(20)
+
+
+def table(seed: int, **changes) -> pd.DataFrame:
+    """Runs in which all methods are alike up to a little noise, unless `changes` says otherwise.
+
+    Args:
+        seed: of the noise.
+        changes: column -> function of (controller, task) -> what is added.
+    """
+    generator = np.random.default_rng(seed)
+    rows = []
+    for task in (*MOVES, CIRCLE):
+        for controller in METHODS:
+            for robot in SEEDS:
+                row = {
+                    "settling_time_s": 2.0, "overshoot": 0.1, "path_length_ratio": 1.1, "jacobian_error_mean": 0.1,
+                    "rms_error_evaluated_m": 0.02, "controller_time_median_us": 100.0,
+                }  # fmt: skip
+                row = {name: value * (1.0 + 1e-3 * generator.standard_normal()) for name, value in row.items()}
+                for name, change in changes.items():
+                    row[name] += change(controller, task)
+                rows.append(
+                    {"plant": "kinematic", "task": task, "controller": controller, "mismatch": "moderate",
+                     "seed": robot, "status": "completed", **row}
+                )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def tables(**changes) -> dict[str, pd.DataFrame]:
+    made = {MAIN: table(0, **changes)}
+    for name in (FROZEN, NO_EPSILON, ENTRIES):
+        other = table(0)
+        made[name] = other[other["controller"] == PROPOSED].reset_index(drop=True)
+    return made
+
+
+def proposed(amount: float, tasks=(*MOVES, CIRCLE)):
+    return lambda controller, task: amount if controller == PROPOSED and task in tasks else 0.0
+
+
+def verdicts(made: dict[str, pd.DataFrame]) -> dict[str, str]:
+    return {answer.claim: answer.verdict for answer in answer_all(made, "kinematic")}
+
+
+@pytest.mark.parametrize(
+    ("claim", "changes", "verdict"),
+    [
+        ("1", {}, NOT_REPRODUCED),
+        ("1", {"settling_time_s": proposed(-0.5)}, REPRODUCED),
+        ("1", {"settling_time_s": proposed(0.5)}, NOT_REPRODUCED),
+        ("1", {"settling_time_s": proposed(-0.5, ("exp2",))}, f"{DEPENDS}: holds in 3 of 12"),
+        ("2", {"overshoot": proposed(0.1), "path_length_ratio": proposed(0.2)}, REPRODUCED),
+        ("2", {"overshoot": proposed(0.1)}, f"{DEPENDS}: holds in 12 of 24"),
+        ("2", {"overshoot": proposed(-0.05), "path_length_ratio": proposed(-0.05)}, NOT_REPRODUCED),
+        ("3", {}, REPRODUCED),
+        ("3", {"settling_time_s": lambda controller, task: 0.5 * (controller == "ukf_mpc")}, NOT_REPRODUCED),
+        ("3", {"settling_time_s": lambda controller, task: 0.5 * (controller == "ukf_mpc") * (task == "exp1")},
+         f"{DEPENDS}: holds in 3 of 4"),
+        ("4", {}, NOT_REPRODUCED),
+        ("4", {"settling_time_s": lambda controller, task:
+               {PROPOSED: 2.0, "rbf_pid": 1.0}.get(controller, 0.0) * (task in ("exp1", "exp4"))}, REPRODUCED),
+        ("4", {"settling_time_s": lambda controller, task:
+               {PROPOSED: 1.0, "rbf_pid": 1.0}.get(controller, 0.0) * (task in ("exp1", "exp4"))},
+         f"{DEPENDS}: holds in 2 of 3"),
+        ("5", {}, NOT_REPRODUCED),
+        ("5", {"rms_error_evaluated_m": proposed(-0.015)}, REPRODUCED),
+        ("6", {"controller_time_median_us": proposed(-60.0)}, REPRODUCED),
+        ("6", {"controller_time_median_us": proposed(50.0)}, NOT_REPRODUCED),
+        ("6", {"controller_time_median_us": proposed(-20.0)}, NOT_REPRODUCED),
+        ("6", {"controller_time_median_us": proposed(-60.0, MOVES)}, f"{DEPENDS}: holds in 1 of 2"),
+        ("7", {"jacobian_error_mean": proposed(-0.05)}, REPRODUCED),
+        ("7", {"jacobian_error_mean": proposed(0.05)}, NOT_REPRODUCED),
+        ("7", {"jacobian_error_mean": proposed(-0.05, ("exp1", "circle"))}, f"{DEPENDS}: holds in 2 of 5"),
+        ("ε = 0", {"settling_time_s": proposed(-0.5)}, "worse"),
+        ("ε = 0", {"settling_time_s": proposed(0.5)}, "better"),
+        ("entries", {"settling_time_s": proposed(-0.5)}, "worse"),
+    ],
+)  # fmt: skip
+def test_a_rule_gives_the_verdict_that_its_words_say(claim, changes, verdict):
+    assert verdicts(tables(**changes))[claim] == verdict
+
+
+def test_runs_that_never_settle_or_fail_count_as_slow():
+    made = tables(settling_time_s=proposed(-0.5))
+    runs = made[MAIN]
+    mine = runs["controller"] == PROPOSED
+    made[MAIN] = runs.assign(settling_time_s=runs["settling_time_s"].mask(mine & (runs["task"] == "exp1")))
+    made[MAIN].loc[mine & (runs["task"] == "exp2"), "status"] = "feature_lost"
+    assert verdicts(made)["1"] == f"{DEPENDS}: holds in 6 of 12"
+
+
+@pytest.mark.parametrize(("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)])
+def test_numbers_of_the_evidence_may_differ_as_rounding_makes_them(tmp_path, number, same):
+    answer = answer_all(tables(), "kinematic")[0]
+    write_tables([replace(answer, evidence="circle 10.0 [9.0, 12.5] mm in 38 of 40")], tmp_path)
+    found = [replace(answer, evidence=f"circle {number} mm in 37 of 40")]
+    assert (differences(found, read_answers(tmp_path / "answers.csv")) == []) == same
+
+
+def test_a_committed_table_is_compared_line_by_line(tmp_path):
+    answers = answer_all(tables(), "kinematic")
+    write_tables(answers, tmp_path)
+    wanted = read_answers(tmp_path / "answers.csv")
+    assert differences(answers, wanted) == []
+    (line,) = differences([replace(answers[0], verdict=REPRODUCED), *answers[1:]], wanted)
+    assert line.startswith("claim 1 on kinematic: now reproduced: faster in")
+    (line,) = differences([replace(answers[0], evidence=answers[0].evidence.replace("faster", "slower"))], wanted)
+    assert "slower" in line
+    assert differences([replace(answers[0], plant="bullet")], wanted) == ["claim 1 on bullet: not in the table"]
+    with pytest.raises(ConfigurationError, match="is not a table of answers"):
+        read_answers(tmp_path / "nothing.csv")
+
+
+def test_every_answer_is_in_the_tables_and_has_a_figure(tmp_path):
+    answers = answer_all(tables(), "kinematic")
+    assert len(answer_table(answers)) == len(answers) == 9
+    assert markdown_table(answers).count("\n") == 11
+    files = draw_answers(answers, tmp_path)
+    assert {file.name for file in files if file.suffix == ".png"} == {
+        *(f"claim_{number}.png" for number in range(1, 8)), "reading_epsilon.png", "reading_entries.png",
+    }  # fmt: skip
+    assert all(file.stat().st_size > 5_000 for file in files)
+
+
+def test_no_study_uses_a_seed_that_methods_were_tuned_on():
+    for study in studies(["kinematic"], 400):
+        seeds = {cell.request.seed for cell in study.cells}
+        assert not seeds & set(TUNING)
+        assert min(seeds) == FIRST_SEED
+
+
+def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch, tmp_path, capsys):
+    short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1")
+    assert servobench(monkeypatch, *short, "--out", str(tmp_path / "first")) == 0
+    shown = capsys.readouterr().out
+    assert "1: converges faster than the other three on kinematic" in shown
+    wanted = tmp_path / "wanted.csv"
+    wanted.write_text((tmp_path / "first" / "answers.csv").read_text())
+    again = (*short, "--out", str(tmp_path / "first"), "--resume", "--check", str(wanted))
+    assert servobench(monkeypatch, *again) == 0
+    assert "the same answers as in" in capsys.readouterr().out
+    wanted.write_text(wanted.read_text().replace("faster in", "faster by far in"))
+    assert servobench(monkeypatch, *again) == 1
+    assert "claim 1 on kinematic: now" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--seeds", "3"), "--seeds must be at least 6"),
+        (("--check", "nowhere.csv"), "nowhere.csv is not a table of answers"),
+        (("--plants", "moon"), "unknown plant 'moon'"),
+        (("--resume", "--scheduler", "nowhere"), "--scheduler needs an address"),
+    ],
+)
+def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, arguments, message):
+    assert servobench(monkeypatch, "claims", "--out", str(tmp_path / "out"), *arguments) == 2
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()

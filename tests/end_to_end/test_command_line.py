@@ -1,0 +1,191 @@
+"""The command line as a user meets it: what it prints, what it leaves on disk, and how it refuses bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+from servobench.harness.batch import results
+
+
+def judged_columns(table: pd.DataFrame) -> pd.DataFrame:
+    """Everything but the wall-clock times."""
+    return table[[name for name in table.columns if not name.startswith(("controller_time", "plant_time"))]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("plants",), ("kinematic", "bullet")),
+        (("controllers",), ("constant", "calibrated", "ukf_mfac")),
+        (("tasks",), ("exp1", "circle", "random", "waypoints")),
+        (("controllers", "ukf_mfac"), ("ukf_mfac.law.step_weight", "ukf_mfac.estimator.feature_noise")),
+        (("plants", "kinematic"), ("kinematic.lag", "0.05")),
+    ],
+)
+def test_what_there_is_can_be_listed(monkeypatch, capsys, arguments, words):
+    assert servobench(monkeypatch, *arguments) == 0
+    shown = capsys.readouterr().out
+    for word in words:
+        assert word in shown
+
+
+def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["run", "--plant", "kinematic", "--controller", "calibrated", "--task", "exp2", "--seed", "3"]
+    assert servobench(monkeypatch, *arguments, "--set", "exp2.duration=3", "--out", str(out)) == 0
+    assert "calibrated" in capsys.readouterr().out
+    runs, steps = pd.read_parquet(out / "runs.parquet"), pd.read_parquet(out / "steps.parquet")
+    assert runs[["status", "seed", "mismatch"]].values.tolist() == [["completed", 3, "moderate"]]
+    assert len(steps) == 60
+    assert steps["time_s"].tolist() == [k * 0.05 for k in range(60)]
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["configuration"]["exp2"]["duration"] == 3
+    assert manifest["seeds"] == [3]
+    assert manifest["packages"]["numpy"]
+    figures = {path.stem for path in (out / "figures").glob("*.png")}
+    assert figures == {path.stem for path in (out / "figures").glob("*.pdf")}
+    assert len(figures) == 6
+    assert not (out / "report.html").exists()
+    assert json.loads(runs["mismatch_values"][0])["camera_angle"] != 0.0
+
+
+def test_the_tables_have_the_promised_columns(monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    servobench(
+        monkeypatch, "run", "--plant", "kinematic", "--set", "exp2.duration=1", "--set", "run.full_jacobian=true",
+        "--out", str(out),
+    )  # fmt: skip
+    runs = {
+        "run_id", "plant", "controller", "task", "seed", "mismatch", "status", "settling_time_s",
+        "settling_time_5pct_s", "overshoot", "steady_state_error_m", "rms_error_m", "max_error_m",
+        "path_length_ratio", "control_effort_rad",
+        "saturation_fraction", "jacobian_error_mean", "jacobian_condition_max", "controller_time_median_us",
+        "controller_time_p99_us", "plant_time_median_us",
+    }  # fmt: skip
+    steps = {
+        "run_id", "step", "time_s", "reference_x_m", "feature_y_m", "true_feature_z_m", "joint_position_elbow_rad",
+        "joint_velocity_command_wrist_3_rad_s", "error_norm_m", "jacobian_error", "feature_valid", "controller_time_us",
+        "plant_time_us", "estimated_jacobian_x_elbow", "true_jacobian_z_wrist_1",
+    }  # fmt: skip
+    assert runs <= set(pd.read_parquet(out / "runs.parquet").columns)
+    assert steps <= set(pd.read_parquet(out / "steps.parquet").columns)
+
+
+@pytest.mark.parametrize("plant", ["kinematic", "bullet"])
+def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(
+    monkeypatch, tmp_path, plant
+):
+    tables = []
+    for workers in ("1", "2"):
+        out = tmp_path / workers
+        assert (
+            servobench(
+                monkeypatch, "compare", "--plants", plant, "--controllers", "ukf_mfac,constant",
+                "--tasks", "exp2,random", "--mismatch", "moderate", "--seeds", "5:6", "--workers", workers,
+                "--out", str(out), "--set", "exp2.duration=1", "--set", "random.duration=1", "--no-report",
+            )
+            == 0
+        )  # fmt: skip
+        tables.append([judged_columns(pd.read_parquet(out / name)) for name in ("runs.parquet", "steps.parquet")])
+    for single, double in zip(*tables, strict=True):
+        assert len(single) >= 4
+        pd.testing.assert_frame_equal(single, double, check_exact=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "--plant", "bulet"), "unknown plant 'bulet': did you mean 'bullet'?"),
+        (("run", "--controller", "pid2"), "unknown controller 'pid2'"),
+        (("run", "--task", "exp9"), "unknown task 'exp9': did you mean 'exp"),
+        (("run", "--mismatch", "mild"), "'mild' is not known here; wanted one profile (none, factory, moderate"),
+        (("run", "--mismatch", "factory=none.yaml"), "none.yaml cannot be read"),
+        (("run", "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
+        (("run", "--plant", "kinematic", "--view"), "--view shows the plant bullet only, got --plant kinematic"),
+        (("run", "--set", "run.period=0.007"), "period must be a whole multiple of the plant's own step"),
+        (("run", "--set", "run.period=-1"), "run: period must be above 0, got -1"),
+        (("run", "--plant", "kinematic", "--set", "kinematic.feature_noise=-1"), "kinematic: feature_noise must be"),
+        (("run", "--set", "kinematc.lag=1"), "unknown section 'kinematc': did you mean 'kinematic'?"),
+        (("run", "--set", "kinematic.lagg=1", "--plant", "kinematic"), "kinematic has no setting 'lagg'"),
+        (("run", "--config", "none.toml"), "none.toml cannot be read"),
+        (("run", "--task", "waypoints"), "task waypoints: a CSV file is needed"),
+        (("run", "--task", "waypoints", "--set", "waypoints.file=none.csv"), "waypoint file none.csv cannot be read"),
+        (("run", "--set", "exp2.start=[1,2]"), "start must have shape (6,), got (2,)"),
+        (("compare", "--controllers", "constant,cnstant"), "unknown controller 'cnstant': did you mean 'constant'?"),
+        (("compare", "--seeds", "5:5"), "seeds must name at least one seed"),
+        (("compare", "--seeds", "many"), "seeds must be a count (5), a list (3,1,4) or a range (100:120)"),
+        (("compare", "--tasks", ""), "--tasks is empty"),
+        (("collect", "."), "is not a results folder"),
+    ],
+)
+def test_bad_input_is_one_line_exit_code_2_and_nothing_written(monkeypatch, capsys, tmp_path, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert servobench(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("servobench: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_results_folder_is_left_alone(monkeypatch, capsys, tmp_path):
+    (tmp_path / "note.txt").write_text("mine")
+    assert servobench(monkeypatch, "run", "--plant", "kinematic", "--out", str(tmp_path)) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
+
+
+def start_batch(out: Path) -> subprocess.Popen[str]:
+    command = [
+        sys.executable,
+        "-m",
+        "servobench.harness.cli.main",
+        "compare",
+        "--plants",
+        "kinematic",
+        "--seeds",
+        "200",
+    ]
+    command += ["--controllers", "constant", "--tasks", "exp2", "--workers", "2", "--out", str(out)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    while len(list((out / results.PARTS).glob(f"[0-9]*.{results.RUNS}"))) < 3:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return process
+
+
+def test_ctrl_c_keeps_what_is_finished(tmp_path):
+    out = tmp_path / "out"
+    process = start_batch(out)
+    os.killpg(process.pid, signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, output
+    assert "Traceback" not in output
+    runs = pd.read_parquet(out / "runs.parquet")
+    assert 3 <= len(runs) < 200
+    assert set(pd.read_parquet(out / "steps.parquet")["run_id"]) == set(runs["run_id"])
+
+
+def test_a_killed_batch_keeps_every_finished_run(monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    process = start_batch(out)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate(timeout=120)
+    finished = len(results.load_runs(out))
+    assert finished >= 3
+    assert servobench(monkeypatch, "collect", str(out)) == 0
+    assert len(pd.read_parquet(out / "runs.parquet")) == finished

@@ -1,0 +1,163 @@
+"""The pages of documentation: their links, the code that they name, and the examples that they promise to run."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import sys
+import tomllib
+
+import pytest
+from typer.testing import CliRunner
+
+from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
+from kit.foreign_fmu import build_crane
+from servobench.controllers.composed import ESTIMATORS, LAWS
+from servobench.harness.cli.main import app
+from servobench.harness.config import registry
+from servobench.harness.config.settings import read_settings
+from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.tasks import TASKS
+
+PLACES = sorted({match.groups() for page in DOCS for match in PLACE.finditer(page.read_text(encoding="utf-8"))})
+
+
+def links(text):
+    targets = re.findall(r"\]\(([^)\s]+)\)", text)
+    return [target for target in targets if "://" not in target]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[str(page.relative_to(ROOT)) for page in PAGES])
+def test_every_relative_link_leads_somewhere(page):
+    text = page.read_text(encoding="utf-8")
+    for link in links(text):
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{page.name} links to {link}"
+        if anchor:
+            assert anchor in anchors(target.read_text(encoding="utf-8")), f"{page.name} links to {link}"
+
+
+def test_the_pages_do_link():
+    assert {"docs/methods.md", "docs/plants.md", "docs/results.md"} <= set(links(PAGES[0].read_text(encoding="utf-8")))
+    assert sum(len(links(page.read_text(encoding="utf-8"))) for page in DOCS) > 30
+
+
+@pytest.mark.parametrize(("path", "name"), PLACES, ids=[f"{path}:{name}" for path, name in PLACES])
+def test_every_piece_of_code_that_is_named_exists(path, name):
+    assert find(path, name) is not None
+
+
+def first_column(page, heading):
+    return {names(row[0])[0] for _, header, rows in tables(read(page)) if header[0] == heading for row in rows}
+
+
+def test_everything_registered_has_a_row_and_nothing_else_has():
+    assert first_column("methods.md", "controller") == set(registry.CONTROLLERS)
+    assert first_column("plants.md", "plant") == {*registry.PLANTS, "fmu:PATH.toml"}
+    assert first_column("plants.md", "task") == set(TASKS)
+    assert set(LAWS) | set(ESTIMATORS) <= set(names(section(read("methods.md"), "Estimator and law")))
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Installs the example of a page as pip would: its module and its entry points on the path."""
+
+    def install(text):
+        project, code = tomllib.loads(blocks(text, "toml")[0])["project"], blocks(text, "python")[0]
+        module = project["name"].replace("-", "_")
+        (tmp_path / f"{module}.py").write_text(code, encoding="utf-8")
+        information = tmp_path / f"{module}-{project['version']}.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: 0.1\n")
+        points = [
+            f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in entries.items())
+            for group, entries in project["entry-points"].items()
+        ]
+        (information / "entry_points.txt").write_text("".join(points))
+        monkeypatch.syspath_prepend(tmp_path)
+        importlib.invalidate_caches()
+        forget()
+        modules.append(module)
+
+    def forget():
+        registry._points.cache_clear()
+        registry._load.cache_clear()
+
+    modules = []
+    yield install
+    monkeypatch.undo()
+    forget()
+    for module in modules:
+        sys.modules.pop(module, None)
+
+
+@pytest.mark.parametrize("controller", ["nominal_rate", "nominal_broyden"])
+def test_the_controllers_of_the_example_settle_on_a_real_plant(installed, controller):
+    installed(section(read("methods.md"), "Your own controller"))
+    assert controller in registry.controller_names()
+    request = RunRequest("kinematic", controller, "exp2", "moderate", 3)
+    settings = read_settings(None, ["nominal_rate.gain=1.5", "nominal_broyden.law.proportional_gain=1.5"])
+    row = run_experiment(request, settings).row
+    assert row["status"] == "completed"
+    assert row["settling_time_s"] < 6.0
+    assert 0.0 < row["jacobian_error_mean"] < 1.0
+
+
+def test_the_plant_of_the_example_closes_a_loop(installed):
+    installed(section(read("plants.md"), "Your own plant"))
+    settings = read_settings(None, ["rls.initial.source=probe", "target.target=[0.2, 0.7]"])
+    row = run_experiment(RunRequest("planar", "rls", "target", "none", 0), settings).row
+    assert row["status"] == "completed"
+    assert row["settling_time_s"] < 8.0
+    assert row["jacobian_error_mean"] < 0.5
+
+
+def test_the_mapping_of_the_example_closes_a_loop_on_an_fmu(tmp_path):
+    build_crane(tmp_path / "crane.fmu", 3)
+    mapping = tmp_path / "crane.toml"
+    mapping.write_text(blocks(section(read("plants.md"), "`fmu:PATH.toml`, any FMU"), "toml")[0])
+    plant = f"fmu:{mapping}"
+    settings = read_settings(
+        None, ["ukf_mfac.initial.source=probe", "target.target=[0.2, 0.7]", f"{plant}.feature_noise=0.0"]
+    )
+    result = run_experiment(RunRequest(plant, "ukf_mfac", "target", "none", 0), settings)
+    assert result.row["settling_time_s"] < 8.0
+    assert (result.steps["feature_x_m"] == result.steps["true_feature_x_m"]).all()
+    assert "joint_position_luff_rad" in result.steps
+
+
+def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    made = CliRunner().invoke(app, ["run", "--plant", "kinematic", "--set", "exp2.duration=0.2"])
+    assert made.exit_code == 0, made.output
+    for code in blocks(read("results.md"), "python"):
+        exec(compile(code, "docs/results.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "ukf_mfac" in printed
+    assert "completed" in printed
+
+
+def test_every_python_block_is_valid_python():
+    codes = [code for page in DOCS for code in blocks(page.read_text(encoding="utf-8"), "python")]
+    assert codes
+    assert all(ast.parse(code).body for code in codes)
+
+
+def test_the_table_of_equations_has_each_once_and_the_code_names_it_too():
+    def numbers(text):
+        found = []
+        for first, last in re.findall(r"(\d+)(?:[–-](\d+))?", text):
+            found += range(int(first), int(last or first) + 1)
+        return found
+
+    rows = next(rows for _, header, rows in tables(read("methods.md")) if header[0] == "equation")
+    assert sorted(number for row in rows for number in numbers(row[0])) == list(range(1, 47))
+    for equations, _, where in rows:
+        for path, _ in PLACE.findall(where):
+            text = (ROOT / path).read_text(encoding="utf-8")
+            told = {n for found in re.findall(r"eqs?\. ([\d–\-, and]+)", text) for n in numbers(found)}
+            if not path.startswith("tests/"):
+                assert told >= set(numbers(equations)), f"{path} does not name all of eqs. {equations}"

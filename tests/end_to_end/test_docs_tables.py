@@ -1,0 +1,158 @@
+"""The tables of the documentation say what the code does: settings, columns, diagnostics, statuses, profiles, keys."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tomllib
+
+import pytest
+
+from kit.documents import DOCS, PLACE, find, names, read, section, tables
+from servobench.controllers.composed import ESTIMATORS, LAWS
+from servobench.controllers.initial import InitialConfig
+from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from servobench.harness.config import registry
+from servobench.harness.config.settings import flatten, read_settings
+from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.experiment import RunRequest
+from servobench.plant.fmu.config import FmuConfig
+from servobench.plant.fmu.mapping import _KEYS
+from servobench.plant.robot.mismatch import AXES, PROFILES, parse_mismatch
+from servobench.plant.signals import RunFault
+
+PACKAGE = "servobench"
+SETTINGS = {
+    find(*PLACE.findall(before)[-1]): rows
+    for page in DOCS
+    for before, header, rows in tables(page.read_text(encoding="utf-8"))
+    if header[0] == "setting" and PLACE.search(before)
+}
+
+
+def config_classes():
+    """Every dataclass of settings that a user can reach, those of the presets' parts instead of the presets'."""
+    parts = [entry.config for entry in (*ESTIMATORS.values(), *LAWS.values())]
+    plants = [registry.find_plant(name).config for name in registry.PLANTS]
+    whole = [registry.find_controller("nmpc_calibrated").config, FmuConfig]
+    training = [InitialConfig, TrainingConfig, JacobianTraining, ControllerTraining]
+    return {kind for kind in (*parts, *plants, *whole, *training) if dataclasses.fields(kind)}
+
+
+def documented(rows):
+    return {names(name)[0]: tomllib.loads(f"value = {default}")["value"] for name, default, _ in rows}
+
+
+def plain(config):
+    """The settings of one dataclass as TOML gives them, without those of its parts."""
+    values = {item.name: getattr(config, item.name) for item in dataclasses.fields(config)}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in values.items()
+        if not dataclasses.is_dataclass(value)
+    }
+
+
+def test_all_settings_have_a_table_and_nothing_else_has():
+    assert set(SETTINGS) == config_classes()
+
+
+@pytest.mark.parametrize("kind", sorted(SETTINGS, key=lambda kind: kind.__name__), ids=lambda kind: kind.__name__)
+def test_a_table_of_settings_has_the_names_and_defaults_of_the_code(kind):
+    assert documented(SETTINGS[kind]) == plain(kind())
+
+
+def test_the_presets_differ_from_their_parts_only_where_it_is_told():
+    rows = next(rows for _, header, rows in tables(read("methods.md")) if header[0] == "preset")
+    told = {names(name)[0]: tomllib.loads(f"value = {value}")["value"] for name, value in rows}
+    found = {}
+    for name in registry.CONTROLLERS:
+        for part in dataclasses.fields(config := registry.find_controller(name).config()):
+            value = getattr(config, part.name)
+            if dataclasses.is_dataclass(value):
+                usual = flatten(type(value)())
+                changed = {key: new for key, new in flatten(value).items() if new != usual[key]}
+                found |= {f"{name}.{part.name}.{key}": new for key, new in changed.items()}
+    assert told == found
+
+
+def test_the_table_of_controllers_has_their_parts():
+    rows = next(rows for _, header, rows in tables(read("methods.md")) if header[:2] == ["controller", "estimator"])
+    assert {names(row[0])[0] for row in rows} == set(registry.CONTROLLERS)
+    for controller, estimator, law, _, truth in rows:
+        entry = registry.find_controller(names(controller)[0])
+        assert entry.needs_truth == (truth == "yes")
+        if names(estimator):
+            config = entry.config()
+            assert type(config.estimator) is ESTIMATORS[names(estimator)[0]].config
+            assert type(config.law) is LAWS[names(law)[0]].config
+
+
+@pytest.fixture(scope="module")
+def short_runs():
+    """A short run of each estimator, each law and what is no pair of them."""
+    controllers = [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS] + ["nmpc_calibrated"]
+    settings = read_settings(None, ["exp2.duration=0.2", "run.full_jacobian=true"])
+    return [
+        run_experiment(RunRequest("kinematic", controller, "exp2", "moderate", 0), settings)
+        for controller in controllers
+    ]
+
+
+def test_every_diagnostic_is_told_and_exists(short_runs):
+    found = {column for run in short_runs for column in run.steps if column.startswith("diagnostic_")}
+    rows = tables(section(read("methods.md"), "Diagnostics"))[0][2]
+    assert {f"diagnostic_{name}" for row in rows for name in names(row[0])} == found
+
+
+def test_every_column_of_runs_is_told_in_order(short_runs):
+    rows = next(rows for _, header, rows in tables(read("results.md")) if header[0] == "column")
+    told = [names(row[0])[0] for row in rows]
+    assert told == [name for name in short_runs[0].row if name in told]
+    assert set(told) == set(short_runs[0].row)
+
+
+def test_every_column_of_steps_is_told_and_every_told_column_exists(short_runs):
+    rows = tables(section(read("results.md"), "`steps.parquet`: a row a period"))[0][2]
+    places = {"feature": "[xyz]", "unit": "m", "joint": "(?:shoulder|elbow|wrist)[a-z_0-9]*", "name": r"\w+"}
+    patterns = [re.sub(r"<(\w+)>", lambda match: places[match[1]], names(row[0])[0]) for row in rows]
+    for run in short_runs:
+        for column in run.steps:
+            assert sum(bool(re.fullmatch(pattern, column)) for pattern in patterns) == 1, column
+    for pattern in patterns:
+        assert any(re.fullmatch(pattern, column) for column in short_runs[0].steps), pattern
+
+
+def test_every_status_is_told_and_can_occur():
+    rows = next(rows for _, header, rows in tables(read("results.md")) if header[0] == "status")
+
+    def faults(kind):
+        own = {kind.status} if kind.__module__.split(".")[0] == PACKAGE else set()
+        return own.union(*(faults(child) for child in kind.__subclasses__()))
+
+    assert {names(row[0])[0] for row in rows} == faults(RunFault) | {"completed", "numerical_error", "crashed"}
+
+
+def test_the_profiles_have_the_magnitudes_of_the_code():
+    rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "profile")
+    assert {names(row[0])[0] for row in rows} == set(PROFILES)
+    for name, *cells in rows:
+        links, offset, camera, tool, gear = (float(cell.split()[0].rstrip("°")) for cell in cells)
+        profile = PROFILES[names(name)[0]]
+        told = (links / 100, math.radians(offset), math.radians(camera), tool / 1000, gear / 100)
+        assert told == pytest.approx(
+            (profile.links, profile.joint_offsets, profile.camera_rotation, profile.tool, profile.gear_ratio)
+        )
+
+
+def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
+    rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "axis")
+    assert {names(row[0])[0] for row in rows} == set(AXES)
+    for name, example, _ in rows:
+        assert getattr(parse_mismatch(names(example)[0]), names(name)[0]) > 0.0
+
+
+def test_the_keys_of_a_mapping_are_those_of_the_code():
+    rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "key" and header[1] == "wanted")
+    assert {name for row in rows for name in names(row[0])} == set(_KEYS)

@@ -1,0 +1,147 @@
+"""Bad FMUs as a user meets them: one line, exit code 2 or a named status, and nothing left behind."""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from kit.command import servobench
+from kit.foreign_fmu import build_crane, describe
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.experiment import RunRequest
+
+JOINTS = 'joints = ["wheel.slew", "wheel.luff"]'
+MAPPING = {
+    2: f'inputs = ["push.slew", "push.luff"]\nfeatures = ["place.slew", "place.luff"]\n{JOINTS}\n',
+    3: 'inputs = "push"\nfeatures = "place"\njoints = "wheel"\n',
+}
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """A folder for temporary files in which nothing may remain."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield folder
+    assert list(folder.iterdir()) == []
+
+
+def run(monkeypatch, tmp_path: Path, version: int, more: str = "") -> tuple[int, Path]:
+    (tmp_path / "crane.toml").write_text(f'file = "crane.fmu"\n{MAPPING[version]}{more}')
+    out = tmp_path / "out"
+    task = ["--task", "target", "--set", "target.target=[0.2,0.7]", "--set", "target.duration=1"]
+    start = ["--controller", "broyden", "--set", "broyden.initial.source=probe", "--mismatch", "none"]
+    arguments = ["run", "--plant", f"fmu:{tmp_path / 'crane.toml'}", *start, *task, "--out", str(out)]
+    return servobench(monkeypatch, *arguments), out
+
+
+def changed(version: int, old: str, new: str) -> str:
+    text = describe(version)
+    assert old in text
+    return text.replace(old, new)
+
+
+def write(path: Path, entries: dict[str, str]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+
+
+def describe_fmi1() -> str:
+    return changed(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
+
+
+def describe_exchange_only() -> str:
+    return changed(2, "<CoSimulation", "<ModelExchange")
+
+
+# What is wrong before anything is loaded; all three commands say so.
+ARCHIVES = {
+    "no such file": (lambda path: None, "crane.fmu does not exist"),
+    "a folder": (lambda path: path.mkdir(), "crane.fmu does not exist"),
+    "not a zip": (lambda path: path.write_text("hello"), "crane.fmu is not a zip archive"),
+    "climbs": (
+        lambda path: write(path, {"modelDescription.xml": "<x/>", "../../evil.txt": "evil"}),
+        "holds '../../evil.txt', which would climb out",
+    ),
+    "no description": (lambda path: write(path, {"readme": "hello"}), "holds no modelDescription.xml"),
+    "broken XML": (lambda path: build_crane(path, 2, description="<fmiModelDescription"), "a broken modelDescription"),
+    "not FMI": (lambda path: build_crane(path, 2, description="<html/>"), "crane.fmu is of FMI none"),
+    "FMI 1": (lambda path: build_crane(path, 2, description=describe_fmi1()), "crane.fmu is of FMI 1.0; wanted FMI 2"),
+}
+
+
+@pytest.mark.parametrize("case", ARCHIVES)
+def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monkeypatch, tmp_path, temporary, capsys):
+    build, message = ARCHIVES[case]
+    build(tmp_path / "crane.fmu")
+    code, out = run(monkeypatch, tmp_path, 2)
+    assert not out.exists()
+    assert code == 2
+    lines = capsys.readouterr().err.splitlines()
+    for command in ("validate", "info"):
+        assert servobench(monkeypatch, "fmu", command, str(tmp_path / "crane.fmu")) == 2
+        lines += capsys.readouterr().err.splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("servobench: ") and message in line for line in lines)
+    assert list(tmp_path.rglob("evil.txt")) == []
+
+
+@pytest.mark.parametrize(
+    ("version", "arguments", "more", "message"),
+    [
+        (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
+        (2, {"description": describe_exchange_only()}, "", "offers model exchange only; wanted co-simulation"),
+        (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
+        (2, {}, "[parameters]\nquirk = 5\n", "fmi2EnterInitializationMode returned error"),
+        (
+            3,
+            {"description": changed(3, 'start="2"', 'start="3"')},
+            "",
+            "reading wheel[1], wheel[2], wheel[3], … returned",
+        ),
+        (3, {"description": changed(3, 'start="2"', 'start="two"')}, "", "a broken modelDescription.xml: "),
+        (
+            3,
+            {},
+            "[truth]\njacobian = 'wheel'\n",
+            "true_jacobian must name 4 numbers for 2 inputs and 2 features, got 2",
+        ),
+        (3, {}, "[parameters]\narm = [1.0, 2.0, 3.0]\n", "parameter 'arm' must have 2 values, got 3"),
+    ],
+)
+def test_an_fmu_that_does_not_fit_is_one_line(
+    version, arguments, more, message, monkeypatch, tmp_path, temporary, capsys
+):
+    build_crane(tmp_path / "crane.fmu", version, **arguments)
+    code, out = run(monkeypatch, tmp_path, version, more)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("servobench: plant fmu:")
+    assert message in line
+    assert code == 2
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("version", "quirk", "message"),
+    [
+        (2, 1, "fmi2DoStep returned error; the FMU said: load 900 kg is too heavy at noon"),
+        (3, 1, "fmi3DoStep returned error; the FMU said: load 900 kg is too heavy at noon"),
+        (2, 4, "fmi2DoStep returned discard"),
+        (2, 7, "crane.fmu returned something that is not finite for place.luff"),
+        (3, 7, "crane.fmu returned something that is not finite for place[2]"),
+    ],
+)
+def test_a_failure_during_the_run_is_its_status_and_reason(version, quirk, message, tmp_path, temporary):
+    build_crane(tmp_path / "crane.fmu", version)
+    (tmp_path / "crane.toml").write_text(f'file = "crane.fmu"\n{MAPPING[version]}[parameters]\nquirk = {quirk}\n')
+    settings = Settings({"target": {"target": [0.2, 0.7]}, "broyden": {"initial": {"source": "probe"}}})
+    request = RunRequest(f"fmu:{tmp_path / 'crane.toml'}", "broyden", "target", "none", 0)
+    row = run_experiment(request, settings).row
+    assert row["status"] == "fmu_error"
+    assert message in row["reason"]

@@ -1,0 +1,259 @@
+"""The exported UR5: validation, agreement with numpy, derivatives, saved states, equal bytes, and what may go wrong."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy.validation import validate_fmu as validate_by_fmpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.fmus import compile as compiling
+from servobench.fmus.compile import (
+    PLATFORMS,
+    CompilationFailed,
+    CompilerMissing,
+    compile_library,
+    parse_platforms,
+    this_platform,
+)
+from servobench.fmus.export import (
+    ExportOptions,
+    arm_layout,
+    default_actuation,
+    export_fmu,
+    fingerprint,
+)
+from servobench.fmus.information import read_information
+from servobench.fmus.reference import OUTPUT_FILE, reference_run
+from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
+from servobench.fmus.validate import validate_fmu
+from servobench.fmus.variables import model_of, parameters_of
+from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.arm import rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.ur5 import HOME, JOINT_NAMES, nominal_ur5
+
+VERSIONS = [2, 3]
+
+
+def mismatched(text: str, seed: int = 3):
+    return sample_mismatch(parse_mismatch(text), nominal_ur5(), seed)[0]
+
+
+def setup(text: str = "none", period: float = 0.05) -> PlantSetup:
+    return PlantSetup(mismatched(text), np.array(HOME), period)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
+    assert validate_by_fmpy(str(cached_fmu(version))) == []
+    found = validate_fmu(cached_fmu(version))
+    assert found.problems == ()
+    assert found.deviation < 1e-12
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.integers(-314, 314).map(lambda k: k / 100)] * 3), st.sampled_from([None, np.pi / 2, -np.pi / 2]))
+def test_camera_and_arm_survive_the_way_through_the_parameters(rpy, pitch):
+    R = rotation_from_rpy((rpy[0], rpy[1] if pitch is None else pitch, rpy[2]))
+    np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(R)), R, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mismatch", ["none", "severe", "factory", "gear_ratio=5%"])
+def test_a_model_comes_back_from_its_parameters(mismatch):
+    model = mismatched(mismatch)
+    back = model_of(parameters_of(model, default_actuation()), JOINT_NAMES)
+    np.testing.assert_allclose(back.X_BC, model.X_BC, rtol=0, atol=1e-12)
+    q = np.random.default_rng(0).uniform(-3.0, 3.0, (20, 6))
+    np.testing.assert_allclose(back.feature(q), model.feature(q), rtol=0, atol=1e-12)
+
+
+def test_start_values_are_those_of_the_sampled_mismatch(tmp_path):
+    path = export_fmu(tmp_path / "severe.fmu", ExportOptions(2, mismatched("severe"), mismatch="severe, seed 3"))
+    starts = {variable.name: variable.start for variable in read_information(path).variables}
+    wanted = parameters_of(mismatched("severe"), default_actuation())
+    for group in arm_layout(6).of_role("parameter"):
+        assert [float(starts[name]) for name in group.scalar_names()] == wanted[group.name].tolist()
+    assert validate_fmu(path).problems == ()
+    with zipfile.ZipFile(path) as archive:
+        assert "severe, seed 3" in archive.read("documentation/index.html").decode()
+    assert [item.name for item in tmp_path.iterdir()] == ["severe.fmu"]
+
+
+def test_the_fingerprint_changes_with_whatever_decides_how_the_fmu_behaves(monkeypatch):
+    plain = fingerprint(ExportOptions(2))
+    assert fingerprint(ExportOptions(2)) == plain
+    others = [fingerprint(ExportOptions(3)), fingerprint(ExportOptions(2, mismatched("severe")))]
+    others.append(fingerprint(ExportOptions(2, platforms=tuple(PLATFORMS.values()))))
+    monkeypatch.setattr("servobench.fmus.export.CODE", ("-O3",))
+    others.append(fingerprint(ExportOptions(2)))
+    assert len({plain, *others}) == 5
+
+
+EXPORT = """
+import sys
+from pathlib import Path
+from servobench.fmus.compile import parse_platforms
+from servobench.fmus.export import ExportOptions, export_fmu
+export_fmu(Path("again.fmu"), ExportOptions(int(sys.argv[1]), platforms=parse_platforms(sys.argv[2])))
+"""
+WITH_ZIG = pytest.mark.skipif(importlib.util.find_spec("ziglang") is None, reason="ziglang is not installed")
+
+
+@pytest.mark.parametrize("platforms", [this_platform().name, pytest.param("all", marks=WITH_ZIG)])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_equal_inputs_give_equal_files_in_another_process_folder_and_time(version, platforms, tmp_path):
+    first = export_fmu(tmp_path / "first.fmu", ExportOptions(version, platforms=parse_platforms(platforms)))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    changed = {"TMPDIR": str(elsewhere), "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "PYTHONPATH": path_of_packages()}
+    subprocess.run(
+        [sys.executable, "-c", EXPORT, str(version), platforms], cwd=elsewhere, env=os.environ | changed, check=True
+    )
+    assert first.read_bytes() == (elsewhere / "again.fmu").read_bytes()
+    assert [item.name for item in elsewhere.iterdir()] == ["again.fmu"]
+    with zipfile.ZipFile(first) as archive:
+        content = b"".join(archive.read(name) for name in archive.namelist())
+    for path in (tempfile.gettempdir(), str(Path.home()), str(Path.cwd())):
+        assert path.encode() not in content
+
+
+def path_of_packages() -> str:
+    return os.pathsep.join([str(Path.cwd()), os.environ.get("PYTHONPATH", "")])
+
+
+MAGIC = {
+    "x86_64-linux": (b"\x7fELF", b"\x3e\x00", 18),
+    "aarch64-linux": (b"\x7fELF", b"\xb7\x00", 18),
+    "x86_64-darwin": (b"\xcf\xfa\xed\xfe", b"\x07\x00\x00\x01", 4),
+    "aarch64-darwin": (b"\xcf\xfa\xed\xfe", b"\x0c\x00\x00\x01", 4),
+    "x86_64-windows": (b"MZ", b"", 0),
+}
+
+
+@WITH_ZIG
+@pytest.mark.parametrize("version", VERSIONS)
+def test_zig_puts_libraries_for_five_platforms_into_one_fmu(version, tmp_path):
+    path = export_fmu(tmp_path / "all.fmu", ExportOptions(version, platforms=parse_platforms("all")))
+    assert set(MAGIC) == set(PLATFORMS)
+    with zipfile.ZipFile(path) as archive:
+        for name, (magic, machine, offset) in MAGIC.items():
+            target = PLATFORMS[name]
+            inside = f"binaries/{target.folder(version)}/ur5_mismatched{target.suffix}"
+            content = archive.read(inside)
+            assert content.startswith(magic), name
+            assert content[offset:].startswith(machine), name
+            assert f"fmi{version}DoStep".encode() in content or name.endswith("darwin")  # whose names share prefixes
+    assert validate_fmu(path).problems == ()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_sources_are_clean_c11_and_say_nothing(version, tmp_path):
+    with zipfile.ZipFile(cached_fmu(version)) as archive:
+        names = [name for name in archive.namelist() if name.startswith("sources/")]
+        archive.extractall(tmp_path, names)
+    strict = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1", "-fPIC", "-c"]
+    files = [name.removeprefix("sources/") for name in names if name.endswith(".c")]
+    compiler = shutil.which("cc") or "gcc"
+    done = subprocess.run(
+        [compiler, *strict, *files], check=False, cwd=tmp_path / "sources", capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(shutil.which("readelf") is None, reason="needs readelf")
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_library_needs_libc_and_libm_only(version, tmp_path):
+    folder = FmuFolder(cached_fmu(version))
+    library = next((folder.root / "binaries").rglob("*.so"))
+    lines = subprocess.run(["readelf", "-d", str(library)], capture_output=True, text=True, check=True).stdout
+    needed = [line.partition("[")[2].rstrip("]") for line in lines.splitlines() if "NEEDED" in line]
+    assert set(needed) <= {"libc.so.6", "libm.so.6"}
+    folder.close()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_information_tells_version_platform_and_variables(version):
+    information = read_information(cached_fmu(version))
+    assert information.fmi_version == f"{version}.0"
+    assert information.platforms == (this_platform().folder(version),)
+    assert information.has_sources
+    offered = ["co-simulation", "model exchange"] if version == 2 else ["co-simulation"]
+    assert list(information.interfaces) == offered
+    for capabilities in information.interfaces.values():
+        assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
+        assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
+    assert len(information.variables) == (144 if version == 2 else 26)
+    assert all(variable.unit and variable.description for variable in information.variables) or version == 2
+
+
+def tampered(path: Path, target: Path, name: str, change) -> Path:
+    with zipfile.ZipFile(path) as archive:
+        contents = {entry: archive.read(entry) for entry in archive.namelist()}
+    contents[name] = change(contents[name])
+    with zipfile.ZipFile(target, "w") as archive:
+        for entry, content in contents.items():
+            archive.writestr(entry, content)
+    return target
+
+
+def test_validation_tells_what_is_wrong(tmp_path):
+    path = cached_fmu(2)
+    changed = tampered(path, tmp_path / "a.fmu", OUTPUT_FILE, lambda text: text.replace(b"\n0.05,", b"\n0.05,9", 1))
+    assert "differs from the reference" in validate_fmu(changed).problems[0]
+    unit = tampered(path, tmp_path / "b.fmu", "modelDescription.xml", lambda text: text.replace(b'"m/rad"', b'"x"', 1))
+    assert any("unit" in problem for problem in validate_fmu(unit).problems)
+    token = tampered(
+        path, tmp_path / "c.fmu", "modelDescription.xml", lambda text: text.replace(b'guid="{', b'guid="{0')
+    )
+    assert "the GUID is not that of this model" in validate_fmu(token).problems[0]
+
+
+def test_bad_exports_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="fmi_version must be 2 or 3, got 1"):
+        ExportOptions(1)
+    with pytest.raises(ValueError, match="platforms must name at least one"):
+        ExportOptions(2, platforms=())
+    with pytest.raises(ValueError, match=r"platforms holds 'amiga'; known are x86_64-linux.*and 'all'"):
+        parse_platforms("amiga")
+    with pytest.raises(ValueError, match="for the FMU does not exist"):
+        export_fmu(tmp_path / "missing" / "ur5.fmu", ExportOptions(2))
+    with pytest.raises(ValueError, match="fmi_version must be 2 or 3, got 4"):
+        Ur5FmuConfig(fmi_version=4)
+    monkeypatch.setattr(compiling.shutil, "which", lambda _: None)
+    monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(CompilerMissing, match=r"install gcc or clang.*zig with pip install 'servobench\[cross\]'"):
+        export_fmu(tmp_path / "ur5.fmu", ExportOptions(2))
+    assert list(tmp_path.iterdir()) == []
+    cached_fmu.cache_clear()
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda _: str(tmp_path / "cache"))
+    with pytest.raises(ValueError, match="install gcc or clang"):
+        ENTRY.build(Ur5FmuConfig(), setup())
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda _: str(tmp_path / "file"))
+    with pytest.raises(ValueError, match="the FMU cannot be built: .*file"):
+        ENTRY.build(Ur5FmuConfig(), setup())
+    cached_fmu.cache_clear()
+
+
+def test_a_compiler_that_refuses_the_sources_is_quoted(tmp_path):
+    (tmp_path / "bad.c").write_text("int main(void) { return nothing; }\n")
+    with pytest.raises(CompilationFailed, match=r"failed for .*nothing"):
+        compile_library(tmp_path, ["bad.c"], this_platform(), tmp_path / "out" / "bad.so")
+
+
+def test_the_reference_run_meets_the_speed_limit():
+    run_ = reference_run(nominal_ur5(), default_actuation())
+    assert (np.abs(run_.command) > 1.0).any()
+    assert np.abs(run_.outputs["joint_velocity"]).max() <= 1.0

@@ -1,0 +1,357 @@
+"""The FMU plant: a foreign FMU in a closed loop, what may be wrong with one, and what must not be left behind."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kit.foreign_fmu import build_crane, describe
+from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
+from servobench.plant.fmu.archive import PREFIX, FmuFolder, sweep_stale_folders
+from servobench.plant.fmu.config import FmuConfig
+from servobench.plant.fmu.entry import mapped_entry
+from servobench.plant.fmu.fmu_plant import FmuPlant
+from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.fmu.slave import FmuError
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.signals import Command
+
+QUIET = FmuConfig(command_delay_periods=0, feature_noise=0.0)
+START = np.array([0.3, 1.2])
+PERIOD = 0.05
+TOML = {
+    2: """
+file = "crane.fmu"
+inputs = ["push.slew", "push.luff"]
+features = ["place.slew", "place.luff"]
+joints = ["wheel.slew", "wheel.luff"]
+period = 0.01
+[parameters]
+"arm.slew" = 0.6
+"arm.luff" = 0.3
+[limits]
+max_joint_speed = 2.0
+[names]
+joints = ["slew", "luff"]
+features = ["x", "y"]
+""",
+    3: """
+file = "crane.fmu"
+inputs = "push"
+features = ["place"]
+joints = ["wheel"]
+period = 0.01
+[parameters]
+arm = [0.6, 0.3]
+[limits]
+max_joint_speed = 2.0
+[names]
+joints = ["slew", "luff"]
+features = ["x", "y"]
+""",
+}
+NAMES = {
+    2: {
+        "inputs": ("push.slew", "push.luff"),
+        "joints": ("wheel.slew", "wheel.luff"),
+        "features": ("place.slew", "place.luff"),
+    },
+    3: {"inputs": ("push",), "joints": ("wheel",), "features": ("place",)},
+}
+
+
+def leftovers() -> set[Path]:
+    return {path for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}*") if (path / "fmu").is_dir()}
+
+
+@pytest.fixture(autouse=True)
+def _own_temporary_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield
+    assert leftovers() == set()
+
+
+def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> FmuPlant:
+    path = build_crane(tmp_path / "crane.fmu", version)
+    arguments = {"path": path, "max_joint_speed": 2.0, **NAMES[version], **changes}
+    return FmuPlant(config, FmuMapping(**arguments), START, PERIOD)
+
+
+def place_of(q, arm=(0.5, 0.4)):
+    reach = arm[0] * np.exp(1j * q[0]) + arm[1] * np.exp(1j * (q[0] + q[1]))
+    return np.array([reach.real, reach.imag])
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_loop_closes_on_a_foreign_fmu_through_a_mapping_alone(tmp_path, version):
+    build_crane(tmp_path / "crane.fmu", version)
+    (tmp_path / "crane.toml").write_text(TOML[version])
+    entry = mapped_entry(tmp_path / "crane.toml")
+    plant = entry.build(QUIET, PlantSetup(nominal_ur5(), START, PERIOD))
+    assert plant.spec.joint_names == ("slew", "luff")
+    assert plant.spec.feature_names == ("x", "y")
+    observation, target = plant.reset(0), np.array([0.2, 0.7])
+    np.testing.assert_allclose(observation.feature, place_of(START, (0.6, 0.3)), atol=1e-15)
+    for _ in range(120):
+        q = observation.joint_position
+        columns = [(place_of(q + d, (0.6, 0.3)) - place_of(q - d, (0.6, 0.3))) / 2e-6 for d in 1e-6 * np.eye(2)]
+        u = 2.0 * np.linalg.solve(np.column_stack(columns), target - observation.feature)
+        observation = plant.step(Command(u))
+    assert np.linalg.norm(observation.feature - target) < 1e-4
+    assert plant.truth().jacobian is None
+    plant.close()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_commands_are_clipped_delayed_and_held_over_the_fmus_own_steps(tmp_path, version):
+    plant = crane(tmp_path, version, FmuConfig(1, 0.0), period=0.01)
+    plant.reset(0)
+    assert plant.step(Command([9.0, -1.0])).joint_position.tolist() == START.tolist()
+    observation = plant.step(Command([0.0, 0.0]))
+    np.testing.assert_allclose(observation.joint_position, START + PERIOD * np.array([2.0, -1.0]), atol=1e-14)
+    assert observation.time == 2 * PERIOD
+    plant.close()
+
+
+def test_without_joints_the_commands_are_integrated(tmp_path):
+    plant = crane(tmp_path, 2, joints=())
+    for _ in range(3):
+        observation = plant.step(Command([1.0, -3.0]))
+    np.testing.assert_allclose(observation.joint_position, START + 3 * PERIOD * np.array([1.0, -2.0]), atol=1e-14)
+    plant.close()
+
+
+def test_feature_noise_has_the_configured_size_and_the_same_seed_gives_the_same_bits(tmp_path):
+    plant = crane(tmp_path, 2, FmuConfig(0, 0.01, 1, 0.1))
+    runs = []
+    for _ in range(2):
+        first = plant.reset(3)
+        rows = [plant.step(Command([0.0, 0.0])) for _ in range(200)]
+        runs.append([first.feature.tolist(), *((row.feature.tolist(), row.feature_valid) for row in rows)])
+    assert runs[0] == runs[1]
+    spread = np.std([row.feature for row in rows if row.feature_valid], axis=0)
+    assert (spread > 0.007).all()
+    assert (spread < 0.013).all()
+    assert 0 < sum(not row.feature_valid for row in rows) < 50
+    plant.close()
+
+
+@pytest.mark.parametrize("quirk", [3.0, 8.0])
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_step_that_ends_early_is_taken_up_where_it_ended_however_often(tmp_path, version, quirk):
+    plant = crane(tmp_path, version, parameters={"quirk": np.array(quirk)})
+    for k in (1, 2):
+        observation = plant.step(Command([1.0, 0.5]))
+        np.testing.assert_allclose(observation.joint_position, START + k * PERIOD * np.array([1.0, 0.5]), atol=1e-12)
+    plant.close()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_failed_step_is_an_fmu_error_with_the_fmus_last_message(tmp_path, version, caplog):
+    plant = crane(tmp_path, version, parameters={"quirk": np.array(1.0)})
+    with (
+        caplog.at_level(logging.ERROR, "servobench.fmu"),
+        pytest.raises(FmuError, match="load 900 kg is too heavy at noon"),
+    ):
+        plant.step(Command([0.0, 0.0]))
+    assert "load 900 kg" in caplog.text
+    assert FmuError.status == "fmu_error"
+    plant.close()
+
+
+@pytest.mark.parametrize(
+    ("version", "quirk", "message"),
+    [
+        (2, 2, "not finite for place.luff"),
+        (3, 2, r"not finite for place\[2\]"),
+        (2, 4, "fmi2DoStep returned discard"),
+        (3, 4, "returned early at 0 s"),
+        (2, 5, "fmi2EnterInitializationMode returned error"),
+        (3, 5, "fmi3EnterInitializationMode returned error"),
+        (3, 6, "asked to end the simulation"),
+    ],
+)
+def test_misbehaviour_at_run_time_is_an_fmu_error(tmp_path, version, quirk, message):
+    with pytest.raises(FmuError, match=message):
+        crane(tmp_path, version, parameters={"quirk": np.array(float(quirk))}).step(Command([0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"inputs": ("pusch.slew", "push.luff")}, r"inputs names 'pusch.slew'.*did you mean 'push.slew'.*wheel.slew"),
+        ({"inputs": ("place.slew", "place.luff")}, "causality output"),
+        ({"joints": ("wheel.slew",)}, "joints must name 2 numbers for 2 inputs and 2 features, got 1"),
+        ({"true_jacobian": ("place.slew",)}, "true_jacobian must name 4 numbers"),
+        ({"home": "gear"}, "type Integer; wanted a real variable"),
+        ({"parameters": {"arm.slew": np.array([1.0, 2.0])}}, "parameter 'arm.slew' must have 1 values, got 2"),
+        ({"joint_names": ("slew",)}, "joint_names must hold 2 names, got 1"),
+        ({"period": 0.03}, "whole multiple of the plant's own step of 0.03 s"),
+        ({"inputs": ()}, "inputs must name at least one variable"),
+        ({"max_joint_speed": 0.0}, "max_joint_speed must be above 0"),
+        ({"joints": (), "clips_itself": True}, "clips_itself needs joints"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_one_clear_error(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        crane(tmp_path, 2, **changes)
+
+
+def test_an_fmu_that_refuses_its_start_is_a_value_error_to_the_registry(tmp_path):
+    build_crane(tmp_path / "crane.fmu", 2)
+    (tmp_path / "crane.toml").write_text(TOML[2].replace("[parameters]", "[parameters]\nquirk = 5"))
+    with pytest.raises(ValueError, match="fmi2EnterInitializationMode returned error"):
+        mapped_entry(tmp_path / "crane.toml").build(QUIET, PlantSetup(nominal_ur5(), START, PERIOD))
+
+
+def test_a_command_of_the_wrong_size_is_refused(tmp_path):
+    plant = crane(tmp_path, 2)
+    with pytest.raises(ValueError, match=r"joint_velocity must have shape \(2,\), got \(3,\)"):
+        plant.step(Command([0.0, 0.0, 0.0]))
+    plant.close()
+
+
+def test_a_state_that_cannot_be_serialised_is_kept_by_the_plant_that_saved_it():
+    plant = build_ur5(Ur5FmuConfig(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
+    plant.description = replace(plant.description, can_serialise=False)
+    plant.step(Command(np.full(6, 0.3)))
+    state = plant.save_state()
+    runs = []
+    for _ in range(2):
+        plant.restore_state(state)
+        runs.append([plant.step(Command(np.full(6, -0.5))).feature.tobytes() for _ in range(5)])
+    assert runs[0] == runs[1]
+    assert not isinstance(state.fmu, bytes)
+    plant.close()
+
+
+def test_an_fmu_that_cannot_save_its_state_says_so(tmp_path):
+    plant = crane(tmp_path, 2)
+    with pytest.raises(ValueError, match="cannot save its state"):
+        plant.save_state()
+    plant.close()
+
+
+def test_a_closed_plant_may_be_closed_again_but_not_stepped(tmp_path):
+    plant = crane(tmp_path, 2)
+    plant.close()
+    plant.close()
+    with pytest.raises(FmuError, match="has been closed"):
+        plant.step(Command([0.0, 0.0]))
+
+
+def rewritten(version: int, old: str, new: str) -> str:
+    text = describe(version)
+    assert old in text
+    return text.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"folder": "riscv64-plan9"}, "no library for this machine; wanted .*; ?it has: riscv64-plan9|riscv64-plan9"),
+        ({"description": "<fmiModelDescription"}, "broken modelDescription.xml"),
+        ({"description": rewritten(2, 'fmiVersion="2.0"', 'fmiVersion="1.0"')}, "FMI 1|broken"),
+        ({"description": rewritten(2, "<CoSimulation", "<ModelExchange")}, "offers model exchange only"),
+        ({"description": rewritten(2, '"crane"', '"other"')}, "no library for this machine"),
+    ],
+)
+def test_an_fmu_that_cannot_be_used_is_one_clear_error(tmp_path, arguments, message):
+    path = build_crane(tmp_path / "crane.fmu", 2, **arguments)
+    with pytest.raises(ValueError, match=message):
+        FmuPlant(QUIET, FmuMapping(path, **NAMES[2]), START, PERIOD)
+
+
+def test_a_library_that_is_none_is_refused(tmp_path):
+    path = build_crane(tmp_path / "crane.fmu", 2)
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in contents.items():
+            archive.writestr(name, b"nonsense" if name.startswith("binaries") else content)
+    with pytest.raises(ValueError, match="cannot be loaded"):
+        FmuPlant(QUIET, FmuMapping(path, **NAMES[2]), START, PERIOD)
+
+
+@pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil.txt", "a\\..\\evil.txt", "c:evil.txt", "a/../../evil.txt"])
+def test_an_archive_that_climbs_out_of_its_folder_is_refused(tmp_path, name):
+    path = tmp_path / "evil.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", "<x/>")
+        archive.writestr(name, "evil")
+    with pytest.raises(ValueError, match="would climb out"):
+        FmuFolder(path)
+    assert not list(tmp_path.rglob("evil.txt"))
+
+
+def test_what_is_not_an_archive_of_an_fmu_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="does not exist"):
+        FmuFolder(tmp_path / "missing.fmu")
+    (tmp_path / "text.fmu").write_text("hello")
+    with pytest.raises(ValueError, match="not a zip archive"):
+        FmuFolder(tmp_path / "text.fmu")
+    with zipfile.ZipFile(tmp_path / "empty.fmu", "w") as archive:
+        archive.writestr("readme", "hello")
+    with pytest.raises(ValueError, match="holds no modelDescription.xml"):
+        FmuFolder(tmp_path / "empty.fmu")
+
+
+def test_a_damaged_archive_is_refused(tmp_path):
+    path = build_crane(tmp_path / "crane.fmu", 2)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"<?xml") + 20] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="cannot be extracted"):
+        FmuFolder(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such signals")
+def test_the_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
+    path = build_crane(tmp_path / "crane.fmu", 2)
+    code = (
+        "import sys, time; from pathlib import Path; from servobench.plant.fmu.archive import FmuFolder;"
+        "folder = FmuFolder(Path(sys.argv[1])); print(folder.root, flush=True); time.sleep(60)"
+    )
+    environment = {**os.environ, "TMPDIR": tempfile.gettempdir(), "PYTHONPATH": str(Path.cwd())}
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True, env=environment
+    ) as other:
+        root = Path(other.stdout.readline().strip())
+        sweep_stale_folders()
+        assert root.is_dir()
+        other.send_signal(signal.SIGKILL)
+    assert root.is_dir()
+    sweep_stale_folders()
+    assert not root.exists()
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's memory accounting")
+@pytest.mark.parametrize("version", [2, 3])
+def test_memory_stays_flat_over_many_lives_of_a_plant(tmp_path, version):
+    def live(count: int) -> None:
+        for _ in range(count):
+            plant = crane(tmp_path, version)
+            plant.step(Command([0.1, 0.1]))
+            plant.close()
+
+    live(30)
+    before = resident()
+    live(100)
+    assert resident() - before < 5e6

@@ -1,0 +1,159 @@
+"""Other tools run the exported UR5 and agree with the kinematic plant: fmpy, libcosimpy, CasADi's integrator."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from functools import cache
+
+import casadi
+import numpy as np
+import pytest
+from fmpy import simulate_fmu
+
+from servobench.fmus.export import arm_layout, default_actuation
+from servobench.fmus.ur5_plant import cached_fmu
+from servobench.fmus.variables import parameters_of
+from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.signals import Command
+
+PERIOD = 0.05
+STEPS = 1000
+MISMATCHES = ["none", "severe"]
+OFFSETS = arm_layout(6).offsets
+COMMANDS = np.random.default_rng(1).uniform(-1.3, 1.3, (STEPS, 6))  # some beyond the limit of 1 rad/s
+COMMANDS.setflags(write=False)
+
+
+@cache
+def model_of(mismatch: str):
+    return sample_mismatch(parse_mismatch(mismatch), nominal_ur5(), 3)[0]
+
+
+@cache
+def oracle(mismatch: str):
+    """Return joint positions and true features after each step, (STEPS, 9), by numpy."""
+    config = KinematicConfig(feature_noise=0.0, command_delay_periods=0)
+    plant = KinematicPlant(config, PlantSetup(model_of(mismatch), np.array(HOME), PERIOD))
+    rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in COMMANDS]
+    return np.array(rows)
+
+
+def parameters(mismatch: str):
+    return parameters_of(model_of(mismatch), default_actuation())
+
+
+def scalars(mismatch: str) -> dict[str, float]:
+    groups = {group.name: group for group in arm_layout(6).groups}
+    return {
+        scalar: float(value)
+        for name, values in parameters(mismatch).items()
+        for scalar, value in zip(groups[name].scalar_names(), values, strict=True)
+    }
+
+
+@pytest.mark.parametrize("mismatch", MISMATCHES)
+@pytest.mark.parametrize("version", [2, 3])
+def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch):
+    time = np.arange(STEPS) * PERIOD
+    if version == 2:
+        names = [f"joint_velocity_command[{i + 1}]" for i in range(6)]
+        signal = np.array([tuple(row) for row in np.c_[time, COMMANDS]], dtype=[(n, float) for n in ["time", *names]])
+        start = scalars(mismatch)
+        outputs = [f"joint_position[{i + 1}]" for i in range(6)] + [f"ball_position[{i + 1}]" for i in range(3)]
+    else:
+        signal = np.zeros(STEPS, dtype=[("time", float), ("joint_velocity_command", float, (6,))])
+        signal["time"], signal["joint_velocity_command"] = time, COMMANDS
+        start = {name: values.tolist() for name, values in parameters(mismatch).items()}
+        outputs = ["joint_position", "ball_position"]
+    result = simulate_fmu(
+        str(cached_fmu(version)),
+        fmi_type="CoSimulation",
+        stop_time=STEPS * PERIOD,
+        output_interval=PERIOD,
+        step_size=PERIOD,
+        start_values=start,
+        input=signal,
+        output=outputs,
+    )
+    came = np.column_stack([result[name] for name in outputs])[1:]
+    np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)
+
+
+COSIM = """
+import json, sys
+from pathlib import Path
+from libcosimpy.CosimExecution import CosimExecution
+from libcosimpy.CosimManipulator import CosimManipulator
+from libcosimpy.CosimObserver import CosimObserver
+from libcosimpy.CosimSlave import CosimLocalSlave
+task = json.loads(Path(sys.argv[1]).read_text())
+execution = CosimExecution.from_step_size(task["nanoseconds"])
+slave = execution.add_local_slave(CosimLocalSlave(task["fmu"], "arm"))
+manipulator, observer = CosimManipulator.create_override(), CosimObserver.create_last_value()
+assert execution.add_manipulator(manipulator) and execution.add_observer(observer)
+for reference, value in task["parameters"]:
+    assert execution.real_initial_value(slave, reference, value)
+rows = []
+for command in task["commands"]:
+    assert manipulator.slave_real_values(slave, task["inputs"], command)
+    assert execution.step()
+    rows.append(list(observer.last_real_values(slave, task["outputs"])))
+Path(sys.argv[2]).write_text(json.dumps(rows))
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("libcosimpy") is None, reason="libcosimpy is not installed")
+@pytest.mark.parametrize("mismatch", MISMATCHES)
+def test_libcosimpy_runs_it_and_agrees_over_a_thousand_random_steps(mismatch, tmp_path):
+    task, result = tmp_path / "task.json", tmp_path / "result.json"
+    references = {
+        "inputs": range(OFFSETS["joint_velocity_command"], OFFSETS["joint_position"]),
+        "outputs": [
+            *(OFFSETS["joint_position"] + i for i in range(6)),
+            *(OFFSETS["ball_position"] + i for i in range(3)),
+        ],
+        "parameters": [
+            (OFFSETS[name] + i, value)
+            for name, values in parameters(mismatch).items()
+            for i, value in enumerate(values.tolist())
+        ],
+    }
+    content = {"fmu": str(cached_fmu(2)), "nanoseconds": round(PERIOD * 1e9), "commands": COMMANDS.tolist()}
+    task.write_text(json.dumps(content | {name: list(values) for name, values in references.items()}))
+    # In a process of its own: its C++ writes to the standard output and ends the process on what it does not like.
+    done = subprocess.run(
+        [sys.executable, "-c", COSIM, str(task), str(result)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_allclose(json.loads(result.read_text()), oracle(mismatch), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mismatch", MISMATCHES)
+def test_casadi_integrates_the_model_exchange_side_and_agrees_over_a_thousand_random_steps(mismatch):
+    folder = FmuFolder(cached_fmu(2))
+    builder = casadi.DaeBuilder("ur5", str(folder.root / "."))
+    x, u = casadi.MX.sym("x", 12), casadi.MX.sym("u", 6)
+    values = scalars(mismatch)
+    p = casadi.DM([values[name] for name in builder.p()])
+    model = builder.create("model", ["x", "u", "p"], ["ode", "y"])
+    order = {name: i for i, name in enumerate(builder.x())}
+    positions = [order[f"joint_position[{i + 1}]"] for i in range(6)]
+    balls = [list(builder.y()).index(f"ball_position[{i + 1}]") for i in range(3)]
+    equations = {"x": x, "u": u, "ode": model(x, u, p)[0]}
+    step = casadi.integrator("step", "cvodes", equations, 0.0, PERIOD, {"abstol": 1e-14, "reltol": 1e-14})
+    state = np.zeros(12)
+    state[positions] = HOME
+    came = []
+    for command in COMMANDS:
+        state = np.asarray(step(x0=state, u=command)["xf"])[:, 0]
+        output = np.asarray(model(state, command, p)[1])[:, 0]
+        came.append(np.r_[state[positions], output[balls]])
+    np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)
+    folder.close()

@@ -1,0 +1,220 @@
+"""Films and snapshots of runs, from the log alone."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from kit.command import servobench
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.pictures import film as record
+from servobench.harness.pictures.replay import Replay, Trail, logged_run
+from servobench.harness.pictures.style import method_styles
+from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.experiment import RunRequest
+
+REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run_experiment(REQUEST, Settings({"circle": {"laps": 1, "lap_time": 2.0}}))
+
+
+@pytest.fixture(scope="module")
+def run(result):
+    return logged_run(result.row, result.steps, {})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, result):
+    made = tmp_path_factory.mktemp("record") / "out"
+    results.create_folder(made, {"configuration": {"bullet": {"width": 160, "height": 120}}})
+    results.write_part(made, 0, result.row, result.steps)
+    results.collect(made)
+    return made
+
+
+def test_the_ball_in_the_scene_is_where_the_log_says(run):
+    with Replay(run) as replay:
+        for k in (0, 20, 39):
+            replay.place(k)
+            np.testing.assert_allclose(replay._scene.ball_position(), run.ball[k], atol=1e-6)
+
+
+def test_the_reference_is_a_horizontal_circle_in_the_cameras_frame_wherever_that_is(run):
+    np.testing.assert_allclose(run.model.to_camera(run.reference)[:, 2], 1.25)
+    centre = run.model.to_base(np.array([0.0, 0.0, 1.25]))
+    np.testing.assert_allclose(np.linalg.norm(run.reference - centre, axis=1), 0.3)
+
+
+def test_the_cameras_view_has_the_detection_in_it(run):
+    with Replay(run) as replay:
+        replay.place(0)
+        picture = replay.camera_view()
+    assert picture.shape == (240, 320, 3)
+    assert (picture == (40, 255, 80)).all(axis=2).any()
+
+
+def test_a_trail_is_drawn_in_its_colour_and_pale_behind_the_arm(run):
+    colour = (255, 0, 255)
+    inside = np.linspace((0.0, 0.0, 0.02), (0.0, 0.0, 0.06), 5)  # within the arm's foot
+    outside = np.linspace((0.6, -0.4, 0.3), (0.6, 0.0, 0.3), 5)
+    with Replay(run) as replay:
+        replay.place(0)
+        plain, seen, hidden = (replay.overview(trails).astype(int) for trails in (
+            [], [Trail(outside, colour, 2)], [Trail(inside, colour, 2)]))  # fmt: skip
+    assert (seen == colour).all(axis=2).any()
+    assert not (hidden == colour).all(axis=2).any()
+    assert 0 < np.abs(hidden - plain).max() < 100
+
+
+def test_a_frame_shows_the_time_grow(run):
+    first, last = record.draw_frame(run, 0), record.draw_frame(run, 39)
+    assert first.shape == last.shape == (record.HEIGHT, record.WIDTH, 3)
+    colour = np.array(mpl.colors.to_rgb(method_styles(["calibrated"])["calibrated"].colour)) * 255
+    error_panel = (slice(550, 680), slice(90, 930))
+    dark = [(np.abs(frame[error_panel] - colour).max(axis=2) < 30).sum() for frame in (first, last)]
+    assert dark[1] > dark[0] + 200
+
+
+@pytest.fixture(scope="module")
+def films(run, tmp_path_factory):
+    pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
+    told = []
+    stem = tmp_path_factory.mktemp("films") / "run"
+    paths = record.write_recording(run, stem, record.KINDS, lambda share, what: told.append((share, what)))
+    return paths, told
+
+
+def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
+    import imageio_ffmpeg
+
+    paths, told = films
+    assert [path.name for path in paths] == ["run_snapshots.png", "run_snapshots.pdf", "run.mp4", "run.gif"]
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(paths[2]))
+    assert (frames, seconds) == (40, pytest.approx(2.0, abs=0.05))
+    with Image.open(paths[3]) as film:
+        assert film.n_frames == 20
+        assert film.size[0] == record.GIF_WIDTH
+    assert paths[3].stat().st_size < 6e6 * 2.0 / 20.0
+    shares = [share for share, what in told if what == "frames"]
+    assert shares == sorted(shares)
+    assert len(shares) == 40
+
+
+def test_snapshots_go_once_around(run):
+    assert record._lap(run) == 39
+    twice = replace(run, reference=np.concatenate([run.reference, run.reference]))
+    assert 38 <= record._lap(twice) <= 41
+    resting = replace(run, reference=np.tile(run.reference[0], (40, 1)))
+    assert record._lap(resting) == 39
+    assert len(record.draw_snapshots(run).axes) == record.PLACES
+
+
+def test_without_ffmpeg_there_is_one_line_and_snapshots_still_work(monkeypatch, capsys, tmp_path, folder):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert servobench(monkeypatch, "record", str(folder), "--out", str(tmp_path)) == 2
+    error = capsys.readouterr().err
+    assert "pip install 'servobench[animation]'; --kinds snapshots works without it" in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+    assert servobench(monkeypatch, "record", str(folder), "--kinds", "snapshots", "--out", str(tmp_path)) == 0
+    assert {path.suffix for path in tmp_path.iterdir()} == {".png", ".pdf"}
+
+
+def test_a_new_run_is_recorded_below_the_results(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--plant", "kinematic", "--controller", "constant", "--task", "exp2", "--kinds", "snapshots"]
+    assert servobench(monkeypatch, "record", *arguments, "--set", "exp2.duration=0.5") == 0
+    name = "kinematic-constant-exp2-moderate-0_snapshots.png"
+    assert (tmp_path / "results" / "recordings" / name).is_file()
+    assert name in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--run", "a"), "--run names a run of a results folder, and no folder is given"),
+        (("FOLDER", "--controller", "rls"), "--controller belongs to a new run"),
+        (("FOLDER", "--run", "nobody"), "has no run 'nobody'"),
+        (("FOLDER", "--kinds", "mp4,avi"), "--kinds: unknown 'avi'"),
+        (("FOLDER", "--kinds", ","), "--kinds is empty; valid: mp4"),
+        (("NONE",), "is not a results folder"),
+        (("--seed", "-1"), "seed must not be negative, got -1"),
+        (("--task", "exp9"), "unknown task 'exp9'"),
+        (("--set", "circel.laps=1"), "unknown section 'circel'"),
+    ],
+)
+def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, folder, arguments, message):
+    places = {"FOLDER": str(folder), "NONE": str(tmp_path / "none")}
+    assert servobench(monkeypatch, "record", *(places.get(word, word) for word in arguments)) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_folder_with_several_runs_wants_a_name(monkeypatch, capsys, tmp_path, result):
+    results.create_folder(tmp_path / "out", {})
+    for index, name in enumerate(("a", "b")):
+        results.write_part(tmp_path / "out", index, result.row | {"run_id": name}, result.steps)
+    assert servobench(monkeypatch, "record", str(tmp_path / "out")) == 2
+    assert "holds 2 runs; name one with --run, such as a" in capsys.readouterr().err
+
+
+def test_runs_that_cannot_be_shown_are_refused(result):
+    row, steps = result.row, result.steps
+    with pytest.raises(ConfigurationError, match="has no steps: it ended before its first period"):
+        logged_run(row, steps.iloc[:0], {})
+    with pytest.raises(ConfigurationError, match="has no column joint_position_elbow_rad"):
+        logged_run(row, steps.drop(columns="joint_position_elbow_rad"), {})
+    other = json.loads(row["mismatch_values"])
+    other["tool_offset"][0] += 1e-3
+    with pytest.raises(ConfigurationError, match="was made on another robot than mismatch moderate and seed 3"):
+        logged_run(row | {"mismatch_values": json.dumps(other)}, steps, {})
+    with pytest.raises(ConfigurationError, match="'mild' is not known"):
+        logged_run(row | {"mismatch": "mild"}, steps, {})
+    with pytest.raises(ConfigurationError, match="settings of bullet in the manifest: width must be"):
+        logged_run(row, steps, {"width": -1})
+
+
+def test_settings_of_another_version_are_passed_over(result):
+    assert logged_run(result.row, result.steps, {"width": 64, "height": 48, "new_in_2030": 1}).config.width == 64
+
+
+def test_a_plant_with_a_robot_of_its_own_is_refused(result, monkeypatch):
+    class Entry:
+        own_robot = True
+
+    monkeypatch.setattr("servobench.harness.pictures.replay.find_plant", lambda name: Entry())
+    with pytest.raises(ConfigurationError, match="brings a robot of its own, no UR5"):
+        logged_run(result.row | {"plant": "fmu:crane.toml"}, pd.DataFrame(), {})
+
+
+def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
+    request = RunRequest("kinematic", "rbfnn_mfac_plus", "random", "moderate+camera_move=90deg", 3)
+    made = run_experiment(request, Settings({"random": {"duration": 2.0}}))
+    shown = logged_run(made.row, made.steps, {})
+    assert shown.moved_from == 21  # of 40 periods; the move happens during the one before
+    arm = np.array([shown.model.to_base(shown.model.feature(q)) for q in shown.joint_position])
+    np.testing.assert_allclose(shown.ball, arm, atol=1e-9)
+    before, after = shown.reference[:21], shown.reference[21:]
+    np.testing.assert_allclose(np.ptp(before, axis=0), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.ptp(after, axis=0), 0.0, atol=1e-9)
+    assert np.linalg.norm(after[0] - before[0]) > 0.1
+    targets = [record._trails(shown, k)[0].points.mean(axis=0) for k in (0, 20, 21, 39)]
+    np.testing.assert_allclose(targets, [before[0], before[0], after[0], after[0]], atol=1e-9)
+    with Replay(shown) as replay:
+        views = []
+        for k in (20, 21):
+            replay.place(k)
+            views.append(replay.camera_view())
+    assert (views[0] != views[1]).mean() > 0.1

@@ -1,0 +1,176 @@
+"""The report: the notebook runs on every kind of folder, and the page works in a browser without a network."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pandas as pd
+import pytest
+
+from kit.browser import browser_page, find_browser
+from kit.command import servobench
+from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.pictures import report
+
+needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """A real, small comparison with its report, and what the command said."""
+    out = tmp_path_factory.mktemp("compared") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        arguments = ["--plants", "kinematic", "--controllers", "constant,calibrated", "--tasks", "exp2,circle"]
+        quick = ["--set", "exp2.duration=2", "--set", "circle.laps=1", "--workers", "1"]
+        assert servobench(patch, "compare", *arguments, *quick, "--out", str(out)) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    folder = sweep(tmp_path_factory.mktemp("swept") / "out")
+    report.write_report(folder)
+    return folder
+
+
+def test_the_notebook_is_committed_without_outputs_and_has_parameters_in_its_first_cell():
+    notebook = json.loads(report.notebook_path().read_text())
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+    assert report.FOLDER_VARIABLE in "".join(code[0]["source"])
+
+
+def test_a_comparison_ends_with_a_report_that_holds_everything_in_itself(compared):
+    page = (compared / report.NAME).read_text()
+    assert len(page) < 10e6
+    assert not re.search(r'<(script|link|img)[^>]+(src|href)="(?!data:)', page)
+    assert len(re.findall(r"\* plotly\.js v", page)) == 1
+    assert page.count('<img alt="') >= 6
+    assert 'class="highlight' not in page  # no code
+    assert "Name the folder in the next cell" not in page
+
+
+def test_the_path_of_the_report_is_told_at_the_end(monkeypatch, capsys, tmp_path):
+    made = []
+    monkeypatch.setattr(report, "write_report", lambda folder, out: made.append(folder) or (folder / results.RUNS))
+    run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1"]
+    assert servobench(monkeypatch, *run, "--report", "--out", str(tmp_path / "a")) == 0
+    assert capsys.readouterr().out.strip().splitlines()[-1].startswith(f"report: {tmp_path / 'a'}")
+    assert servobench(monkeypatch, *run, "--out", str(tmp_path / "b")) == 0
+    assert "report:" not in capsys.readouterr().out
+    assert made == [tmp_path / "a"]
+
+
+def test_runs_whose_report_fails_are_kept_and_the_failure_is_told(monkeypatch, capsys, tmp_path):
+    def fail(folder, out):
+        raise report.ReportFailed(f"report on {folder}: the notebook failed: no kernel")
+
+    monkeypatch.setattr(report, "write_report", fail)
+    run = ["run", "--plant", "kinematic", "--controller", "constant", "--set", "exp2.duration=1", "--report"]
+    assert servobench(monkeypatch, *run, "--out", str(tmp_path / "out")) == 0
+    assert "no report: report on" in capsys.readouterr().out
+    assert len(results.load_runs(tmp_path / "out")) == 1
+
+
+def test_a_folder_with_failed_runs_only_gives_an_honest_report(tmp_path):
+    page = report.write_report(failed_only(tmp_path / "out")).read_text()
+    assert "of which 0 reached the last period" in page
+    assert "ValueError: no such thing" in page
+    assert "No run of a move came as far as to be judged." in page
+    assert "No steps are in this folder, hence no paths." in page
+
+
+def test_a_folder_with_further_tables_shows_them(tmp_path):
+    folder = write_folder(tmp_path / "out", [made_up_row("a")], [])
+    pd.DataFrame({"claim": ["converges faster"], "answer": ["not reproduced"]}).to_csv(folder / "claims.csv")
+    page = report.write_report(folder, tmp_path / "page.html").read_text()
+    assert "not reproduced" in page
+    assert not (folder / report.NAME).exists()
+
+
+def test_folders_that_cannot_be_reported_are_one_line(monkeypatch, capsys, tmp_path):
+    foreign = comparison(tmp_path / "foreign")
+    (foreign / results.MANIFEST).write_text('{"schema_version": "0"}')
+    empty = comparison(tmp_path / "empty")
+    pd.read_parquet(empty / results.RUNS).iloc[:0].to_parquet(empty / results.RUNS)
+    for folder, words in (
+        (foreign, "has results of schema '0'; this servobench reads"),
+        (empty, "holds no finished run"),
+        (tmp_path / "none", "is not a results folder"),
+    ):
+        assert servobench(monkeypatch, "report", str(folder)) == 2
+        error = capsys.readouterr().err
+        assert words in error
+        assert error.count("\n") == 1
+
+
+def test_a_page_that_cannot_be_written_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(report, "execute_notebook", lambda folder: None)
+    monkeypatch.setattr(report, "_page", lambda notebook, folder: "page")
+    with pytest.raises(ConfigurationError, match=r"report .*none/page.html cannot be written: No such file"):
+        report.write_report(comparison(tmp_path / "out"), tmp_path / "none" / "page.html")
+
+
+def test_a_notebook_that_fails_is_told_with_the_last_line_of_its_error(monkeypatch, tmp_path):
+    broken = tmp_path / "broken.ipynb"
+    cell = {"cell_type": "code", "id": "a", "metadata": {}, "execution_count": None, "outputs": [],
+            "source": "raise ValueError('out of luck')"}  # fmt: skip
+    broken.write_text(json.dumps({"cells": [cell], "metadata": {}, "nbformat": 4, "nbformat_minor": 5}))
+    monkeypatch.setattr(report, "notebook_path", lambda: broken)
+    with pytest.raises(report.ReportFailed, match="the notebook failed: ValueError: out of luck"):
+        report.write_report(comparison(tmp_path / "out"))
+
+
+@needs_browser
+def test_the_page_of_a_comparison_works_in_a_browser_without_a_network(compared, tmp_path):
+    with browser_page(tmp_path) as page:
+        page.open(compared / report.NAME)
+        page.wait_for("document.querySelector('#paths canvas')")
+        page.wait_for("document.querySelectorAll('table.dataTable tbody tr').length > 4")
+        assert page.evaluate("document.querySelector('#paths').data.length") == 8
+        headings = page.evaluate("Array.from(document.querySelectorAll('h2'), h => h.firstChild.textContent)")
+        assert headings == page.evaluate("Array.from(document.querySelectorAll('nav a'), a => a.textContent)")
+        assert len(headings) == 8
+        assert page.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)")
+        assert "exp2 on kinematic" in page.evaluate("document.querySelector('#paths').textContent")
+        assert not page.evaluate("document.querySelector('[data-title*=Share]')")
+        sort_by = (
+            "Array.from(document.querySelectorAll('th'))"
+            ".filter(h => h.textContent.trim() === 'controller' && h.offsetHeight > 0).at(-1)"
+        )
+        column = (
+            "Array.from(document.querySelectorAll('.dt-scroll-body table')).at(-1)"
+            ".querySelectorAll('tbody tr td:nth-child(4)')"
+        )
+        read = f"Array.from({column}, d => d.textContent)"
+        page.evaluate(f"{sort_by}.click()")
+        page.wait_for(f"{read}[0] === 'calibrated' && {read}.at(-1) === 'constant'")
+        page.evaluate(f"{sort_by}.click()")
+        page.wait_for(f"{read}[0] === 'constant'")
+        assert page.complaints() == []
+        assert page.requests() == []
+
+
+@needs_browser
+def test_the_page_of_a_sweep_works_in_a_browser_without_a_network(swept, tmp_path):
+    with browser_page(tmp_path) as page:
+        page.open(swept / report.NAME)
+        page.wait_for("document.querySelectorAll('table.dataTable tbody tr').length > 20")
+        assert page.evaluate("document.querySelector('#paths')") is None
+        assert page.evaluate("document.images.length") == 1
+        assert page.evaluate("document.images[0].naturalWidth") > 0
+        assert page.complaints() == []
+        assert page.requests() == []
+
+
+@needs_browser
+def test_the_browser_would_have_noticed(tmp_path):
+    bad = tmp_path / "bad.html"
+    bad.write_text('<script>missing()</script><img src="http://127.0.0.1:9/picture.png">')
+    with browser_page(tmp_path / "profile") as page:
+        page.open(bad)
+        assert any("missing" in complaint for complaint in page.complaints())
+        assert page.requests() == ["http://127.0.0.1:9/picture.png"]

@@ -1,0 +1,92 @@
+"""`servobench tune` as a user meets it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from kit.command import servobench
+from servobench.harness.studies.tuning.files import read_tuned
+from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
+
+SHORT = ["--controllers", "rls", "--seeds", "4", "--workers", "1"]
+
+
+def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypatch, capsys, tmp_path):
+    out = tmp_path / "out"
+    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(out)) == 0
+    assert "rls" in capsys.readouterr().out
+    first = read_tuned(out / "rls.toml")
+    assert first.settings == nested_settings(default_values(find_tunable("rls")))
+    assert first.score == first.score_of_defaults
+    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "2", "--out", str(out)) == 0
+    second = read_tuned(out / "rls.toml")
+    assert (second.trials, second.score_of_defaults) == (2, first.score)
+    assert sorted(path.name for path in out.iterdir()) == ["rls.journal", "rls.toml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--controllers", "rsl"), "unknown controller 'rsl': did you mean 'rls'?"),
+        (("--controllers", "kalman_mfac"), "controller kalman_mfac takes the values of ukf_mfac; tune that one"),
+        (("--controllers", "mfac+rls"), "controller mfac+rls has no search space"),
+        (("--controllers", ","), "--controllers is empty"),
+        (("--trials", "0"), "trials must be at least 1, got 0"),
+        (("--workers", "0"), "workers must be at least 1, got 0"),
+        (("--seeds", "0"), "seeds must be 4, 8, 12"),
+        (("--seeds", "6"), "seeds must be 4, 8, 12"),
+        (("--seeds", "8000"), "12000 seeds from 10000 on leave the tuning range 10000:20000"),
+        (("--offset", "9999"), "12 seeds from 19999 on leave the tuning range 10000:20000"),
+        (("--offset", "-1"), "12 seeds from 9999 on leave the tuning range 10000:20000"),
+        (("--study-seed", "-1"), "the study's seed must not be negative, got -1"),
+        (("--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
+        (("--plants", ""), "no plant to tune on"),
+    ],
+)
+def test_bad_input_is_one_line_exit_code_2_and_nothing_written(monkeypatch, capsys, tmp_path, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert servobench(monkeypatch, "tune", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("servobench: ")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(monkeypatch, capsys, tmp_path):
+    note = tmp_path / "note.txt"
+    note.write_text("mine")
+    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(tmp_path)) == 2
+    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", str(note)) == 2
+    assert capsys.readouterr().err.count("exists already and holds no study; name another folder with --out") == 2
+    out = str(tmp_path / "out")
+    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", out) == 0
+    assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", out, "--offset", "40") == 2
+    assert "rls.journal was made with other seeds; name another folder with --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_ctrl_c_keeps_the_study(tmp_path, workers):
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "servobench", "tune", "--controllers", "constant", "--seeds", "4"]
+    command += ["--workers", workers, "--trials", "500", "--out", str(out)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+    journal, deadline = out / "constant.journal", time.monotonic() + 120
+    while not journal.exists() or journal.read_text().count('"values":[') < 2:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130, output
+    assert "Traceback" not in output
+    assert "interrupted; the same call goes on where it stopped" in output
+    assert 2 <= read_tuned(out / "constant.toml").trials < 500

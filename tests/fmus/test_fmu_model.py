@@ -1,0 +1,317 @@
+"""The exported UR5 as a model: agreement with numpy and fmpy, derivatives, saved states, reset, refusals."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fmpy import simulate_fmu
+
+from servobench.fmus.export import default_actuation
+from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
+from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
+from servobench.fmus.variables import parameters_of
+from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.description import read_description
+from servobench.plant.fmu.fmu_plant import open_slave
+from servobench.plant.fmu.slave import FmuError, Port
+from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.signals import Command
+
+VERSIONS = [2, 3]
+
+
+def mismatched(text: str, seed: int = 3):
+    return sample_mismatch(parse_mismatch(text), nominal_ur5(), seed)[0]
+
+
+def setup(text: str = "none", period: float = 0.05) -> PlantSetup:
+    return PlantSetup(mismatched(text), np.array(HOME), period)
+
+
+class Opened:
+    """An instance of the exported FMU, for calls below the plant."""
+
+    def __init__(self, version: int, start: bool = True) -> None:
+        path = cached_fmu(version)
+        self.folder = FmuFolder(path)
+        self.description = read_description(path, self.folder.root)
+        self.slave = open_slave(self.description, self.folder)
+        if start:
+            self.slave.start(0.0)
+
+    def port(self, *names: str) -> Port:
+        return Port(self.description.select(names, "test"))
+
+    def get(self, *names: str):
+        port = self.port(*names)
+        self.slave.reader(port)()
+        return port.values
+
+    def set(self, name: str, values) -> None:
+        port = self.port(name)
+        port.values[:] = values
+        self.slave.writer(port)()
+
+    def derivative(self, unknown: str, known: str):
+        knowns, unknowns = self.port(known), self.port(unknown)
+        columns = []
+        for k in range(knowns.values.size):
+            knowns.values[:] = np.eye(knowns.values.size)[k]
+            self.slave.derivative(unknowns, knowns)
+            columns.append(unknowns.values.copy())
+        return np.column_stack(columns)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.slave.close()
+        self.folder.close()
+
+
+@pytest.mark.parametrize("mismatch", ["none", "severe", "factory"])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_fmu_agrees_with_the_kinematic_plant_over_a_thousand_random_steps(version, mismatch):
+    common = {"feature_noise": 0.002, "latency_periods": 1, "drop_probability": 0.1, "joint_range": 2.9}
+    plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, max_joint_speed=2.0, **common), setup(mismatch))
+    oracle = KinematicPlant(KinematicConfig(max_joint_speed=2.0, **common), setup(mismatch))
+    assert plant.spec.joint_names == oracle.spec.joint_names
+    generator, stops = np.random.default_rng(1), 0
+    pairs = [(plant.reset(7), oracle.reset(7))]
+    for k in range(1000):
+        command = Command(generator.uniform(-3.0, 3.0, 6))
+        pairs.append((plant.step(command), oracle.step(command)))
+        stops += np.count_nonzero(np.abs(pairs[-1][1].joint_position) == 2.9)
+        if k % 20 == 0:
+            np.testing.assert_allclose(plant.truth().jacobian, oracle.truth().jacobian, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(plant.truth().feature, oracle.truth().feature, rtol=0, atol=1e-9)
+    for name in ("time", "joint_position", "feature", "feature_valid"):
+        came, wanted = (np.array([getattr(pair[side], name) for pair in pairs], dtype=float) for side in (0, 1))
+        np.testing.assert_allclose(came, wanted, rtol=0, atol=1e-9, err_msg=name)
+    assert stops > 0
+    plant.close()
+
+
+@pytest.mark.parametrize("lag", [0.0, 1e-4, 10.0])
+def test_any_lag_is_solved_exactly(lag):
+    quiet = {"lag": lag, "feature_noise": 0.0, "command_delay_periods": 0}
+    plant, oracle = ENTRY.build(Ur5FmuConfig(**quiet), setup()), KinematicPlant(KinematicConfig(**quiet), setup())
+    for _ in range(20):
+        command = Command(np.full(6, 0.7))
+        came, wanted = plant.step(command), oracle.step(command)
+        np.testing.assert_allclose(came.joint_position, wanted.joint_position, rtol=0, atol=1e-9)
+    plant.close()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_many_small_steps_end_where_one_large_step_ends(version):
+    with Opened(version) as once, Opened(version) as often:
+        for each in (once, often):
+            each.set("joint_velocity_command", np.linspace(-0.9, 0.9, 6))
+        once.slave.stepper(0.5)(0.0)
+        advance = often.slave.stepper(0.005)
+        for k in range(100):
+            advance(k * 0.005)
+        np.testing.assert_allclose(
+            often.get("joint_position", "joint_velocity"), once.get("joint_position", "joint_velocity"), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+def test_fmpy_runs_both_interfaces_to_the_reference(interface):
+    with zipfile.ZipFile(cached_fmu(2)) as archive:
+        header, commands = read_table(archive.read(INPUT_FILE).decode())
+        _, wanted = read_table(archive.read(OUTPUT_FILE).decode())
+    # For model exchange the held commands are steps at the end of each period.
+    doubled = np.repeat(commands, 2, axis=0)[1:]
+    doubled[:, 1:] = np.repeat(commands[:, 1:], 2, axis=0)[:-1]
+    signal = commands if interface == "CoSimulation" else doubled
+    inputs = np.array([tuple(row) for row in signal], dtype=[(name, float) for name in header])
+    outputs = [f"joint_position[{i + 1}]" for i in range(6)] + [f"ball_position[{i + 1}]" for i in range(3)]
+    last = 40
+    result = simulate_fmu(
+        str(cached_fmu(2)),
+        fmi_type=interface,
+        stop_time=float(commands[last, 0]),
+        output_interval=0.05,
+        step_size=0.05,
+        relative_tolerance=1e-9,
+        input=inputs,
+        output=outputs,
+    )
+    came = np.array([result[name][-1] for name in outputs])
+    tolerance = 1e-9 if interface == "CoSimulation" else 1e-5  # the solver's
+    np.testing.assert_allclose(came, np.r_[wanted[last, 1:7], wanted[last, 13:16]], rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(version):
+    model, actuation = mismatched("severe"), default_actuation()
+    with Opened(version, start=False) as opened:
+        for name, values in parameters_of(model, actuation).items():
+            opened.set(name, values)
+        opened.slave.start(0.0)
+        opened.set("joint_velocity_command", [0.5, 2.0, -2.0, 0.1, 0.0, -0.3])
+        opened.slave.stepper(0.3)(0.0)
+        q = opened.get("joint_position")
+        ball = opened.derivative("ball_position", "joint_position")
+        np.testing.assert_allclose(ball, model.jacobian(q), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(opened.get("jacobian").reshape(3, 6), model.jacobian(q), rtol=0, atol=1e-9)
+        hessian = opened.derivative("jacobian", "joint_position")
+        step = 1e-6 * np.eye(6)
+        differences = [(model.jacobian(q + d) - model.jacobian(q - d)).ravel() / 2e-6 for d in step]
+        np.testing.assert_allclose(hessian, np.column_stack(differences), atol=1e-8)
+        lag = np.diag(1.0 / actuation.lag * np.array([1.0, 0.0, 0.0, 1.0, 1.0, 1.0]))  # two commands are clipped
+        np.testing.assert_allclose(opened.derivative("der(joint_velocity)", "joint_velocity_command"), lag)
+        np.testing.assert_allclose(opened.derivative("der(joint_position)", "joint_velocity"), np.eye(6))
+
+
+@pytest.mark.parametrize(
+    "parameter", ["a", "alpha", "pitch", "joint_offset", "gear_ratio", "tool", "camera_rpy", "base_rpy"]
+)
+def test_derivatives_by_parameters_equal_differences(parameter):
+    with Opened(2) as opened:
+        value = opened.get(parameter).copy()
+        came = opened.derivative("ball_position", parameter)
+        for k in range(value.size):
+            column = 0.0
+            for sign in (1.0, -1.0):
+                opened.set(parameter, value + sign * 1e-6 * np.eye(value.size)[k])
+                column += sign * opened.get("ball_position").copy() / 2e-6
+            opened.set(parameter, value)
+            np.testing.assert_allclose(came[:, k], column, atol=1e-8)
+
+
+def run(plant, count: int, seed: int) -> list[bytes]:
+    generator = np.random.default_rng(seed)
+    rows = [plant.step(Command(generator.uniform(-1.0, 1.0, 6))) for _ in range(count)]
+    return [row.joint_position.tobytes() + row.feature.tobytes() for row in rows]
+
+
+CONTINUE = """
+import pickle, sys
+import numpy as np
+from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
+from servobench.plant.plant import PlantSetup
+from servobench.plant.signals import Command
+version, setup, state = pickle.load(sys.stdin.buffer)
+plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, latency_periods=2, drop_probability=0.1), setup)
+plant.restore_state(state)
+generator = np.random.default_rng(2)
+rows = [plant.step(Command(generator.uniform(-1.0, 1.0, 6))) for _ in range(30)]
+sys.stdout.buffer.write(b"".join(row.joint_position.tobytes() + row.feature.tobytes() for row in rows))
+plant.close()
+"""
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_restored_state_gives_the_same_bits_here_and_in_another_process(version):
+    config = Ur5FmuConfig(fmi_version=version, latency_periods=2, drop_probability=0.1)
+    plant = ENTRY.build(config, setup("severe"))
+    plant.reset(4)
+    run(plant, 20, 1)
+    state = plant.save_state()
+    wanted = run(plant, 30, 2)
+    for _ in range(2):
+        plant.restore_state(state)
+        assert run(plant, 30, 2) == wanted
+    plant.close()
+    task = pickle.dumps((version, setup("severe"), state))
+    done = subprocess.run([sys.executable, "-c", CONTINUE], input=task, capture_output=True, check=True)
+    assert done.stdout == b"".join(wanted)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_bytes_that_are_no_state_of_this_model_are_refused(version):
+    plant = ENTRY.build(Ur5FmuConfig(fmi_version=version), setup())
+    state = plant.save_state()
+    for content in (state.fmu[:-1], b"x" * len(state.fmu)):
+        with pytest.raises(FmuError, match="these bytes are no state of this model"):
+            plant.restore_state(replace(state, fmu=content))
+    plant.close()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_reset_equals_a_fresh_instance_and_two_instances_do_not_meet(version):
+    config = Ur5FmuConfig(fmi_version=version)
+    plant = ENTRY.build(config, setup())
+    plant.reset(1)
+    wanted = run(plant, 20, 1)
+    run(plant, 30, 9)
+    other = ENTRY.build(config, setup("severe"))
+    other.reset(1)
+    assert run(other, 20, 1) != wanted
+    plant.reset(1)
+    mixed = []
+    generator = np.random.default_rng(1)
+    for _ in range(20):
+        row = plant.step(Command(generator.uniform(-1.0, 1.0, 6)))
+        mixed.append(row.joint_position.tobytes() + row.feature.tobytes())
+        other.step(Command(np.full(6, 0.5)))
+    assert mixed == wanted
+    plant.close()
+    other.close()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_fmu_refuses_what_makes_no_sense(version):
+    with Opened(version) as opened:
+        with pytest.raises(FmuError, match="not finite or below the variable's minimum"):
+            opened.set("lag", -1.0)
+        with pytest.raises(FmuError, match="not finite"):
+            opened.set("joint_velocity_command", np.nan)
+        with pytest.raises(FmuError, match="computed by the model and cannot be set"):
+            opened.set("ball_position", 0.0)
+        with pytest.raises(FmuError, match="step size is negative"):
+            opened.slave.stepper(-0.1)(0.0)
+        with pytest.raises(FmuError, match="communication point is not where the last step ended"):
+            opened.slave.stepper(0.1)(1.0)
+        with pytest.raises(FmuError, match="not allowed in this phase"):
+            opened.slave.start(0.0)
+    with Opened(version, start=False) as opened:
+        opened.set("joint_lower", 10.0)
+        with pytest.raises(FmuError, match="joint_lower is not below joint_upper"):
+            opened.slave.start(0.0)
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's memory accounting")
+@pytest.mark.parametrize("version", VERSIONS)
+def test_memory_stays_flat_over_two_thousand_instances(version):
+    """Load, instantiate, run, save, restore, serialise, free and unload; whole plants live in test_fmu_plant."""
+    with Opened(version) as opened:
+        files = len(list(Path("/proc/self/fd").iterdir()))
+
+        def live(count: int) -> None:
+            for _ in range(count):
+                slave = open_slave(opened.description, opened.folder)
+                slave.start(0.0)
+                advance = slave.stepper(0.05)
+                advance(0.0)
+                state = slave.save()
+                again = slave.from_bytes(slave.to_bytes(state))
+                advance(0.05)
+                slave.restore(again)
+                slave.free(again)
+                slave.free(state)
+                slave.close()
+
+        live(1000)  # until the allocator has what it needs
+        before = resident()
+        live(2000)
+        assert resident() - before < 1e6  # one lost state an instance would be 2.5e6
+        assert len(list(Path("/proc/self/fd").iterdir())) == files

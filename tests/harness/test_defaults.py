@@ -1,0 +1,82 @@
+"""Tuned values stand in for the defaults of the classes wherever the harness builds a controller."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from servobench.controllers import ukf_mfac
+from servobench.harness.batch.manifest import describe_batch
+from servobench.harness.config import defaults
+from servobench.harness.config.defaults import default_config, tuned_file
+from servobench.harness.config.registry import controller_names, find_controller
+from servobench.harness.config.settings import ConfigurationError, Settings, flatten
+from servobench.harness.run.experiment import RunRequest
+
+
+@pytest.fixture
+def tuned(tmp_path, monkeypatch):
+    """A function that lets a text be the file of tuned values of ukf_mfac."""
+
+    def write(text):
+        (tmp_path / "tuned").mkdir(exist_ok=True)
+        (tmp_path / "tuned" / "ukf_mfac.toml").write_text(text)
+        defaults.tuned_settings.cache_clear()
+
+    monkeypatch.setattr(defaults, "files", lambda _: tmp_path)
+    yield write
+    defaults.tuned_settings.cache_clear()
+
+
+@pytest.mark.parametrize("name", controller_names())
+def test_the_defaults_of_every_controller_fit_its_class(name):
+    entry = find_controller(name)
+    assert isinstance(default_config(entry), entry.config)
+
+
+def test_a_tuned_value_replaces_the_default_of_the_class_and_leaves_the_rest(tuned):
+    tuned("score = 0.5\n[settings.law]\nstep_factor = 0.3\n")
+    entry = find_controller("ukf_mfac")
+    expected = dataclasses.replace(entry.config(), law=dataclasses.replace(entry.config().law, step_factor=0.3))
+    assert default_config(entry) == expected
+    assert entry.config() != expected
+
+
+def test_kalman_mfac_takes_the_values_of_the_filter_that_it_equals(tuned):
+    tuned("[settings.law]\nstep_factor = 0.3\n[settings.estimator]\nprocess_deviation = 0.07\n")
+    unscented, kalman = (flatten(default_config(find_controller(name))) for name in ("ukf_mfac", "kalman_mfac"))
+    common = [key for key in unscented if key in kalman and key != "estimator.form"]
+    assert [unscented[key] for key in common] == [kalman[key] for key in common]
+    assert kalman["estimator.process_deviation"] == 0.07
+
+
+def test_what_the_user_sets_wins_and_the_manifest_tells_the_tuned_rest(tuned):
+    tuned("[settings.law]\nstep_factor = 0.3\nstep_weight = 0.05\n")
+    settings = Settings({"ukf_mfac": {"law": {"step_factor": 0.4}}})
+    manifest = describe_batch([RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)], settings)
+    assert manifest["configuration"]["ukf_mfac"]["law.step_factor"] == 0.4
+    assert manifest["configuration"]["ukf_mfac"]["law.step_weight"] == 0.05
+
+
+def test_a_controller_without_a_file_keeps_the_defaults_of_its_class(tuned):
+    tuned("[settings]\n")
+    assert default_config(find_controller("mfac+rls")) == find_controller("mfac+rls").config()
+    assert default_config(ukf_mfac.ENTRY) == ukf_mfac.UkfMfacConfig()
+    assert not tuned_file("broyden").is_file()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[settings\n", "tuned values .*ukf_mfac.toml cannot be read"),
+        ("score = 1.0\n", "tuned values .*ukf_mfac.toml cannot be read: 'settings'"),
+        ("settings = 3\n", r"\[settings\] must be a table, got 3"),
+        ("[settings.law]\nstep_facto = 0.3\n", "ukf_mfac.law has no setting 'step_facto'"),
+        ("[settings.law]\nstep_factor = 3.0\n", "ukf_mfac.law: step_factor must be .* got 3"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(tuned, text, message):
+    tuned(text)
+    with pytest.raises(ConfigurationError, match=message):
+        default_config(ukf_mfac.ENTRY)

@@ -1,0 +1,175 @@
+"""The figures of made-up folders: what is drawn, that it is labelled, and that oddities do not spoil it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
+from servobench.harness.analysis.report_tables import split_tasks
+from servobench.harness.batch import results
+from servobench.harness.config.registry import CONTROLLERS as KNOWN
+from servobench.harness.pictures.conditions import draw_conditions
+from servobench.harness.pictures.draw import draw_figures, folder_figures, picture_of
+from servobench.harness.pictures.panels import ENDED
+from servobench.harness.pictures.style import method_styles
+from servobench.harness.pictures.tracks import Track, load_groups
+
+OTHERS = [f"method_{i}" for i in range(20)]
+
+
+def drawn(folder):
+    return {f"{named.kind} {named.stem}": named for named in folder_figures(folder)}
+
+
+def kinds(folder):
+    return [named.kind for named in folder_figures(folder)]
+
+
+def legend_of(figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def test_every_method_has_a_line_and_a_marker_of_its_own_so_that_colour_is_not_needed():
+    styles = method_styles([*KNOWN, *OTHERS])
+    looks = {(str(style.line), style.marker) for style in styles.values()}
+    assert len(looks) == len(KNOWN) + len(OTHERS)
+    markers = [style.marker for name, style in styles.items() if name in OTHERS]
+    assert len(set(markers)) == len(OTHERS)
+
+
+def test_a_method_looks_the_same_whatever_stands_beside_it():
+    for name in KNOWN:
+        alone, among = method_styles([name])[name], method_styles([*OTHERS, *KNOWN])[name]
+        assert (alone.colour, alone.line, alone.marker) == (among.colour, among.line, among.marker)
+
+
+def test_marks_lie_evenly_along_a_path_and_not_in_time():
+    points = np.zeros((100, 3))
+    points[90:, 0] = np.arange(10.0)  # at rest, then moving
+    marks = method_styles(["ukf_mfac"])["ukf_mfac"].path_arguments(points)["markevery"]
+    assert marks[0] == 0
+    assert min(marks[1:]) > 90
+    assert len(marks) >= 7
+
+
+def test_a_comparison_gives_the_figures_of_the_paper_and_more(tmp_path):
+    assert kinds(comparison(tmp_path / "out")) == [
+        "errors", "paths", "tracking", "tracking_path", "jacobian", "effort", "step_times",
+        "joint_speeds", "joint_speeds", "joint_speeds",
+    ]  # fmt: skip
+
+
+def test_every_axis_of_every_figure_has_a_unit_and_the_legend_every_controller(tmp_path):
+    for named in folder_figures(comparison(tmp_path / "out")):
+        figure = named.figure
+        figure.canvas.draw()
+        outer = [figure.get_supylabel(), figure.get_supxlabel()]
+        for axes in figure.axes:
+            if not axes.get_visible():
+                continue
+            assert axes.get_xlabel() or not any(label.get_visible() for label in axes.get_xticklabels()), named.stem
+            labels = [axes.get_xlabel(), axes.get_ylabel(), *outer]
+            labels += [axes.get_zlabel()] if hasattr(axes, "get_zlabel") else []
+            assert all("[" in label for label in labels if label and not label.startswith("hollow")), named.stem
+        words = legend_of(figure) or [text.get_text() for axes in figure.axes for text in axes.get_yticklabels()]
+        assert set(CONTROLLERS) <= set(words), named.stem
+
+
+def test_more_than_four_moves_go_into_several_figures(tmp_path):
+    tasks = ("exp1", "exp2", "exp3", "exp4", "random")
+    folder = comparison(tmp_path / "out", tasks=tasks)
+    assert kinds(folder).count("errors") == 2
+    assert len({named.stem for named in folder_figures(folder)}) == len(kinds(folder))
+
+
+def test_figures_are_files_in_two_formats_and_the_same_each_time(tmp_path):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
+    paths = draw_figures(folder)
+    assert {path.suffix for path in paths} == {".png", ".pdf"}
+    assert len(paths) == 12
+    before = {path.name: path.read_bytes() for path in paths}
+    assert before == {path.name: path.read_bytes() for path in draw_figures(folder)}
+
+
+def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
+    folder = comparison(tmp_path / "out", tasks=("exp1",))
+    runs, steps = pd.read_parquet(folder / results.RUNS), pd.read_parquet(folder / results.STEPS)
+    first = runs["run_id"][0]
+    runs.loc[0, "status"] = "feature_lost"
+    runs.to_parquet(folder / results.RUNS)
+    steps[(steps["run_id"] != first) | (steps["step"] < 3)].to_parquet(folder / results.STEPS)
+    for named in folder_figures(folder):
+        if named.kind in ("errors", "paths", "jacobian"):
+            assert ENDED in legend_of(named.figure), named.kind
+    assert any(named.figure.get_supxlabel().startswith("hollow") for named in folder_figures(folder))
+
+
+def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
+    short = made_up_steps("a", periods=1)
+    gaps = made_up_steps("b")
+    gaps[["jacobian_error", "error_norm_m"]] = np.nan
+    gaps.loc[5:9, ["true_feature_x_m", "feature_x_m"]] = np.nan
+    rows = [made_up_row("a", controller="ukf_mfac"), made_up_row("b", controller="rbf_pid")]
+    folder = write_folder(tmp_path / "out", rows, [short, gaps])
+    for named in folder_figures(folder):
+        picture, width = picture_of(named.figure)
+        assert picture.startswith(b"\x89PNG")
+        assert width > 300
+
+
+def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_one_is_told(tmp_path):
+    unknown = made_up_steps("a")
+    unknown["jacobian_error"] = np.nan
+    assert "jacobian" not in kinds(write_folder(tmp_path / "unknown", [made_up_row("a")], [unknown]))
+    exact = made_up_steps("a")
+    exact["jacobian_error"] = 0.0
+    folder = write_folder(tmp_path / "exact", [made_up_row("a", controller="calibrated")], [exact])
+    (figure,) = [named.figure for named in folder_figures(folder) if named.kind == "jacobian"]
+    assert legend_of(figure) == ["calibrated (exact)"]
+
+
+def test_a_plant_with_other_features_and_joints_is_drawn_under_its_own_names(tmp_path):
+    steps = made_up_steps("a", features=("sway_angle_rad", "trolley_m"))
+    row = made_up_row("a", plant="fmu:/some where/crane.toml", mismatch="none", task="target")
+    for named in folder_figures(write_folder(tmp_path / "out", [row], [steps])):
+        assert set(named.stem) <= set("abcdefghijklmnopqrstuvwxyz_0123456789.")
+        if named.kind == "errors":
+            labels = [axes.get_ylabel() for axes in named.figure.axes]
+            assert labels == ["true error", "measured\nsway_angle [rad]", "measured\ntrolley [m]"]
+        if named.kind == "paths":
+            assert "fewer than three features" in [text.get_text() for text in named.figure.axes[0].texts]
+
+
+@pytest.mark.parametrize("folder", [sweep, failed_only])
+def test_a_folder_without_steps_has_no_figures_of_them(tmp_path, folder):
+    assert draw_figures(folder(tmp_path / "out")) == []
+    assert not (tmp_path / "out" / "figures").exists()
+
+
+def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp_path):
+    moves, _ = split_tasks(results.load_runs(sweep(tmp_path / "out")))
+    figure = draw_conditions(moves, method_styles(CONTROLLERS))
+    labels = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
+    assert labels == ["latency [periods]", "camera rotation [deg]"]
+    share = np.asarray(figure.axes[1].containers[0].lines[0].get_ydata(), dtype=float)
+    np.testing.assert_allclose(share, [100.0, 100 * 4 / 6, 50.0])
+
+
+def test_nothing_is_drawn_over_conditions_that_do_not_vary(tmp_path):
+    moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "out")))
+    assert draw_conditions(moves, method_styles(CONTROLLERS)) is None
+
+
+def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
+    rows = [made_up_row(f"run{seed}", seed=seed) for seed in (7, 3, 5)]
+    folder = write_folder(tmp_path / "out", rows, [made_up_steps(row["run_id"]) for row in rows])
+    (group,) = load_groups(folder)
+    assert group.seed == 3
+    assert group.tasks["exp1"]["ukf_mfac"].run_id == "run3"
+
+
+def test_a_resting_reference_is_told_from_a_moving_one():
+    assert Track("a", "completed", made_up_steps("a")).point_to_point
+    assert not Track("a", "completed", made_up_steps("a", curve=True)).point_to_point

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from servobench.harness.run.metrics import (
+    Judgement,
+    judge_run,
+    overshoot,
+    path_length,
+    settling_time,
+)
+from servobench.plant.signals import PlantSpec
+
+PERIOD = 0.1
+
+
+def test_settling_is_the_first_time_after_which_the_error_stays():
+    error = np.array([1.0, 0.001, 0.1, *[0.001] * 10])
+    assert settling_time(error, 0.005, PERIOD) == pytest.approx(0.3)
+
+
+def test_an_error_that_came_in_too_late_or_left_again_has_not_settled():
+    assert np.isnan(settling_time(np.array([1.0] * 10 + [0.0] * 4), 0.005, PERIOD))
+    assert settling_time(np.array([1.0] * 10 + [0.0] * 5), 0.005, PERIOD) == pytest.approx(1.0)
+    assert np.isnan(settling_time(np.array([0.0] * 10 + [1.0]), 0.005, PERIOD))
+    assert np.isnan(settling_time(np.full(20, np.nan), 0.005, PERIOD))
+
+
+def test_settling_and_overshoot_agree_with_python_control():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import control
+    system = control.tf([4.0], [1.0, 1.0, 4.0])
+    times = np.arange(0.0, 15.0, 0.01)
+    _, response = control.step_response(system, times)
+    info = control.step_info(response, times, SettlingTimeThreshold=0.05, yfinal=1.0)
+    assert settling_time(np.abs(1.0 - response), 0.05, 0.01) == pytest.approx(info["SettlingTime"], abs=0.011)
+    track = np.outer(response, [0.3, 0.0, -0.4])
+    assert overshoot(track, np.array([0.3, 0.0, -0.4])) == pytest.approx(info["Overshoot"] / 100, abs=1e-9)
+
+
+def test_no_overshoot_when_the_feature_stops_short():
+    assert overshoot(np.array([[0.0, 0.0], [0.5, 0.2]]), np.array([1.0, 0.0])) == 0.0
+
+
+def test_the_path_length_of_a_square_is_its_circumference():
+    assert path_length(np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]], dtype=float)) == 4.0
+
+
+def make_steps() -> pd.DataFrame:
+    """A straight move of 1 m along x in four periods, one joint, saturated in half of them."""
+    x = np.array([0.0, 0.5, 1.0, 1.0])
+    return pd.DataFrame(
+        {
+            "time_s": np.arange(4) * 1.0,
+            "reference_x_m": 1.0,
+            "true_feature_x_m": x,
+            "joint_velocity_command_a_rad_s": [2.0, -2.0, 1.0, 0.0],
+            "error_norm_m": np.abs(1.0 - x),
+            "feature_valid": [True, True, True, False],
+            "jacobian_error": [0.2, 0.4, np.nan, np.nan],
+            "jacobian_condition": [1.0, 3.0, 2.0, 1.0],
+            "controller_time_us": [1.0, 2.0, 3.0, 4.0],
+            "plant_time_us": 5.0,
+        }
+    )
+
+
+def test_a_run_is_judged_by_hand_computed_figures():
+    spec = PlantSpec(("a",), ("x",), np.array([2.0]), np.array([-9.0]), np.array([9.0]), period=1.0)
+    got = judge_run(make_steps(), Judgement(spec, point_to_point=True, evaluate_from=1.0))
+    assert got["settling_time_s"] == 2.0
+    assert got["rms_error_m"] == pytest.approx(np.sqrt(1.25 / 4))
+    assert got["rms_error_evaluated_m"] == pytest.approx(np.sqrt(0.25 / 3))
+    assert got["max_error_m"] == 1.0
+    assert got["steady_state_error_m"] == 0.0
+    assert got["path_length_ratio"] == 1.0
+    assert got["control_effort_rad"] == 5.0
+    assert got["saturation_fraction"] == 0.5
+    assert got["feature_invalid_fraction"] == 0.25
+    assert got["jacobian_error_mean"] == pytest.approx(0.3)
+    assert got["jacobian_condition_max"] == 3.0
+    assert got["controller_time_median_us"] == 2.5
+    assert got["overshoot"] == 0.0
+
+
+def test_overshoot_of_a_moving_reference_is_not_told():
+    spec = PlantSpec(("a",), ("x",), np.array([2.0]), np.array([-9.0]), np.array([9.0]), period=1.0)
+    assert np.isnan(judge_run(make_steps(), Judgement(spec, point_to_point=False, evaluate_from=0.0))["overshoot"])

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servobench.harness.run.references import (
+    Circle,
+    FixedPoint,
+    Lemniscate,
+    Waypoints,
+    line,
+    read_waypoints,
+)
+
+CENTRE = np.array([0.1, -0.2, 1.2])
+NAMES = ("x", "y", "z")
+
+
+def test_a_preview_starts_now_and_shows_the_next_instants():
+    circle = Circle(CENTRE, 0.3, 10.0)
+    rows = circle.preview(7, 0.05, 4)
+    np.testing.assert_array_equal(rows, np.stack([circle.at(k * 0.05) for k in (7, 8, 9, 10)]))
+
+
+def test_a_fixed_point_stays():
+    np.testing.assert_array_equal(FixedPoint(CENTRE).preview(3, 0.1, 2), [CENTRE, CENTRE])
+
+
+def test_a_circle_keeps_its_radius_its_depth_and_its_lap():
+    times = np.linspace(0, 10, 201)
+    points = Circle(CENTRE, 0.3, 10.0).at(times)
+    np.testing.assert_allclose(np.linalg.norm(points - CENTRE, axis=1), 0.3, atol=1e-12)
+    assert (points[:, 2] == CENTRE[2]).all()
+    np.testing.assert_allclose(points[0], points[-1], atol=1e-12)
+    np.testing.assert_allclose(points[50], CENTRE + [0, 0.3, 0], atol=1e-12)  # 200 points a lap
+
+
+def test_a_lemniscate_crosses_its_centre_twice_a_lap():
+    eight = Lemniscate(CENTRE, 0.2, 8.0)
+    np.testing.assert_allclose(eight.at([2.0, 6.0]), [CENTRE, CENTRE], atol=1e-12)
+    np.testing.assert_allclose(eight.at(1.0), CENTRE + [0.2 / np.sqrt(2), 0.1, 0], atol=1e-12)
+
+
+def test_a_line_moves_at_constant_speed_and_rests_at_its_end():
+    path = line(np.zeros(2), np.array([1.0, 2.0]), 4.0)
+    np.testing.assert_allclose(path.at([-1.0, 1.0, 4.0, 9.0]), [[0, 0], [0.25, 0.5], [1, 2], [1, 2]])
+
+
+def test_waypoints_come_back_from_a_file(tmp_path):
+    file = tmp_path / "points.csv"
+    file.write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n2,1,0,1\n")
+    np.testing.assert_allclose(read_waypoints(file, NAMES).at(1.0), [0.5, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "must have a header and rows with the columns time_s, x_m, y_m, z_m"),
+        ("time_s,x_m,y_m\n0,0,0\n", "must have a header and rows with the columns"),
+        ("time_s,x_m,y_m,z_m\n0,0,zero,1\n", "row 1: y_m is not a number: 'zero'"),
+        ("time_s,x_m,y_m,z_m\n0,0,0\n", "row 1: z_m is not a number: None"),
+        ("time_s,x_m,y_m,z_m\n0,0,nan,1\n", "not finite"),
+        ("time_s,x_m,y_m,z_m\n1,0,0,1\n1,0,0,1\n", "times must ascend"),
+    ],
+)
+def test_a_malformed_waypoint_file_is_refused(tmp_path, text, message):
+    file = tmp_path / "points.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_waypoints(file, NAMES)
+
+
+def test_a_missing_waypoint_file_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="none.csv cannot be read"):
+        read_waypoints(tmp_path / "none.csv", NAMES)
+
+
+@pytest.mark.parametrize("curve", [Circle, Lemniscate])
+def test_a_curve_needs_a_radius_and_a_lap_time(curve):
+    with pytest.raises(ValueError, match="radius must be above 0"):
+        curve(CENTRE, 0.0, 1.0)
+    with pytest.raises(ValueError, match="lap_time must be above 0"):
+        curve(CENTRE, 1.0, -1.0)
+
+
+def test_a_line_needs_a_duration():
+    with pytest.raises(ValueError, match="duration must be above 0"):
+        line(CENTRE, CENTRE, 0.0)
+
+
+def test_waypoints_need_a_time_for_each_point():
+    with pytest.raises(ValueError, match="need times"):
+        Waypoints(np.zeros(3), np.zeros((2, 3)))

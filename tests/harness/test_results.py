@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError
+
+
+def add_part(folder, index: int, **extra: float) -> None:
+    run_id = f"run{index}"
+    steps = pd.DataFrame({"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | extra)
+    results.write_part(folder, index, {"run_id": run_id, "seed": index} | extra, steps)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    made = tmp_path / "out"
+    results.create_folder(made, {"seeds": [0]})
+    return made
+
+
+def test_parts_are_readable_before_and_after_they_are_put_together(folder):
+    for index in (1, 0):
+        add_part(folder, index)
+    before = results.load_runs(folder), results.load_steps(folder)
+    assert results.collect(folder) == 2
+    after = results.load_runs(folder), results.load_steps(folder)
+    for early, late in zip(before, after, strict=True):
+        pd.testing.assert_frame_equal(early, late)
+    assert before[0]["run_id"].tolist() == ["run0", "run1"]
+    assert not (folder / results.PARTS).exists()
+    assert results.collect(folder) == 2
+
+
+def test_tables_with_different_columns_join_with_gaps(folder):
+    add_part(folder, 0)
+    add_part(folder, 1, torque=2.5)
+    results.collect(folder)
+    steps = results.load_steps(folder)
+    assert steps["torque"].isna().tolist() == [True] * 3 + [False] * 3
+    assert results.load_steps(folder, ["run1"])["torque"].tolist() == [2.5] * 3
+
+
+def test_a_run_without_its_row_does_not_count(folder):
+    add_part(folder, 0)
+    add_part(folder, 1)
+    (folder / results.PARTS / f"00000001.{results.RUNS}").unlink()
+    (folder / results.PARTS / f".00000002.{results.RUNS}").write_bytes(b"half")
+    assert results.collect(folder) == 1
+    assert results.load_steps(folder)["run_id"].unique().tolist() == ["run0"]
+
+
+def test_a_run_that_ended_before_its_first_period_has_a_row_and_no_steps(folder):
+    results.write_part(folder, 0, {"run_id": "run0"}, pd.DataFrame())
+    assert results.collect(folder) == 1
+    with pytest.raises(ConfigurationError, match="holds no steps"):
+        results.load_steps(folder)
+
+
+def test_a_killed_clean_up_loses_nothing(folder):
+    add_part(folder, 0)
+    add_part(folder, 1)
+    parts = {path.name: path.read_bytes() for path in (folder / results.PARTS).iterdir()}
+    results.collect(folder)
+    (folder / results.PARTS).mkdir()
+    name = f"00000001.{results.RUNS}"
+    (folder / results.PARTS / name).write_bytes(parts[name])
+    assert results.collect(folder) == 2
+    assert len(results.load_runs(folder)) == 2
+
+
+def test_a_folder_with_something_in_it_is_not_written_into(tmp_path):
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(ConfigurationError, match="exists already; name another one with --out"):
+        results.create_folder(tmp_path, {})
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="cannot be made"):
+        results.create_folder(tmp_path / "file" / "out", {})
+
+
+def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
+    with pytest.raises(ConfigurationError, match="holds no finished run"):
+        results.load_runs(folder)
+    (folder / results.MANIFEST).write_text(json.dumps({"schema_version": "0"}))
+    with pytest.raises(ConfigurationError, match="results of schema '0'; this servobench reads"):
+        results.load_runs(folder)
+    with pytest.raises(ConfigurationError, match="is not a results folder"):
+        results.load_steps(tmp_path)
+    with pytest.raises(ConfigurationError, match="is not a results folder"):
+        results.collect(tmp_path)
+
+
+def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder):
+    results.point_latest(folder)
+    newer = folder.parent / "newer"
+    results.create_folder(newer, {})
+    results.point_latest(newer)
+    assert (folder.parent / "latest").resolve() == newer.resolve()
+    (folder.parent / "latest").unlink()
+    (folder.parent / "latest").mkdir()
+    results.point_latest(newer)
+    assert not (folder.parent / "latest").is_symlink()
+
+
+def test_the_manifest_is_json_for_every_reader(tmp_path):
+    results.create_folder(tmp_path / "out", {"limit": float("inf"), "low": (1.5, float("-inf")), "count": 3})
+    text = (tmp_path / "out" / results.MANIFEST).read_text(encoding="utf-8")
+    assert "Infinity" not in text
+    manifest = json.loads(text)
+    assert (manifest["limit"], manifest["low"], manifest["count"]) == ("inf", [1.5, "-inf"], 3)

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import pytest
+
+from servobench.harness.config.settings import (
+    ConfigurationError,
+    Settings,
+    flatten,
+    read_settings,
+)
+from servobench.plant.signals import check_number
+
+
+@dataclass(frozen=True)
+class Inner:
+    gain: float = 1.0
+    kind: Literal["one", "two"] = "one"
+
+    def __post_init__(self) -> None:
+        check_number("gain", self.gain, above=0.0)
+
+
+@dataclass(frozen=True)
+class Outer:
+    count: int = 3
+    on: bool = False
+    name: str = "a"
+    point: tuple[float, ...] = (0.0, 1.0)
+    inner: Inner = field(default_factory=Inner)
+
+
+def resolve(*assignments: str) -> Outer:
+    return read_settings(None, assignments).resolve("outer", Outer())
+
+
+def test_assignments_reach_nested_fields_and_leave_the_rest():
+    got = resolve(
+        "outer.inner.gain=2", "outer.on=true", "outer.name=b c", "outer.point=[1, 2.5]", "outer.inner.kind=two"
+    )
+    assert got == Outer(on=True, name="b c", point=(1.0, 2.5), inner=Inner(2.0, "two"))
+
+
+def test_a_section_may_have_the_name_of_a_mapping_file():
+    got = read_settings(None, ["fmu:../my.cranes/a.toml.count=4", "fmu:../my.cranes/a.toml.inner.gain=3"])
+    assert got.resolve("fmu:../my.cranes/a.toml", Outer()) == Outer(count=4, inner=Inner(3.0))
+
+
+def test_assignments_win_over_the_file(tmp_path):
+    file = tmp_path / "settings.toml"
+    file.write_text("[outer]\ncount = 5\n[outer.inner]\ngain = 4.0\n")
+    got = read_settings(file, ["outer.count=6"]).resolve("outer", Outer())
+    assert got == Outer(count=6, inner=Inner(4.0))
+
+
+def test_a_section_that_names_a_file_keeps_its_dots():
+    settings = read_settings(None, ["fmu:some.where/outer.toml.inner.gain=2.0"])
+    assert settings.resolve("fmu:some.where/outer.toml", Outer()) == Outer(inner=Inner(2.0))
+
+
+def test_a_default_that_differs_from_the_class_is_kept():
+    assert Settings({"outer": {"on": True}}).resolve("outer", Outer(count=9)) == Outer(count=9, on=True)
+
+
+def test_flatten_names_every_leaf():
+    assert list(flatten(Outer())) == ["count", "on", "name", "point", "inner.gain", "inner.kind"]
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("outer.cuont=1", r"outer has no setting 'cuont': did you mean 'count'\? valid: count, inner, name, on, point"),
+        ("outer.inner.gian=1", r"outer.inner has no setting 'gian': did you mean 'gain'"),
+        ("outer.inner.gain=-1", r"outer.inner: gain must be above 0, got -1"),
+        ("outer.inner.gain=nan", r"outer.inner: gain must be above 0, got nan"),
+        ("outer.inner.gain=high", r"outer.inner.gain: wanted a number, got 'high'"),
+        ("outer.count=2.5", r"outer.count: wanted a whole number, got 2.5"),
+        ("outer.count=true", r"outer.count: wanted a whole number, got True"),
+        ("outer.on=1", r"outer.on: wanted true or false, got 1"),
+        ("outer.name=1", r"outer.name: wanted text, got 1"),
+        ("outer.point=[1, 'x']", r"outer.point: wanted a number, got 'x'"),
+        ("outer.inner=1", r"outer.inner is a section of its own, got 1"),
+        ("outer.count.x=1", r"outer.count is a plain value"),
+        ("outer.inner.kind=three", r"outer.inner.kind: wanted one of one, two, got 'three'"),
+        ("outer=1", r"--set needs section.key=value"),
+        ("outer.count", r"--set needs section.key=value"),
+    ],
+)
+def test_a_bad_assignment_is_one_clear_line(assignment, message):
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        resolve(assignment)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_section_is_refused_with_the_nearest_name():
+    with pytest.raises(ConfigurationError, match="unknown section 'oter': did you mean 'outer'"):
+        read_settings(None, ["oter.count=1"]).check_sections(["outer", "run"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("[outer\n", "is not valid TOML"), ("count = 1\n", "'count' stands outside a")],
+)
+def test_a_malformed_file_is_refused(tmp_path, text, message):
+    file = tmp_path / "settings.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigurationError, match=message):
+        read_settings(file, [])
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="none.toml cannot be read"):
+        read_settings(tmp_path / "none.toml", [])

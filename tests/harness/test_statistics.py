@@ -1,0 +1,242 @@
+"""Statistics against published numbers, other libraries' functions, and properties."""
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import optimize, stats
+
+from servobench.harness.analysis.statistics import (
+    Comparison,
+    compare_pairs,
+    failure_table,
+    median_with_interval,
+    outcomes,
+    settling_times,
+    signed_rank_p_value,
+    success_rate,
+    tail_mean,
+)
+
+NEVER = float("nan")
+samples = st.lists(st.floats(0.0, 100.0, allow_subnormal=False), min_size=2, max_size=12)
+
+
+def table(**columns):
+    """A table of runs of two controllers or more, with all keys."""
+    size = len(columns["controller"])
+    fixed = {"plant": "p", "task": "t", "mismatch": "m", "status": "completed"}
+    return pd.DataFrame({name: [value] * size for name, value in fixed.items()} | columns)
+
+
+@pytest.mark.parametrize(
+    ("successes", "runs", "low", "high"),
+    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+)
+def test_wilson_intervals_are_those_of_newcombe_1998(successes, runs, low, high):
+    found = success_rate(successes, runs)
+    assert (round(found.low, 4), round(found.high, 4)) == (low, high)
+    assert (found.value, found.count) == (successes / runs, runs)
+
+
+@given(runs=st.integers(1, 200), share=st.floats(0.0, 1.0))
+def test_the_wilson_interval_solves_its_equation(runs, share):
+    """(p̂ − p)² = z² p (1 − p) / n at both ends."""
+    successes = round(share * runs)
+    found = success_rate(successes, runs)
+    for p in (found.low, found.high):
+        assert (found.value - p) ** 2 == pytest.approx(stats.norm.ppf(0.975) ** 2 * p * (1 - p) / runs, abs=1e-12)
+    assert found.low - 1e-12 <= found.value <= found.high + 1e-12
+
+
+@pytest.mark.parametrize(("successes", "runs"), [(0, 0), (3, 2), (-1, 2)])
+def test_impossible_counts_are_refused(successes, runs):
+    with pytest.raises(ValueError, match="successes must be from 0 to runs"):
+        success_rate(successes, runs)
+
+
+def test_the_bootstrap_interval_is_scipys_up_to_one_order_statistic():
+    sample = np.random.default_rng(5).gamma(2.0, size=40)
+    drawn = stats.bootstrap((sample,), np.median, n_resamples=2000, method="percentile", rng=np.random.default_rng(3))
+    found = median_with_interval(sample, seed=3)
+    medians = np.sort(drawn.bootstrap_distribution)
+    for mine, theirs in zip((found.low, found.high), drawn.confidence_interval, strict=True):
+        position = np.searchsorted(medians, theirs)
+        assert medians[position - 1] <= mine <= medians[position]
+    assert found.value == np.median(sample)
+
+
+def test_the_interval_of_a_median_agrees_with_the_one_of_its_binomial_order_statistics():
+    """Exact and free of assumptions: the bootstrap must come close on a sample of this size."""
+    sample = np.sort(np.random.default_rng(1).exponential(size=201))
+    found = median_with_interval(sample)
+    low, high = stats.binom.ppf([0.025, 0.975], 201, 0.5).astype(int)
+    assert sample[low - 4] <= found.low <= sample[low + 4]
+    assert sample[high - 4] <= found.high <= sample[high + 4]
+
+
+@settings(max_examples=25, deadline=None)
+@given(values=samples, never=st.integers(0, 12))
+def test_runs_that_never_settle_weigh_like_runs_that_settle_after_all_others(values, never):
+    found = median_with_interval(values + [NEVER] * never, resamples=200)
+    late = median_with_interval(values + [1e6] * never, resamples=200)
+    for mine, theirs in ((found.value, late.value), (found.low, late.low), (found.high, late.high)):
+        assert mine == theirs if theirs <= 100.0 else np.isinf(mine)
+    assert found.low <= found.value <= found.high
+
+
+def test_a_median_is_infinite_where_half_of_the_runs_never_settle():
+    assert median_with_interval([1.0, 2.0, NEVER]).value == 2.0
+    assert median_with_interval([1.0, NEVER]).value == np.inf
+    found = median_with_interval([NEVER] * 4)
+    assert (found.value, found.low, found.high) == (np.inf, np.inf, np.inf)
+
+
+def test_what_does_not_apply_is_left_out_when_asked():
+    found = median_with_interval([3.0, NEVER, 5.0], missing="left_out")
+    assert (found.value, found.count) == (4.0, 2)
+    with pytest.raises(ValueError, match="at least one number"):
+        median_with_interval([NEVER], missing="left_out")
+
+
+def test_degenerate_samples_have_no_interval_or_one_of_no_width():
+    alone, equal = median_with_interval([2.5]), median_with_interval([2.5] * 9)
+    assert alone.value == 2.5
+    assert np.isnan([alone.low, alone.high]).all()
+    assert (equal.low, equal.value, equal.high) == (2.5, 2.5, 2.5)
+    with pytest.raises(ValueError, match="−∞"):
+        median_with_interval([1.0, -np.inf])
+
+
+def test_the_same_seed_gives_the_same_interval_and_another_one_another():
+    sample = np.random.default_rng(0).normal(size=30)
+    assert median_with_interval(sample, seed=1) == median_with_interval(sample, seed=1)
+    assert len({median_with_interval(sample, seed=seed) for seed in range(8)}) > 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(values=samples, level=st.sampled_from([0.0, 0.5, 0.9, 0.95]))
+def test_the_tail_mean_is_the_minimum_of_rockafellar_and_uryasev(values, level):
+    """min over c of c + mean(max(x − c, 0)) / (1 − level), a linear program."""
+    count = len(values)
+    cost = np.concatenate([[1.0], np.full(count, 1.0 / ((1.0 - level) * count))])
+    above = np.hstack([-np.ones((count, 1)), -np.eye(count)])
+    bounds = [(None, None)] + [(0.0, None)] * count
+    with np.errstate(all="ignore"):
+        program = optimize.linprog(cost, A_ub=above, b_ub=-np.array(values), bounds=bounds)
+    assert tail_mean(values, level) == pytest.approx(program.fun, rel=1e-6, abs=1e-6)
+
+
+def test_the_tail_mean_of_hundred_errors_is_the_mean_of_the_worst_ten_or_five():
+    errors = np.random.default_rng(2).permutation(np.arange(1.0, 101.0))
+    assert tail_mean(errors, 0.9) == pytest.approx(95.5)
+    assert tail_mean(errors, 0.95) == pytest.approx(98.0)
+    assert tail_mean([*errors, NEVER]) == np.inf
+    assert tail_mean([*errors, NEVER], 0.9, missing="left_out") < 97.0
+    with pytest.raises(ValueError, match="level must be at least 0 and below 1, got 1"):
+        tail_mean(errors, 1.0)
+
+
+def test_the_signed_rank_test_enumerates_all_signs():
+    """Exact two-sided p-value of nine distinct differences by counting."""
+    difference = np.array([0.3, -0.1, 0.9, 1.2, -0.4, 2.0, 0.7, 1.6, 0.05])
+    ranks = stats.rankdata(np.abs(difference))
+    observed = ranks[difference > 0].sum()
+    sums = [ranks[np.array(signs)].sum() for signs in itertools.product([False, True], repeat=9)]
+    share = 2 * min(np.mean(np.array(sums) >= observed), np.mean(np.array(sums) <= observed))
+    assert signed_rank_p_value(difference) == pytest.approx(min(1.0, share))
+
+
+def test_zeros_keep_their_ranks_as_pratt_has_it():
+    """Normal approximation by hand: zeros are ranked, then left out of the sum and of its variance."""
+    difference = np.round(np.random.default_rng(0).normal(0.05, 0.1, 60) / 0.05) * 0.05
+    ranks = stats.rankdata(np.round(np.abs(difference), 9))
+    moved = np.abs(difference) > 1e-9
+    assert 5 < np.sum(~moved) < 20
+    distance = abs(ranks[difference > 1e-9].sum() - ranks[moved].sum() / 2) / np.sqrt(np.sum(ranks[moved] ** 2) / 4)
+    assert signed_rank_p_value(difference) == pytest.approx(2 * stats.norm.sf(distance), rel=1e-9)
+
+
+def test_equal_pairs_are_no_evidence_and_rounding_makes_no_ranks():
+    assert signed_rank_p_value(np.zeros(5)) == 1.0
+    exact = np.array([1, 1, 1, 0, 0, -1, 1, 1, 2, 1]) / 20
+    blurred = exact + 1e-15 * np.arange(10)
+    assert signed_rank_p_value(blurred) == signed_rank_p_value(exact)
+
+
+def three_controllers():
+    rng = np.random.default_rng(7)
+    base = rng.uniform(1.0, 2.0, 25)
+    values = np.concatenate([base, base + rng.uniform(0.1, 0.3, 25), base + rng.normal(scale=0.1, size=25)])
+    return table(controller=["a"] * 25 + ["b"] * 25 + ["c"] * 25, seed=[*range(25)] * 3, settling_time_s=values)
+
+
+def test_holms_correction_multiplies_the_sorted_p_values_by_those_that_are_left():
+    found = compare_pairs(three_controllers(), [("a", "b"), ("a", "c"), ("b", "c")], never=10.0)
+    raw = np.array([comparison.p_value for comparison in found])
+    order = np.argsort(raw)
+    expected = np.empty(3)
+    expected[order] = np.minimum(np.maximum.accumulate(raw[order] * [3, 2, 1]), 1.0)
+    assert [comparison.corrected_p_value for comparison in found] == pytest.approx(expected.tolist())
+    assert raw[0] < 1e-6 < raw[1]
+
+
+def test_the_better_controller_has_a_negative_difference_of_pairs_and_not_of_medians():
+    runs = three_controllers()
+    (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
+    paired = runs.pivot_table(index="seed", columns="controller", values="settling_time_s")
+    assert found.difference.value == pytest.approx((paired["a"] - paired["b"]).median())
+    assert found.difference.low < found.difference.value < found.difference.high < 0.0
+    assert found.difference.count == 25
+
+
+def test_only_common_seeds_make_pairs_in_any_order_of_rows():
+    runs = three_controllers()
+    some = runs[(runs["controller"] == "a") | (runs["seed"] >= 15)]
+    (found,) = compare_pairs(some.sample(frac=1.0, random_state=0), [("a", "b")], never=10.0)
+    (same,) = compare_pairs(runs[runs["seed"] >= 15], [("a", "b")], never=10.0)
+    assert found.difference.count == 10
+    assert (found.difference.value, found.p_value) == (same.difference.value, same.p_value)
+
+
+def test_a_run_that_never_settled_or_ended_early_counts_as_the_whole_duration():
+    runs = table(controller=list("ab") * 2, seed=[0, 0, 1, 1], settling_time_s=[1.0, NEVER, 2.0, 0.5])
+    runs.loc[3, "status"] = "feature_lost"
+    (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
+    assert isinstance(found, Comparison)
+    assert found.difference.value == pytest.approx(np.median([1.0 - 10.0, 2.0 - 10.0]))
+
+
+@pytest.mark.parametrize(
+    ("pairs", "change", "message"),
+    [
+        ([], {}, "pairs must hold at least one pair"),
+        ([("a", "nobody")], {}, "a and nobody have no run in common"),
+        ([("a", "b")], {"seed": 0}, "a has several runs of the same plant, task, mismatch, seed"),
+    ],
+)
+def test_comparisons_that_cannot_be_made_are_refused(pairs, change, message):
+    with pytest.raises(ValueError, match=message):
+        compare_pairs(three_controllers().assign(**change), pairs, never=10.0)
+
+
+def test_runs_are_classed_by_how_they_ended():
+    runs = table(controller=list("aabbb"), settling_time_s=[1.0, NEVER, 2.0, NEVER, 1.5])
+    runs["status"] = ["completed", "completed", "feature_lost", "crashed", "completed"]
+    assert outcomes(runs).tolist() == ["settled", "not_settled", "feature_lost", "crashed", "settled"]
+    assert settling_times(runs).notna().tolist() == [True, False, False, False, True]
+    found = failure_table(runs)
+    assert found.columns.tolist() == ["settled", "not_settled", "crashed", "feature_lost"]
+    assert found.loc["b"].tolist() == [1, 0, 1, 1]
+    assert found.to_numpy().sum() == len(runs)
+    assert failure_table(runs, ("task", "controller")).loc[("t", "a")].tolist() == [1, 1, 0, 0]
+
+
+def test_runs_that_all_ended_before_their_first_period_have_no_metrics_and_are_classed_all_the_same():
+    runs = table(controller=["a", "b"], seed=[0, 0]).assign(status="crashed")
+    assert failure_table(runs)["crashed"].tolist() == [1, 1]
+    (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
+    assert found.p_value == 1.0

@@ -1,0 +1,103 @@
+"""A foreign FMU for tests: a planar arm of two joints with other names and sizes, from C that shares nothing with ours.
+
+Its parameter `quirk` makes it misbehave: 1 step fails, 2 result is NaN, 3 every step ends half way, 4 a step makes no
+progress, 5 initialisation fails, 6 it asks to end the simulation (FMI 3), 7 result becomes NaN,
+8 every step ends after 10 µs.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from functools import cache
+from pathlib import Path
+
+from servobench.fmus.compile import this_platform
+
+SOURCES = Path(__file__).parent / "foreign_fmu_sources"
+STARTS = {"push": (0.0, 0.0), "arm": (0.5, 0.4)}
+SCALARS = [("wheel", 10, "output"), ("push", 20, "input"), ("place", 30, "output"), ("arm", 40, "parameter")]
+
+
+def describe_exchange(derivatives: bool = True) -> str:
+    """Return the model description of FMI 2 with a model-exchange side, whose states are the joints."""
+    text = describe(2)
+    names = ("wheel.slew", "wheel.luff")
+    rates = "".join(
+        f'<ScalarVariable name="der({name})" valueReference="{60 + i}"><Real derivative="{i + 1}"/></ScalarVariable>'
+        for i, name in enumerate(names)
+    )
+    first = text.count("<ScalarVariable") + 1
+    outputs, rows = "".join(map(_unknown, (1, 2, 5, 6))), "".join(map(_unknown, (first, first + 1)))
+    sections = {"Outputs": outputs, "Derivatives": rows, "InitialUnknowns": outputs + rows}
+    structure = "".join(f"<{name}>{unknowns}</{name}>" for name, unknowns in sections.items())
+    provides = f'providesDirectionalDerivative="{str(derivatives).lower()}"'
+    exchange = f'<ModelExchange modelIdentifier="crane" {provides}/>'
+    text = text.replace("<CoSimulation", f"{exchange}<CoSimulation").replace(
+        "</ModelVariables>", f"{rates}</ModelVariables>"
+    )
+    return text.replace("<ModelStructure/>", f"<ModelStructure>{structure}</ModelStructure>")
+
+
+def _unknown(index: int) -> str:
+    return f'<Unknown index="{index}"/>'
+
+
+def describe(version: int) -> str:
+    """Return the model description; FMI 3 shows arrays whose size is a structural parameter, FMI 2 scalars."""
+    variability = {"parameter": "tunable", "input": "continuous", "output": "continuous"}
+    rows = []
+    for name, reference, causality in SCALARS:
+        common = f'causality="{causality}" variability="{variability[causality]}"'
+        starts = STARTS.get(name)
+        if version == 3:
+            inner = '<Dimension valueReference="60"/>'
+            start = f'start="{starts[0]} {starts[1]}"' if starts else ""
+            head = f'<Float64 name="{name}" valueReference="{reference}" {common} {start}>'
+            rows.append(f"{head}{inner}</Float64>")
+        else:
+            rows += [
+                f'<ScalarVariable name="{name}.{part}" valueReference="{reference + i}" {common}>'
+                + (f'<Real start="{starts[i]}"/></ScalarVariable>' if starts else "<Real/></ScalarVariable>")
+                for i, part in enumerate(("slew", "luff"))
+            ]
+    if version == 3:
+        rows.append('<Float64 name="quirk" valueReference="50" causality="parameter" variability="tunable" start="0"/>')
+        rows.append(
+            '<UInt64 name="size" valueReference="60" causality="structuralParameter" variability="fixed" start="2"/>'
+        )
+        head = 'fmiVersion="3.0" modelName="Crane" instantiationToken="x"'
+    else:
+        rows.append(
+            '<ScalarVariable name="quirk" valueReference="50" causality="parameter" variability="tunable">'
+            '<Real start="0"/></ScalarVariable>'
+        )
+        rows.append(
+            '<ScalarVariable name="gear" valueReference="70" causality="parameter" variability="tunable">'
+            '<Integer start="1"/></ScalarVariable>'
+        )
+        head = 'fmiVersion="2.0" modelName="Crane" guid="x"'
+    return (
+        f'<?xml version="1.0"?><fmiModelDescription {head}><CoSimulation modelIdentifier="crane"/>'
+        f"<ModelVariables>{''.join(rows)}</ModelVariables><ModelStructure/></fmiModelDescription>"
+    )
+
+
+@cache
+def library(version: int) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "crane.so"
+        arguments = ["-shared", "-fPIC", "-O1", str(SOURCES / f"crane{version}.c"), "-o", str(target), "-lm"]
+        subprocess.run([shutil.which("cc") or "gcc", *arguments], check=True)
+        return target.read_bytes()
+
+
+def build_crane(path: Path, version: int, *, folder: str | None = None, description: str | None = None) -> Path:
+    """Write the foreign FMU to `path`."""
+    place = folder or this_platform().folder(version)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", description or describe(version))
+        archive.writestr(f"binaries/{place}/crane{this_platform().suffix}", library(version))
+    return path

@@ -1,0 +1,58 @@
+"""A made-up arm whose Jacobian is constant, so that whatever a controller of it promises can be checked exactly."""
+
+from collections import deque
+
+import numpy as np
+
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
+from servobench.plant.signals import Observation, PlantSpec
+
+N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
+A = 0.4 * np.random.default_rng(11).normal(size=(M, N))  # m/rad
+SPEC = PlantSpec(
+    tuple(f"j{i}" for i in range(N)),
+    tuple(f"y{i}" for i in range(M)),
+    np.full(N, LIMIT),
+    np.full(N, -6.0),
+    np.full(N, 6.0),
+    PERIOD,
+)
+KNOWLEDGE = RobotKnowledge(SPEC, PREVIEW, lambda q: np.broadcast_to(A, (*np.shape(q)[:-1], M, N)))
+
+
+def networks():
+    """Networks as after training within ±2 rad: units so wide that Ĵ_net = A everywhere; any controller network."""
+    rng = np.random.default_rng(2)
+    centres = np.broadcast_to(np.array([[-2.0], [2.0]]), (N, 2, N))
+    jacobian = JacobianNetwork(centres, np.full((N, 2), 1e9), np.repeat(A.T[:, :, None] / 2.0, 2, axis=2))
+    centres = rng.normal(size=(8, M + N))
+    weights = 0.02 * rng.normal(size=(N, M + N, 8))
+    weights[:, M:] += np.eye(N)[:, :, None] / 8
+    return TrainedNetworks(jacobian, ControllerNetwork(centres, np.full(8, 3.0), weights, 1, 1), 0.0, 0.0, "")
+
+
+class ToyArm:
+    """q(k+1) = q(k) + Σ_i g_i dq(k−i), y(k) = turn A q(k − latency)."""
+
+    def __init__(self, turn, response=(0.0, 1.0), latency=0):
+        self.turn, self.response = turn, np.asarray(response)
+        self.q, self.k = np.zeros(N), 0
+        self.commands = deque([np.zeros(N)] * len(response), maxlen=len(response))
+        self.seen = deque([np.zeros(M)] * (latency + 1), maxlen=latency + 1)
+
+    def observe(self):
+        return Observation(self.k * PERIOD, self.q, self.seen[0])
+
+    def step(self, u):
+        self.commands.appendleft(u * PERIOD)
+        self.q = self.q + self.response @ np.array(self.commands)
+        self.k += 1
+        self.seen.append(self.turn @ A @ self.q)
+        return self.observe()
+
+    def end(self):
+        """Where the feature will be when all commands up to now are done."""
+        left = np.append(np.cumsum(self.response[:0:-1])[::-1], 0.0)
+        return self.turn @ A @ (self.q + left @ np.array(self.commands))

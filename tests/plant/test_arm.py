@@ -1,0 +1,204 @@
+import numpy as np
+import pytest
+import yaml
+
+from servobench.plant.robot.arm import (
+    CALIBRATION_BLOCKS,
+    SerialArm,
+    arm_from_calibration,
+    arm_from_dh,
+    rotation_from_rpy,
+)
+from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.robot.ur5 import (
+    DH_A,
+    DH_ALPHA,
+    DH_D,
+    JOINT_NAMES,
+    TOOL,
+    nominal_ur5,
+    ur5_arm,
+    ur5_arm_from_calibration,
+)
+
+
+def poses(count, n=6, seed=0):
+    return np.random.default_rng(seed).uniform(-2 * np.pi, 2 * np.pi, (count, n))
+
+
+def odd_arm():
+    """A UR5 with every kind of mismatch at once."""
+    nominal = ur5_arm()
+    rng = np.random.default_rng(3)
+    return SerialArm(
+        JOINT_NAMES,
+        nominal.translation + rng.uniform(-0.05, 0.05, (7, 3)),
+        nominal.rpy + rng.uniform(-0.1, 0.1, (7, 3)),
+        rng.uniform(-0.1, 0.1, 6),
+        rng.uniform(0.9, 1.1, 6),
+        np.array([0.02, -0.03, 0.12]),
+    )
+
+
+def elementary(axis, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = np.eye(4)
+    i, j = {"x": (1, 2), "z": (0, 1)}[axis]
+    matrix[i, i], matrix[i, j], matrix[j, i], matrix[j, j] = c, -s, s, c
+    return matrix
+
+
+def shift(axis, length):
+    matrix = np.eye(4)
+    matrix["xyz".index(axis), 3] = length
+    return matrix
+
+
+def test_dh_arm_equals_the_explicit_product_of_elementary_matrices():
+    for q in poses(50):
+        expected = np.eye(4)
+        for angle, a, d, alpha in zip(q, DH_A, DH_D, DH_ALPHA, strict=True):
+            expected = expected @ elementary("z", angle) @ shift("z", d) @ shift("x", a) @ elementary("x", alpha)
+        np.testing.assert_allclose(ur5_arm().flange_pose(q), expected, atol=1e-14)
+        np.testing.assert_allclose(ur5_arm().ball_position(q), (expected @ [*TOOL, 1.0])[:3], atol=1e-14)
+
+
+def test_planar_arm_matches_the_hand_computed_position_and_jacobian():
+    arm = arm_from_dh([2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0, 0.0], ("shoulder", "elbow"))
+    q = np.array([np.pi / 2, -np.pi / 2])  # upper arm along y, forearm along x
+    np.testing.assert_allclose(arm.ball_position(q), [1.0, 2.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(arm.ball_jacobian(q), [[-2.0, 0.0], [1.0, 1.0], [0.0, 0.0]], atol=1e-15)
+
+
+@pytest.mark.parametrize("arm", [ur5_arm(), ur5_arm_from_calibration(), odd_arm()])
+def test_jacobian_equals_central_differences(arm):
+    model = HandEyeModel(arm, nominal_ur5().X_BC)
+    h = 1e-5
+    for q in poses(20):
+        steps = h * np.eye(6)
+        numeric = (model.feature(q + steps) - model.feature(q - steps)).T / (2 * h)
+        np.testing.assert_allclose(model.jacobian(q), numeric, atol=1e-9)
+
+
+def test_leading_axes_give_the_same_as_a_loop():
+    model = HandEyeModel(odd_arm(), nominal_ur5().X_BC)
+    q = poses(12).reshape(3, 4, 6)
+    for name, function in (
+        ("frames", model.arm.frames),
+        ("ball", model.arm.ball_position),
+        ("feature", model.feature),
+        ("jacobian", model.jacobian),
+    ):
+        together = function(q)
+        for index in np.ndindex(3, 4):
+            np.testing.assert_allclose(together[index], function(q[index]), atol=1e-15, err_msg=name)
+
+
+def test_rotations_are_rotations_in_the_urdf_order():
+    rpy = np.random.default_rng(0).uniform(-np.pi, np.pi, (10, 3))
+    for (roll, pitch, yaw), R in zip(rpy, rotation_from_rpy(rpy), strict=True):
+        about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+        expected = elementary("z", yaw)[:3, :3] @ about_y @ elementary("x", roll)[:3, :3]
+        np.testing.assert_allclose(R, expected, atol=1e-15)
+
+
+def test_offsets_and_gear_ratios_act_on_the_reported_position():
+    nominal, arm = ur5_arm(), odd_arm()
+    unmoved = SerialArm(JOINT_NAMES, nominal.translation, nominal.rpy, arm.joint_offset, arm.gear_ratio, nominal.tool)
+    q = poses(5)
+    expected = nominal.ball_position(arm.gear_ratio * q + arm.joint_offset)
+    np.testing.assert_allclose(unmoved.ball_position(q), expected, atol=1e-15)
+
+
+def test_factory_calibration_is_millimetres_from_the_data_sheet():
+    q = poses(200)
+    distance = np.linalg.norm(ur5_arm_from_calibration().ball_position(q) - ur5_arm().ball_position(q), axis=-1)
+    assert np.median(distance) > 1e-4
+    assert distance.max() < 0.01
+
+
+def test_camera_and_base_frame_are_inverse_to_each_other():
+    model = nominal_ur5()
+    points = np.random.default_rng(0).normal(size=(4, 5, 3))
+    np.testing.assert_allclose(model.to_base(model.to_camera(points)), points, atol=1e-15)
+    homogeneous = np.linalg.inv(model.X_BC) @ [*points[0, 0], 1.0]
+    np.testing.assert_allclose(model.to_camera(points[0, 0]), homogeneous[:3], atol=1e-15)
+
+
+def calibration(tmp_path, change):
+    blocks = {name: dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1) for name in CALIBRATION_BLOCKS}
+    change(blocks)
+    path = tmp_path / "calibration.yaml"
+    path.write_text(yaml.safe_dump({"kinematics": blocks}), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda blocks: blocks.pop("wrist_2"), "lacks 'wrist_2'; wanted 'kinematics' with the blocks shoulder"),
+        (lambda blocks: blocks["forearm"].pop("yaw"), "lacks 'yaw'"),
+        (lambda blocks: blocks["shoulder"].update(x="long"), "holds something that is not a number"),
+        (lambda blocks: blocks["shoulder"].update(x=[1.0]), "holds something that is not a number"),
+        (lambda blocks: blocks.update(shoulder=None), "holds something that is not a number"),
+        (lambda blocks: blocks["wrist_1"].update(z=float("nan")), "holds a number that is not finite"),
+        (lambda blocks: blocks["wrist_1"].update(z=float("inf")), "holds a number that is not finite"),
+    ],
+)
+def test_a_malformed_calibration_is_one_clear_error(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        arm_from_calibration(calibration(tmp_path, change), TOOL, JOINT_NAMES)
+    assert "\n" not in str(caught.value)
+    assert "calibration.yaml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "cannot be read: No such file"),
+        (b"{ not: [yaml", "is not valid YAML"),
+        (b"", "holds something that is not a number"),
+        (b"- 1\n- 2\n", "holds something that is not a number"),
+        (b"other: 1\n", "lacks 'kinematics'"),
+        (b"\xff\xfe\xfa\x00", "calibration file"),
+    ],
+)
+def test_a_file_that_is_no_calibration_is_one_clear_error(tmp_path, content, message):
+    path = tmp_path / "other.yaml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        arm_from_calibration(path, TOOL, JOINT_NAMES)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_well_formed_calibration_loads(tmp_path):
+    arm = arm_from_calibration(calibration(tmp_path, lambda blocks: None), TOOL, JOINT_NAMES)
+    assert arm.n == 6
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: arm_from_dh([1.0], [0.0, 0.0], [0.0, 0.0], TOOL, ("i", "j")), r"a must have shape \(2,\), got \(1,\)"),
+        (lambda: arm_from_dh([1.0], [0.0], [0.0], [0.0], ("i",)), r"tool must have shape \(3,\)"),
+        (lambda: ur5_arm().ball_position(np.zeros(5)), r"joint_position must have shape \(..., 6\), got \(5,\)"),
+        (
+            lambda: SerialArm(("i",), np.zeros((1, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.zeros(3)),
+            r"translation must have shape \(2, 3\), got \(1, 3\)",
+        ),
+        (
+            lambda: SerialArm(("i",), np.zeros((2, 3)), np.full((2, 3), np.nan), np.zeros(1), np.ones(1), np.zeros(3)),
+            "rpy must be finite",
+        ),
+        (lambda: HandEyeModel(ur5_arm(), np.eye(3)), r"X_BC must be a finite \(4, 4\) matrix"),
+        (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, -1.0, 1.0])), "X_BC must hold a rotation matrix"),
+        (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, 1.1, 1.0])), "X_BC must hold a rotation matrix"),
+        (lambda: hand_eye_spec(nominal_ur5(), 0.05, -1.0, 6.0), "max_joint_speed must be above 0, got -1.0"),
+        (lambda: hand_eye_spec(nominal_ur5(), 0.05, 1.0, 0.0), "joint_range must be above 0, got 0.0"),
+        (lambda: hand_eye_spec(nominal_ur5(), 0.0, 1.0, 6.0), "period must be positive"),
+    ],
+)
+def test_a_wrong_argument_is_named(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+
+from servobench.plant.robot.camera import DepthNoise, PinholeCamera, view_matrix
+from servobench.plant.robot.ur5 import nominal_ur5
+
+CAMERA = PinholeCamera()
+
+
+def points(count: int) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(0.4, 2.0, count)])
+
+
+def test_a_ray_times_its_depth_is_the_point_that_was_projected():
+    p = points(50)
+    columns, rows = CAMERA.project(p).T
+    np.testing.assert_allclose(CAMERA.rays(columns, rows) * p[:, 2:], p, atol=1e-12)
+
+
+def test_the_vertical_field_of_view_spans_the_image():
+    assert 2 * np.degrees(np.arctan(0.5 * CAMERA.height / CAMERA.focal)) == pytest.approx(CAMERA.vertical_fov)
+
+
+def test_the_opengl_matrices_lead_to_the_same_pixel_and_depth_as_the_pinhole_model():
+    model = nominal_ur5()
+    p_C = points(50)
+    eye = view_matrix(model.X_BC) @ np.column_stack([model.to_base(p_C), np.ones(50)]).T
+    clip = CAMERA.projection_matrix() @ eye
+    device = (clip[:3] / clip[3]).T
+    pixel = np.column_stack([(device[:, 0] + 1) / 2 * CAMERA.width, (1 - device[:, 1]) / 2 * CAMERA.height])
+    # The renderer samples the pixel of column u and row v at (u, v + 1).
+    np.testing.assert_allclose(pixel - (0.0, 1.0), CAMERA.project(p_C), atol=1e-9)
+    np.testing.assert_allclose(CAMERA.metric_depth((device[:, 2] + 1) / 2), p_C[:, 2], rtol=1e-12)
+
+
+def test_stereo_noise_follows_the_white_paper():
+    # f at 848 px for a 60° high 4:3 image: 0.5 · 636 / tan 30°; RMS = z² · 0.08 / (f · 0.05).
+    focal = 0.5 * 636 / np.tan(np.radians(30))
+    np.testing.assert_allclose(DepthNoise("stereo").sigma([1.0, 2.0], CAMERA), np.array([1.6, 6.4]) / focal)
+
+
+def test_structured_light_noise_follows_nguyen():
+    np.testing.assert_allclose(DepthNoise("structured_light").sigma([0.4, 1.4], CAMERA), [0.0012, 0.0031])
+
+
+@pytest.mark.parametrize("model", ["stereo", "structured_light"])
+def test_measured_depths_scatter_by_the_models_standard_deviation_about_the_truth(model):
+    noise = DepthNoise(model, depth_quantisation=0.0)
+    measured = noise.apply(np.full(20000, 1.3), CAMERA, np.random.default_rng(0))
+    sigma = float(noise.sigma(1.3, CAMERA))
+    assert measured.std() == pytest.approx(sigma, rel=0.03)
+    assert abs(measured.mean() - 1.3) < 4 * sigma / np.sqrt(20000)
+
+
+def test_quantisation_rounds_to_the_sensors_unit():
+    measured = DepthNoise("none", depth_quantisation=0.001).apply([1.23449, 1.2351], CAMERA, np.random.default_rng(0))
+    np.testing.assert_allclose(measured, [1.234, 1.235], atol=1e-12)
+
+
+def test_without_noise_nothing_is_drawn_and_nothing_changes():
+    generator, untouched = np.random.default_rng(3), np.random.default_rng(3)
+    z = np.array([1.0, 1.1])
+    np.testing.assert_array_equal(DepthNoise("none", depth_quantisation=0.0).apply(z, CAMERA, generator), z)
+    assert generator.random() == untouched.random()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "width must be at least 1, got 0"),
+        ({"height": -2}, "height must be at least 1"),
+        ({"vertical_fov": 0.0}, "vertical_fov must be above 0 and below 180"),
+        ({"vertical_fov": 180.0}, "vertical_fov must be above 0 and below 180"),
+        ({"near": 0.0}, "near must be above 0"),
+        ({"far": 0.05}, "far must be above 0.1"),
+    ],
+)
+def test_a_bad_camera_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        PinholeCamera(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depth_noise": "kinect"}, "depth_noise must be one of none, stereo, structured_light, got 'kinect'"),
+        ({"depth_subpixel": -0.1}, "depth_subpixel must be at least 0"),
+        ({"depth_baseline": 0.0}, "depth_baseline must be above 0"),
+        ({"native_width": 0}, "native_width must be at least 1"),
+        ({"depth_quantisation": -0.001}, "depth_quantisation must be at least 0"),
+    ],
+)
+def test_a_bad_noise_model_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        DepthNoise(**change)

@@ -1,0 +1,156 @@
+import colorsys
+
+import numpy as np
+import pytest
+
+from servobench.plant.bullet.detection import (
+    Detection,
+    draw_detection,
+    find_patch,
+    fit_sphere,
+    locate_ball,
+)
+from servobench.plant.robot.camera import DepthNoise, PinholeCamera
+
+CAMERA = PinholeCamera()
+RADIUS = 0.035
+RED = (200, 20, 15)
+
+
+def ball_image(centre, colour=RED) -> tuple[np.ndarray, np.ndarray]:
+    """An ideal image of a ball before a grey wall, by intersecting every pixel's ray with the sphere."""
+    rows, columns = np.indices((CAMERA.height, CAMERA.width))
+    rays = CAMERA.rays(columns.ravel(), rows.ravel())
+    length2, along = (rays**2).sum(axis=1), rays @ np.asarray(centre)
+    D = along**2 - length2 * (np.dot(centre, centre) - RADIUS**2)
+    hit = D >= 0
+    depth = np.full(len(rays), 2.0)
+    depth[hit] = (along[hit] - np.sqrt(D[hit])) / length2[hit]
+    rgb = np.full((len(rays), 3), 150, dtype=np.uint8)
+    rgb[hit] = colour
+    return rgb.reshape(CAMERA.height, CAMERA.width, 3), depth.reshape(CAMERA.height, CAMERA.width)
+
+
+def detect(rgb, depth) -> Detection | None:
+    patch = find_patch(rgb)
+    return None if patch is None else locate_ball(patch, depth[patch.rows, patch.columns], CAMERA, RADIUS)
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 1.2), (0.4, -0.3, 1.3), (-0.5, 0.35, 0.9), (0.1, 0.2, 0.5)])
+def test_the_centre_of_an_ideal_ball_is_exact(centre):
+    found = detect(*ball_image(centre))
+    np.testing.assert_allclose(found.centre, centre, atol=2e-6)
+    assert found.visible == pytest.approx(1.0, abs=0.03)
+    assert found.fit.residual < 1e-6
+
+
+@pytest.mark.parametrize("hue", [-8.0, 0.0, 8.0])
+def test_reds_on_both_sides_of_hue_zero_are_found(hue):
+    colour = tuple(round(255 * part) for part in colorsys.hsv_to_rgb(hue / 360 % 1.0, 0.9, 0.8))
+    assert detect(*ball_image((0.0, 0.1, 1.2), colour)) is not None
+
+
+@pytest.mark.parametrize("colour", [(60, 150, 230), (200, 190, 60), (180, 170, 165), (60, 200, 60), (20, 3, 3)])
+def test_other_colours_and_the_dark_are_not_found(colour):
+    assert find_patch(ball_image((0.0, 0.1, 1.2), colour)[0]) is None
+
+
+def test_opacity_is_ignored():
+    rgb, _ = ball_image((0.1, 0.0, 1.2))
+    rgba = np.dstack([rgb, np.full(rgb.shape[:2], 255, dtype=np.uint8)])
+    np.testing.assert_array_equal(find_patch(rgba).columns, find_patch(rgb).columns)
+
+
+def test_a_ball_that_the_border_cuts_is_not_found():
+    columns_to_the_right = (CAMERA.width / 2) / CAMERA.focal
+    assert detect(*ball_image((columns_to_the_right * 1.2, 0.0, 1.2))) is None
+    assert detect(*ball_image((-columns_to_the_right * 1.2, 0.0, 1.2))) is None
+
+
+@pytest.mark.parametrize("side", ["left", "right", "top"])
+def test_a_ball_hidden_by_a_third_keeps_its_centre(side):
+    centre = np.array([0.05, -0.1, 0.9])
+    rgb, depth = ball_image(centre)
+    u, v = CAMERA.project(centre)
+    reach = CAMERA.focal * RADIUS / centre[2] / 3
+    cover = {
+        "left": np.s_[:, : round(u - reach)],
+        "right": np.s_[:, round(u + reach) :],
+        "top": np.s_[: round(v - reach)],
+    }
+    rgb[cover[side]], depth[cover[side]] = 90, 0.6
+    found = detect(rgb, depth)
+    np.testing.assert_allclose(found.centre, centre, atol=2e-6)
+    assert found.visible < 0.85
+
+
+def test_a_ball_hidden_by_four_fifths_is_not_found():
+    rgb, depth = ball_image((0.0, 0.0, 0.9))
+    rgb[:, : round(CAMERA.project([0.0, 0.0, 0.9])[0] + 0.6 * CAMERA.focal * RADIUS / 0.9)] = 90
+    assert detect(rgb, depth) is None
+
+
+def test_flying_pixels_do_not_move_the_centre():
+    centre = (0.1, 0.1, 1.0)
+    rgb, depth = ball_image(centre)
+    patch = find_patch(rgb)
+    chosen = np.random.default_rng(0).choice(len(patch.rows), len(patch.rows) // 8, replace=False)
+    depth[patch.rows[chosen], patch.columns[chosen]] += 0.3
+    np.testing.assert_allclose(detect(rgb, depth).centre, centre, atol=2e-6)
+
+
+def test_the_largest_of_two_red_patches_is_the_ball():
+    rgb, depth = ball_image((0.2, 0.0, 1.0))
+    rgb[20:25, 20:25] = RED
+    np.testing.assert_allclose(detect(rgb, depth).centre, (0.2, 0.0, 1.0), atol=2e-6)
+
+
+def test_a_flat_red_patch_much_larger_than_the_ball_is_not_the_ball():
+    rgb, depth = ball_image((0.0, 0.0, 1.0))
+    rgb[60:160, 60:200], depth[60:160, 60:200] = RED, 1.2
+    assert detect(rgb, depth) is None
+
+
+def test_depth_without_any_shape_is_not_the_ball():
+    rgb, depth = ball_image((0.0, 0.0, 1.0))
+    depth += np.random.default_rng(0).normal(scale=0.03, size=depth.shape)
+    assert detect(rgb, depth) is None
+
+
+def test_an_image_without_red_and_a_speck_hold_no_ball():
+    rgb, depth = ball_image((0.0, 0.0, 1.0), colour=(90, 90, 90))
+    assert detect(rgb, depth) is None
+    rgb[50:53, 50:53] = RED
+    assert detect(rgb, depth) is None
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0, 1.25), (0.35, 0.3, 1.3)])
+def test_depth_noise_of_several_millimetres_leaves_the_centre_unbiased(centre):
+    rgb, depth = ball_image(centre)
+    patch, noise, rng = find_patch(rgb), DepthNoise("stereo"), np.random.default_rng(2)
+    true = depth[patch.rows, patch.columns]
+    assert noise.sigma(true, CAMERA).mean() > 0.003
+    found = [locate_ball(patch, noise.apply(true, CAMERA, rng), CAMERA, RADIUS) for _ in range(400)]
+    errors = np.array([ball.centre for ball in found if ball is not None]) - centre
+    assert len(errors) == 400
+    # The bias is far below the scatter, and the scatter is what the fit says of itself.
+    assert np.abs(errors.mean(axis=0)).max() < 0.00015
+    expected = np.sqrt(np.mean([ball.fit.uncertainty**2 for ball in found]))
+    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(expected, rel=0.15)
+
+
+def test_the_fit_fails_where_no_ray_meets_the_sphere():
+    rays = CAMERA.rays(np.arange(100), np.full(100, 3))
+    assert fit_sphere(rays, np.ones(100), np.array([0.0, 0.5, 1.0]), RADIUS) is None
+
+
+def test_drawing_marks_the_outline_on_a_copy():
+    rgb, depth = ball_image((0.1, -0.1, 1.0))
+    before, found = rgb.copy(), detect(rgb, depth)
+    picture = draw_detection(rgb, found, CAMERA, RADIUS)
+    np.testing.assert_array_equal(rgb, before)
+    changed = np.argwhere((picture != rgb).any(axis=2))[:, ::-1]
+    distance = np.linalg.norm(changed - CAMERA.project(found.centre), axis=1)
+    assert len(changed) > 20
+    assert distance.max() < CAMERA.focal * RADIUS / 1.0 + 5
+    np.testing.assert_array_equal(draw_detection(rgb, None, CAMERA, RADIUS), rgb)

@@ -1,0 +1,104 @@
+"""Mappings of FMU variables in TOML files."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from servobench.plant.fmu.mapping import FmuMapping, read_mapping
+
+WHOLE = """
+file = "crane.fmu"
+inputs = ["v[1]", "v[2]"]
+features = "hook"
+joints = ["q"]
+home = "q0"
+start = [0.3, 1.2]
+period = 0.01
+[parameters]
+mass = 12
+gains = [1.0, 2.0]
+[nominal]
+gains = 3.0
+[truth]
+features = ["hook"]
+jacobian = ["J"]
+states = "s"
+[limits]
+max_joint_speed = 2
+joint_lower = -3.1
+joint_upper = 3.2
+[names]
+joints = ["slew", "luff"]
+features = ["x", "y"]
+feature_unit = "mm"
+"""
+
+
+def written(tmp_path, text):
+    path = tmp_path / "crane.toml"
+    path.write_text(text)
+    return path
+
+
+def test_every_key_arrives(tmp_path):
+    mapping = read_mapping(written(tmp_path, WHOLE))
+    assert mapping.path == tmp_path / "crane.fmu"
+    assert (mapping.inputs, mapping.features, mapping.joints) == (("v[1]", "v[2]"), ("hook",), ("q",))
+    assert (mapping.home, mapping.period, mapping.true_features, mapping.true_jacobian) == (
+        "q0",
+        0.01,
+        ("hook",),
+        ("J",),
+    )
+    assert (mapping.max_joint_speed, mapping.joint_lower, mapping.joint_upper) == (2.0, -3.1, 3.2)
+    assert (mapping.joint_names, mapping.feature_names, mapping.feature_unit) == (("slew", "luff"), ("x", "y"), "mm")
+    np.testing.assert_array_equal(mapping.parameters["gains"], [1.0, 2.0])
+    assert mapping.parameters["mass"] == 12.0
+    assert mapping.nominal == {"gains": 3.0}
+    assert mapping.true_states == ("s",)
+    assert mapping.start.tolist() == [0.3, 1.2]
+    assert read_mapping(written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))).nominal is None
+
+
+def test_the_mapping_in_the_documentation_is_one_and_names_every_key(tmp_path):
+    readme = (Path(__file__).parents[2] / "fmus" / "README.md").read_text(encoding="utf-8")
+    text = readme.partition("```toml\n")[2].partition("```")[0]
+    mapping = read_mapping(written(tmp_path, text))
+    values = {item.name: getattr(mapping, item.name) for item in fields(FmuMapping)}
+    del values["camera"]  # for the exported UR5 only
+    unset = [name for name, value in values.items() if value is None or (isinstance(value, tuple | dict) and not value)]
+    assert unset == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('file = "crane.fmu"', "", "the key 'file' is missing"),
+        ('features = "hook"', "", "the key 'features' is missing"),
+        ('home = "q0"', 'hoem = "q0"', r"unknown key 'hoem'; did you mean 'home'\? valid: file, inputs"),
+        ("joint_lower", "joint_low", "unknown key 'limits.joint_low'; did you mean 'limits.joint_lower'"),
+        ('home = "q0"', "home = 3", "home must be text, got 3"),
+        ('joints = ["q"]', "joints = [1]", r"joints must be a name or a list of names, got \[1\]"),
+        ("gains = 3.0", "gains = 'large'", "gains must be a number, got 'large'"),
+        ('home = "q0"', "", "start needs home, the parameter that takes it"),
+        ("period = 0.01", 'period = "short"', "period must be a number, got 'short'"),
+        ("period = 0.01", "period = 0.0", "period must be above 0, got 0.0"),
+        ("mass = 12", 'mass = "heavy"', "mass must be a number, got 'heavy'"),
+        ("max_joint_speed = 2", "max_joint_speed = -2", "max_joint_speed must be above 0"),
+        ("[parameters]\nmass = 12\ngains = [1.0, 2.0]", "parameters = 1", "parameters must be a section"),
+        ("period = 0.01", "period = ", "is not valid TOML"),
+    ],
+)
+def test_a_bad_mapping_is_one_clear_error_that_names_the_file(tmp_path, old, new, message):
+    assert old in WHOLE
+    with pytest.raises(ValueError, match=f"mapping .*crane.toml.*{message}"):
+        read_mapping(written(tmp_path, WHOLE.replace(old, new, 1)))
+
+
+def test_a_missing_mapping_is_told(tmp_path):
+    with pytest.raises(ValueError, match=r"mapping .*missing.toml cannot be read"):
+        read_mapping(tmp_path / "missing.toml")

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from servobench.plant.robot.mismatch import (
+    MAX_TILT,
+    Mismatch,
+    magnitude_texts,
+    parse_mismatch,
+    sample_mismatch,
+)
+from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
+
+POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
+
+
+def test_no_mismatch_leaves_the_model_as_it_is():
+    model, _ = sample_mismatch(parse_mismatch("none"), nominal_ur5(), 3)
+    np.testing.assert_allclose(model.feature(POSES), nominal_ur5().feature(POSES), rtol=0, atol=1e-12)
+
+
+def test_the_same_seed_draws_the_same_robot_and_another_seed_another():
+    mismatch = parse_mismatch("severe")
+    records = [sample_mismatch(mismatch, nominal_ur5(), seed)[1].as_record() for seed in (5, 5, 6)]
+    assert records[0] == records[1]
+    assert records[0] != records[2]
+    assert json.loads(json.dumps(records[0])) == records[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "links", "offset", "angle", "tool"), [("moderate", 0.05, 3, 15, 0.02), ("severe", 0.1, 6, 45, 0.04)]
+)
+def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset, angle, tool):
+    samples = [sample_mismatch(parse_mismatch(text), nominal_ur5(), seed)[1] for seed in range(200)]
+    for values, bound in (
+        ([sample.link_scale - 1 for sample in samples], links),
+        ([sample.joint_offset for sample in samples], math.radians(offset)),
+        ([sample.camera_angle for sample in samples], math.radians(angle)),
+        ([sample.tool_offset for sample in samples], tool),
+    ):
+        assert np.abs(values).max() <= bound
+        assert np.max(values) > 0.9 * bound
+        assert np.min(values) < -0.9 * bound
+
+
+@pytest.mark.parametrize("angle", [10, 45, 90, 120, 180])
+def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(angle):
+    nominal = nominal_ur5()
+    for seed in range(100):
+        true, _ = sample_mismatch(parse_mismatch(f"camera_rotation={angle}deg"), nominal, seed)
+        R = nominal.X_BC[:3, :3].T @ true.X_BC[:3, :3]
+        assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(math.radians(angle), abs=1e-6)
+        assert math.acos(min(R[2, 2], 1.0)) <= MAX_TILT + 1e-9
+        np.testing.assert_allclose(true.to_camera(WORKSPACE_CENTRE), nominal.to_camera(WORKSPACE_CENTRE), atol=1e-12)
+
+
+def test_a_larger_magnitude_goes_further_in_the_same_direction():
+    small, large = (sample_mismatch(parse_mismatch(f"links={size}%"), nominal_ur5(), 4)[1] for size in (5, 10))
+    np.testing.assert_allclose(2 * (small.link_scale - 1), large.link_scale - 1, atol=1e-12)
+
+
+def test_axes_add_to_a_profile():
+    both = parse_mismatch("moderate+gear_ratio=5%")
+    assert (both.links, both.gear_ratio) == (0.05, 0.05)
+    assert not both.camera_exact
+
+
+def test_factory_takes_the_arm_of_the_calibration_file():
+    true, _ = sample_mismatch(parse_mismatch("factory"), nominal_ur5(), 0)
+    np.testing.assert_allclose(true.arm.ball_position(POSES), ur5_arm_from_calibration().ball_position(POSES))
+
+
+def test_a_gear_ratio_scales_the_motion_but_not_the_reported_position():
+    true, sample = sample_mismatch(parse_mismatch("gear_ratio=5%"), nominal_ur5(), 0)
+    expected = nominal_ur5().jacobian(sample.gear_ratio * POSES) * sample.gear_ratio
+    np.testing.assert_allclose(true.jacobian(POSES), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mild", "'mild' is not known here; wanted one profile"),
+        ("links", "axis links needs a magnitude"),
+        ("camera_rotation=60", "axis camera_rotation needs a magnitude with one of the units 'deg', 'rad'"),
+        ("tool=20deg", "axis tool needs a magnitude with one of the units"),
+        ("links=-5%", "axis links needs a magnitude"),
+        ("links=120%", "links must be at least 0 and below 1"),
+        ("camera_rotation=200deg", "camera_rotation must be"),
+        ("none=3", "'none=3' is not known"),
+        ("links=5%+moderate", "'moderate' is not known here"),
+    ],
+)
+def test_a_malformed_mismatch_is_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        parse_mismatch(text)
+
+
+def test_a_missing_calibration_file_is_named():
+    with pytest.raises(ValueError, match="nowhere.yaml cannot be read"):
+        sample_mismatch(parse_mismatch("factory=nowhere.yaml"), nominal_ur5(), 0)
+
+
+def test_a_negative_magnitude_is_refused():
+    with pytest.raises(ValueError, match="tool must be at least 0"):
+        Mismatch(tool=-0.1)
+
+
+@pytest.mark.parametrize(
+    ("axis", "text", "magnitudes"),
+    [
+        ("camera_rotation", "0:90:45deg", ("0deg", "45deg", "90deg")),
+        ("links", "0:30:10%", ("0%", "10%", "20%", "30%")),
+        ("tool", "5/12.5mm", ("5mm", "12.5mm")),
+        ("gear_ratio", "0.1", ("0.1",)),
+        ("joint_offsets", "0:0.3:0.1rad", ("0rad", "0.1rad", "0.2rad", "0.3rad")),
+    ],
+)
+def test_a_range_of_magnitudes_includes_both_ends(axis, text, magnitudes):
+    assert magnitude_texts(axis, text) == magnitudes
+
+
+@pytest.mark.parametrize(
+    ("axis", "text", "message"),
+    [
+        ("lens", "0:1:1", "unknown mismatch axis 'lens'; valid: links, joint_offsets"),
+        ("links", "30:0:10%", "the range '30:0:10%' of links is empty"),
+        ("links", "0:30:0%", "is empty"),
+        ("tool", "0:60mm", "tool needs begin:end:step with a unit, such as tool=0:60:20mm; got '0:60mm'"),
+        ("tool", "", "tool needs begin:end:step"),
+        ("tool", "0:60:20deg", "tool needs a magnitude with one of the units 'mm'"),
+    ],
+)
+def test_a_bad_range_of_magnitudes_is_refused(axis, text, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        magnitude_texts(axis, text)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
+    model, sample = sample_mismatch(parse_mismatch("camera_move=120deg"), nominal_ur5(), seed)
+    moved = sample.moved(model)
+    turn = Rotation.from_matrix(model.X_BC[:3, :3].T @ moved.X_BC[:3, :3])
+    assert turn.magnitude() == pytest.approx(np.radians(120.0))
+    tilt = np.arccos(model.X_BC[:3, 2] @ moved.X_BC[:3, 2])
+    assert tilt <= np.radians(30.0) + 1e-9
+    np.testing.assert_allclose(model.to_camera(WORKSPACE_CENTRE), moved.to_camera(WORKSPACE_CENTRE), atol=1e-12)
+
+
+def test_without_a_move_there_is_no_moved_robot():
+    model, sample = sample_mismatch(parse_mismatch("severe"), nominal_ur5(), 0)
+    assert sample.moved(model) is None

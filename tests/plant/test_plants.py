@@ -1,0 +1,177 @@
+"""The contract of a plant, held against every registered one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servobench.harness.config.registry import find_plant, plant_names
+from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.signals import Command
+
+PERIOD = 0.05
+COMMANDS = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 6))
+
+
+@pytest.fixture(params=plant_names())
+def entry(request) -> PlantEntry:
+    return find_plant(request.param)
+
+
+@pytest.fixture
+def plant(entry):
+    model, _ = sample_mismatch(parse_mismatch("moderate+gear_ratio=5%"), nominal_ur5(), 1)
+    made = entry.build(entry.config(), PlantSetup(model, np.array(HOME), PERIOD))
+    yield made
+    made.close()
+
+
+def record(plant, seed: int) -> list[tuple[float, bytes, bytes, bool]]:
+    observations = [plant.reset(seed), *(plant.step(Command(u)) for u in COMMANDS)]
+    return [(o.time, o.joint_position.tobytes(), o.feature.tobytes(), o.feature_valid) for o in observations]
+
+
+def test_the_spec_tells_sizes_that_observations_have(plant):
+    observation = plant.reset(0)
+    assert observation.joint_position.shape == (plant.spec.n,)
+    assert observation.feature.shape == (plant.spec.m,)
+    assert plant.spec.period == PERIOD
+
+
+def test_it_starts_where_it_was_told_to_at_time_zero(plant):
+    observation = plant.reset(0)
+    assert observation.time == 0.0
+    np.testing.assert_allclose(observation.joint_position, HOME, atol=1e-6)
+
+
+def test_time_is_the_number_of_periods_times_the_period(plant):
+    plant.reset(0)
+    assert [plant.step(Command(u)).time for u in COMMANDS] == [(k + 1) * PERIOD for k in range(len(COMMANDS))]
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(plant):
+    first = record(plant, 7)
+    assert record(plant, 7) == first
+    assert record(plant, 8) != first
+
+
+def test_the_truth_is_near_what_is_seen_at_rest(plant):
+    observation = plant.reset(0)
+    np.testing.assert_allclose(plant.truth().feature, observation.feature, atol=0.01)
+
+
+def test_the_true_jacobian_predicts_the_true_feature(plant):
+    plant.reset(0)
+    before = plant.truth()
+    start = plant.reset(0).joint_position
+    for _ in range(4):
+        observation = plant.step(Command(0.05 * np.ones(plant.spec.n)))
+    moved = observation.joint_position - start
+    assert np.linalg.norm(moved) > 0.005
+    after = plant.truth()
+    J = (before.jacobian + after.jacobian) / 2
+    np.testing.assert_allclose(after.feature - before.feature, J @ moved, atol=2e-5)
+
+
+def test_a_command_beyond_the_limit_is_clipped(plant):
+    n, limit = plant.spec.n, plant.spec.joint_velocity_limit
+    moves = []
+    for factor in (1.0, 10.0):
+        plant.reset(0)
+        for _ in range(4):
+            observation = plant.step(Command(factor * limit * np.ones(n)))
+        moves.append(observation.joint_position)
+    np.testing.assert_allclose(moves[0], moves[1], atol=1e-9)
+
+
+def test_a_command_of_the_wrong_size_is_refused(plant):
+    plant.reset(0)
+    with pytest.raises(ValueError, match="joint_velocity must have shape"):
+        plant.step(Command(np.zeros(plant.spec.n + 1)))
+
+
+def test_a_command_that_is_not_finite_cannot_be_made():
+    with pytest.raises(ValueError, match="joint_velocity must be finite"):
+        Command(np.array([0.0, np.nan]))
+
+
+def test_a_start_of_the_wrong_size_is_refused(entry):
+    with pytest.raises(ValueError, match="start must have shape"):
+        entry.build(entry.config(), PlantSetup(nominal_ur5(), np.zeros(2), PERIOD))
+
+
+def test_a_negative_seed_is_refused(plant):
+    with pytest.raises(ValueError, match="seed must be a non-negative integer"):
+        plant.reset(-1)
+
+
+def test_it_can_be_closed_twice_and_closes_no_other(entry, plant):
+    plant.close()
+    other = entry.build(entry.config(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
+    plant.close()
+    assert other.reset(0).feature_valid
+    other.close()
+
+
+def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):
+    plain = record(plant, 3)
+    plant.reset(3)
+    pictures = [plant.picture()]
+    observed = []
+    for u in COMMANDS:
+        observation = plant.step(Command(u))
+        observed.append(observation.feature.tobytes())
+        pictures.append(plant.picture())
+    assert observed == [row[2] for row in plain[1:]]
+    for picture in pictures:
+        assert picture is None or (picture.dtype == np.uint8 and picture.ndim == 3 and picture.std() > 0)
+
+
+def test_a_moved_camera_shows_the_ball_elsewhere_until_the_reset(plant):
+    model, sample = sample_mismatch(parse_mismatch("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
+    moved = sample.moved(model)
+    plant.reset(0)
+    before = plant.truth()
+    plant.move_camera(moved.X_BC)
+    observation = plant.step(Command(np.zeros(6)))
+    for _ in range(3):
+        observation = plant.step(Command(np.zeros(6)))
+    after = plant.truth()
+    assert np.linalg.norm(after.feature - before.feature) > 0.005
+    np.testing.assert_allclose(after.feature, moved.feature(observation.joint_position), atol=1e-6)
+    np.testing.assert_allclose(after.jacobian, moved.jacobian(observation.joint_position), atol=1e-6)
+    assert np.linalg.norm(observation.feature - after.feature) < 0.01
+    plant.reset(0)
+    np.testing.assert_allclose(plant.truth().feature, before.feature, atol=1e-9)
+
+
+def test_noise_and_latency_can_be_varied(entry):
+    model = nominal_ur5()
+
+    def spread(factor: float) -> float:
+        plant = entry.build(entry.vary_sensing(entry.config(), factor, 3), PlantSetup(model, np.array(HOME), PERIOD))
+        try:
+            seen = [plant.reset(4).feature, *(plant.step(Command(np.zeros(6))).feature for _ in range(30))]
+            return float(np.std(seen, axis=0).max())
+        finally:
+            plant.close()
+
+    quiet, usual, loud = spread(0.0), spread(1.0), spread(3.0)
+    assert quiet < 0.5 * usual
+    assert loud > 1.8 * usual
+
+
+START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the point about which the camera turns
+
+
+def test_latency_shows_a_moved_camera_late(entry):
+    model, sample = sample_mismatch(parse_mismatch("camera_move=20deg"), nominal_ur5(), 1)
+    plant = entry.build(entry.vary_sensing(entry.config(), 0.0, 3), PlantSetup(model, START, PERIOD))
+    first = plant.reset(0).feature
+    plant.move_camera(sample.moved(model).X_BC)
+    seen = [np.linalg.norm(plant.step(Command(np.zeros(6))).feature - first) for _ in range(6)]
+    plant.close()
+    assert max(seen[:3]) < 0.002
+    assert min(seen[3:]) > 0.005

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servobench.plant.plant import whole_steps
+from servobench.plant.signals import (
+    Command,
+    Observation,
+    PlantSpec,
+    check_number,
+)
+
+
+def test_messages_keep_read_only_copies():
+    source = np.zeros(2)
+    command = Command(source)
+    source[0] = 1.0
+    assert command.joint_velocity.tolist() == [0.0, 0.0]
+    with pytest.raises(ValueError, match="read-only"):
+        command.joint_velocity[0] = 1.0
+
+
+@pytest.mark.parametrize("name", ["joint_position", "feature"])
+def test_an_observation_must_be_finite(name):
+    values = {"joint_position": np.zeros(2), "feature": np.zeros(1)} | {name: np.array([np.inf])}
+    with pytest.raises(ValueError, match=f"{name} must be finite"):
+        Observation(time=0.0, **values)
+
+
+def test_an_observation_needs_a_time():
+    with pytest.raises(ValueError, match="time must be finite"):
+        Observation(np.nan, np.zeros(1), np.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"joint_velocity_limit": np.array([0.0])}, "joint_velocity_limit must be positive"),
+        ({"joint_velocity_limit": np.ones(2)}, "joint_velocity_limit must have shape"),
+        ({"joint_lower": np.array([3.0])}, "joint_lower must be below joint_upper"),
+        ({"period": 0.0}, "period must be positive"),
+    ],
+)
+def test_a_spec_is_checked(change, message):
+    values = {
+        "joint_names": ("a",),
+        "feature_names": ("x",),
+        "joint_velocity_limit": np.ones(1),
+        "joint_lower": -np.ones(1),
+        "joint_upper": np.ones(1),
+        "period": 0.1,
+    }
+    with pytest.raises(ValueError, match=message):
+        PlantSpec(**(values | change))
+
+
+def test_a_number_is_held_against_its_bounds():
+    check_number("x", 1.0, above=0.0, at_most=1.0)
+    with pytest.raises(ValueError, match="x must be above 0 and at most 1, got 2"):
+        check_number("x", 2, above=0.0, at_most=1.0)
+    with pytest.raises(ValueError, match="x must be finite, got inf"):
+        check_number("x", np.inf)
+
+
+def test_a_period_is_a_whole_number_of_own_steps():
+    assert whole_steps(0.05, 1 / 240) == 12
+    with pytest.raises(ValueError, match=r"whole multiple of the plant's own step of 0.00416666667 s, got 0.051 s"):
+        whole_steps(0.051, 1 / 240)
+    with pytest.raises(ValueError, match="whole multiple"):
+        whole_steps(-0.05, 1 / 240)

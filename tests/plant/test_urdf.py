@@ -1,0 +1,187 @@
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pybullet
+import pytest
+
+from servobench.plant.bullet.bullet_plant import ur5_body
+from servobench.plant.bullet.meshes import rectangles_obj, sphere_mesh, sphere_obj
+from servobench.plant.bullet.urdf import ArmBody, arm_urdf, bench_files
+from servobench.plant.bullet.urdf_elements import rpy_along
+from servobench.plant.robot import ur5
+from servobench.plant.robot.arm import SerialArm
+
+BALL = 7  # link number: six joints, the flange, the ball
+
+
+def perturbed_ur5() -> SerialArm:
+    rng, arm = np.random.default_rng(4), ur5.ur5_arm()
+    return SerialArm(
+        arm.joint_names,
+        arm.translation * rng.uniform(0.9, 1.1, arm.translation.shape),
+        arm.rpy + rng.uniform(-0.05, 0.05, arm.rpy.shape),
+        rng.uniform(-0.1, 0.1, 6),
+        rng.uniform(0.9, 1.1, 6),
+        arm.tool + rng.uniform(-0.04, 0.04, 3),
+    )
+
+
+ARMS = {"nominal": ur5.ur5_arm, "factory": ur5.ur5_arm_from_calibration, "perturbed": perturbed_ur5}
+
+
+@pytest.fixture(params=ARMS)
+def arm(request) -> SerialArm:
+    return ARMS[request.param]()
+
+
+@pytest.fixture
+def loaded(arm, tmp_path):
+    """The arm in PyBullet: a function from reported joint positions to the state of a link."""
+    (tmp_path / "arm.urdf").write_text(arm_urdf(arm, ur5_body(), "ball.obj"), encoding="utf-8")
+    (tmp_path / "ball.obj").write_text(sphere_obj(0), encoding="utf-8")
+    client = pybullet.connect(pybullet.DIRECT)
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+    path = str(tmp_path / "arm.urdf")
+    body = pybullet.loadURDF(path, useFixedBase=True, flags=flags, physicsClientId=client)
+
+    def link_state(q, link):
+        for joint, angle in enumerate(arm.joint_angle(q)):
+            pybullet.resetJointState(body, joint, angle, physicsClientId=client)
+        return pybullet.getLinkState(body, link, computeForwardKinematics=True, physicsClientId=client)
+
+    link_state.dynamics = lambda link: pybullet.getDynamicsInfo(body, link, physicsClientId=client)
+    yield link_state
+    pybullet.disconnect(client)
+
+
+def test_the_simulators_ball_is_where_the_arm_says(arm, loaded):
+    q = np.random.default_rng(0).uniform(-2 * np.pi, 2 * np.pi, (500, 6))
+    simulated = np.array([loaded(pose, BALL)[4] for pose in q])
+    assert np.abs(simulated - arm.ball_position(q)).max() <= 1e-6
+
+
+def test_the_simulators_joints_and_flange_are_where_the_arm_says(arm, loaded):
+    q = np.random.default_rng(1).uniform(-np.pi, np.pi, 6)
+    frames = arm.frames(q)
+    for link in range(7):
+        state = loaded(q, link)
+        np.testing.assert_allclose(state[4], frames[link, :3, 3], atol=1e-6)
+        turned = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+        np.testing.assert_allclose(turned, frames[link, :3, :3], atol=1e-5)
+
+
+def test_the_centres_of_mass_are_those_of_the_data_sheet_in_the_dh_frames(arm, loaded):
+    q = np.random.default_rng(2).uniform(-np.pi, np.pi, 6)
+    for link, centre in enumerate(ur5.CENTRE_OF_MASS):
+        dh_frame = arm.frames(q)[link] @ fixed_transform(arm, link + 1)
+        np.testing.assert_allclose(loaded(q, link)[0], dh_frame[:3, :3] @ centre + dh_frame[:3, 3], atol=1e-6)
+
+
+def fixed_transform(arm, row):
+    fixed = np.eye(4)
+    quaternion = pybullet.getQuaternionFromEuler(arm.rpy[row].tolist())
+    fixed[:3, :3] = np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+    fixed[:3, 3] = arm.translation[row]
+    return fixed
+
+
+def test_masses_and_inertias_arrive_in_the_simulator(loaded):
+    for link in range(6):
+        info = loaded.dynamics(link)
+        assert info[0] == pytest.approx(ur5.MASS[link])
+        across, along = ur5.INERTIA[link]
+        np.testing.assert_allclose(sorted(info[2]), sorted([across, across, along]), rtol=1e-6)
+
+
+def test_numbers_in_the_urdf_lose_no_digit():
+    arm = perturbed_ur5()
+    origins = ET.fromstring(arm_urdf(arm, ur5_body(), "ball.obj")).findall("joint/origin")
+    written = np.array([[float(part) for part in origin.get("xyz").split()] for origin in origins])
+    np.testing.assert_array_equal(written, np.vstack([arm.translation, arm.tool]))
+
+
+def test_nothing_collides():
+    assert "<collision" not in arm_urdf(ur5.ur5_arm(), ur5_body(), "ball.obj") + bench_files()["bench.urdf"]
+
+
+def test_nothing_but_the_ball_is_reddish():
+    robot = ET.fromstring(arm_urdf(ur5.ur5_arm(), ur5_body(), "ball.obj"))
+    bench = ET.fromstring(bench_files()["bench.urdf"])
+    for visual in [*robot.iter("visual"), *bench.iter("visual")]:
+        red, green, blue, _ = (float(part) for part in visual.find("material/color").get("rgba").split())
+        is_ball = (
+            visual.find("geometry/mesh") is not None and visual.find("geometry/mesh").get("filename") == "ball.obj"
+        )
+        assert (red > 2 * max(green, blue)) == is_ball
+
+
+def test_the_benchs_urdf_names_files_that_come_with_it():
+    files = bench_files()
+    names = {mesh.get("filename") for mesh in ET.fromstring(files["bench.urdf"]).iter("mesh")}
+    assert names == set(files) - {"bench.urdf"}
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -2), (1, 0, 0), (0.3, -0.4, 0.1), (-1, -1, -1)])
+def test_rpy_along_turns_z_into_the_direction(direction):
+    turned = pybullet.getMatrixFromQuaternion(pybullet.getQuaternionFromEuler(rpy_along(direction).tolist()))
+    np.testing.assert_allclose(
+        np.reshape(turned, (3, 3))[:, 2], np.array(direction) / np.linalg.norm(direction), atol=1e-7
+    )
+
+
+def test_the_sphere_is_closed_round_and_turned_outwards():
+    vertices, triangles = sphere_mesh(3)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0, atol=1e-12)
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    assert {tuple(edge) for edge in edges} == {tuple(edge) for edge in edges[:, ::-1]}
+    assert len(vertices) - len(edges) // 2 + len(triangles) == 2
+    a, b, c = vertices[triangles].transpose(1, 0, 2)
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) > 0).all()
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(4 * np.pi / 3, rel=0.01)
+
+
+def test_the_obj_file_holds_the_mesh():
+    vertices, triangles = sphere_mesh(1)
+    lines = [line.split() for line in sphere_obj(1).splitlines()]
+    np.testing.assert_array_equal([[float(x) for x in row[1:]] for row in lines if row[0] == "v"], vertices)
+    faces = [[int(corner.split("//")[0]) for corner in row[1:]] for row in lines if row[0] == "f"]
+    np.testing.assert_array_equal(faces, triangles + 1)
+
+
+def test_rectangles_face_up_and_have_their_area():
+    text = rectangles_obj([(0.0, 0.0, 1.0, 2.0), (3.0, 3.0, 4.0, 4.0)], -0.5)
+    rows = [line.split() for line in text.splitlines()]
+    vertices = np.array([[float(x) for x in row[1:]] for row in rows if row[0] == "v"])
+    faces = np.array([[int(corner.split("//")[0]) - 1 for corner in row[1:]] for row in rows if row[0] == "f"])
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    np.testing.assert_allclose(np.cross(b - a, c - a)[:, 2] / 2, [1.0, 1.0, 0.5, 0.5])
+    assert (vertices[:, 2] == -0.5).all()
+
+
+def changed_body(**change) -> ArmBody:
+    body = ur5_body()
+    names = ("mass", "centre_of_mass", "inertia", "max_torque", "tube_radius", "side_step", "ball_radius")
+    return ArmBody(**({name: getattr(body, name) for name in names} | change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"centre_of_mass": np.zeros((5, 3))}, r"centre_of_mass must have shape \(6, 3\), got \(5, 3\)"),
+        ({"mass": -np.ones(6)}, "mass must be positive"),
+        ({"inertia": np.zeros((6, 2))}, "inertia must be positive"),
+        ({"max_torque": np.full(6, np.nan)}, "max_torque must be finite"),
+        ({"ball_radius": 0.0}, "ball_radius must be above 0"),
+    ],
+)
+def test_a_bad_body_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        changed_body(**change)
+
+
+def test_a_body_for_another_number_of_joints_is_refused():
+    arm = SerialArm(("one",), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.array([0.0, 0.0, 0.1]))
+    with pytest.raises(ValueError, match="body must be for 1 joints, got one for 6"):
+        arm_urdf(arm, ur5_body(), "ball.obj")
