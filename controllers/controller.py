@@ -11,15 +11,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    PlantSpec,
-    RunFault,
-)
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import Command, Observation, PlantSpec
 
 if TYPE_CHECKING:
     from servobench.controllers.networks.config import TrainingConfig
@@ -28,24 +23,6 @@ if TYPE_CHECKING:
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 SymbolicFeature: TypeAlias = Callable[[Any], Any]
 Diagnostics: TypeAlias = Mapping[str, float]
-
-
-class ControllerDiverged(RunFault):
-    """A controller asked for something that is not finite."""
-
-    status: ClassVar[str] = "controller_diverged"
-
-
-class FilterDiverged(RunFault):
-    """A covariance lost symmetry, positive definiteness or finiteness."""
-
-    status: ClassVar[str] = "filter_diverged"
-
-
-class SolverFailed(RunFault):
-    """An optimiser returned no usable answer and no fallback was configured."""
-
-    status: ClassVar[str] = "solver_failed"
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,10 @@ from typing import Literal, final
 
 import numpy as np
 
-from servobench.controllers.controller import ControllerDiverged, JacobianFunction, RobotKnowledge
-from servobench.plant.signals import (
-    FloatArray,
-    Observation,
-    PlantSpec,
-    check_number,
-)
+from servobench.controllers.controller import JacobianFunction, RobotKnowledge
+from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.faults import ControllerDiverged
+from servobench.plant.signals import Observation, PlantSpec
 
 SOURCES = ("nominal", "probe", "given")
 

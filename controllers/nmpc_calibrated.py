@@ -10,23 +10,13 @@ from typing import Any, Final, Literal, final, get_args
 import casadi
 import numpy as np
 
-from servobench.controllers.controller import (
-    Controller,
-    ControllerEntry,
-    Diagnostics,
-    RobotKnowledge,
-    SolverFailed,
-)
+from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
 from servobench.controllers.laws.mpc.closed_form import decay_targets, move_weights
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
 from servobench.controllers.laws.mpc.qp import SOLVERS, QpShape, QpSolution
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    as_vector,
-    check_number,
-)
+from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.faults import SolverFailed
+from servobench.plant.signals import Command, Observation
 
 Fallback = Literal["hold", "raise"]
 Solver = Literal["daqp", "qpoases"]

@@ -12,16 +12,13 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import (
-    Controller,
-    ControllerDiverged,
-    Diagnostics,
-    RobotKnowledge,
-)
+from servobench.controllers.controller import Controller, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.initial import InitialJacobian
 from servobench.controllers.laws.law import Law
-from servobench.plant.signals import Command, FloatArray, Observation
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import ControllerDiverged
+from servobench.plant.signals import Command, Observation
 
 
 @final

@@ -46,9 +46,9 @@ from servobench.fmus.variables import (
     arm_groups,
     parameters_of,
 )
+from servobench.plant.checks import as_vector
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
-from servobench.plant.signals import as_vector
 
 IDENTIFIER = "ur5_mismatched"
 HEADERS = {

@@ -24,8 +24,8 @@ from servobench.fmus.variables import (
     STATE,
     Layout,
 )
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot.symbolic import SX, HandEyeGeometry, feature_and_jacobian
-from servobench.plant.signals import FloatArray
 
 # Generated functions leave parts of their calling convention unused, and none of them is an entry point of the library.
 KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */

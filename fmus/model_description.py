@@ -20,7 +20,7 @@ from servobench.fmus.variables import (
     Group,
     Layout,
 )
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 UNITS: dict[str, dict[str, str]] = {
     "1": {},

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from servobench.fmus.variables import Actuation, Layout
+from servobench.plant.checks import FloatArray
 from servobench.plant.kinematic import discretise_lag
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.seeds import named_generator
-from servobench.plant.signals import FloatArray
 
 STEP = 0.05  # s
 STEPS = 200

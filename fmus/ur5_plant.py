@@ -13,6 +13,7 @@ import platformdirs
 from servobench.fmus.compile import CompilationFailed, CompilerMissing
 from servobench.fmus.export import ExportOptions, export_fmu, fingerprint
 from servobench.fmus.variables import Actuation, parameters_of
+from servobench.plant.checks import as_vector, check_number
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.entry import build_plant
 from servobench.plant.fmu.fmu_plant import FmuPlant
@@ -20,7 +21,6 @@ from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import FEATURE_NAMES
 from servobench.plant.sensing import vary_sensing
-from servobench.plant.signals import as_vector, check_number
 
 
 @dataclass(frozen=True)

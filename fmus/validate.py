@@ -9,11 +9,12 @@ import numpy as np
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import FmuFolder
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description
 from servobench.plant.fmu.fmu_plant import open_slave
-from servobench.plant.fmu.slave import FmuError, Port
-from servobench.plant.signals import FloatArray
+from servobench.plant.fmu.slave import Port
 
 TOLERANCE = 1e-9
 

@@ -14,9 +14,9 @@ from math import prod
 
 import numpy as np
 
+from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.signals import FloatArray, as_vector
 
 PARAMETER, INPUT, STATE, DERIVATIVE, OUTPUT = "parameter", "input", "state", "derivative", "output"
 

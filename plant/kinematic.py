@@ -16,24 +16,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from servobench.plant.plant import (
-    Plant,
-    PlantDiverged,
-    PlantEntry,
-    PlantSetup,
-)
+from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.faults import PlantDiverged
+from servobench.plant.plant import Plant, PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.seeds import named_generator
 from servobench.plant.sensing import FeatureChannel, vary_sensing
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    PlantSpec,
-    Truth,
-    as_vector,
-    check_number,
-)
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 
 @dataclass(frozen=True)

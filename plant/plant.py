@@ -9,34 +9,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    PlantSpec,
-    RunFault,
-    Truth,
-)
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
-
-
-class PlantDiverged(RunFault):
-    """The plant's state left the finite numbers."""
-
-    status: ClassVar[str] = "plant_diverged"
-
-
-class FeatureLost(RunFault):
-    """The feature was not measured for too many periods in a row."""
-
-    status: ClassVar[str] = "feature_lost"
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 Config = TypeVar("Config")
 

@@ -7,78 +7,10 @@ command of instant t_k; the command acts on [t_k, t_{k+1}).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-
-
-class RunFault(RuntimeError):
-    """A named reason why a run ended before its last period; `status` is what the table of runs shows."""
-
-    status: ClassVar[str] = "fault"
-
-
-def as_vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
-    """Return `value` as a read-only float64 vector.
-
-    Args:
-        name: name of the argument, for the error message.
-        value: anything array-like of shape (size,).
-        size: wanted number of entries.
-
-    Returns:
-        A read-only copy, shape (size,).
-
-    Raises:
-        ValueError: wrong shape, or an entry that is not finite.
-    """
-    vector = np.array(value, dtype=np.float64)
-    if vector.shape != (size,):
-        raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
-    if not np.isfinite(vector).all():
-        raise ValueError(f"{name} must be finite, got {vector.tolist()}")
-    vector.flags.writeable = False
-    return vector
-
-
-def check_number(
-    name: str,
-    value: float,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    at_most: float | None = None,
-    below: float | None = None,
-) -> None:
-    """Check a configured number against its bounds.
-
-    Args:
-        name: name of the argument, for the error message.
-        value: the number that came.
-        above: it must be greater than this.
-        at_least: it must not be less than this.
-        at_most: it must not be greater than this.
-        below: it must be less than this.
-
-    Raises:
-        ValueError: not finite, or out of bounds; names the argument, what was wanted and what came.
-    """
-    wanted = []
-    good = bool(np.isfinite(value))
-    for word, bound, holds in (
-        ("above", above, above is None or value > above),
-        ("at least", at_least, at_least is None or value >= at_least),
-        ("at most", at_most, at_most is None or value <= at_most),
-        ("below", below, below is None or value < below),
-    ):
-        if bound is not None:
-            wanted.append(f"{word} {bound:g}")
-            good = good and holds
-    if not good:
-        raise ValueError(f"{name} must be {' and '.join(wanted) or 'finite'}, got {value}")
+from servobench.plant.checks import FloatArray, as_vector
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("plant", "controllers", "fmus", "harness")
 MAY_IMPORT = {
     "plant": ("plant",),
-    "controllers": ("controllers", "plant.signals"),
+    "controllers": ("controllers", "plant.signals", "plant.checks", "plant.faults", "plant.settings"),
     "fmus": ("fmus", "plant"),
     "harness": PACKAGES,
 }

@@ -7,7 +7,7 @@ from typing import final
 
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from servobench.controllers.controller import Diagnostics
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 LONGEST_DELAY = 14  # periods: no estimator tells of a longer one, so that laws know how much past to keep
 

@@ -16,9 +16,10 @@ from typing import Literal, final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, FilterDiverged
+from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.faults import FilterDiverged
 
 FORMS = ("split", "full")
 

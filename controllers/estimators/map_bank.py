@@ -20,8 +20,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg.lapack import dgesdd, dposv
 
-from servobench.controllers.controller import FilterDiverged
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import FilterDiverged
 
 
 def map_update(

@@ -20,7 +20,7 @@ from servobench.controllers.estimators.map_bank import map_update, near_rotation
 from servobench.controllers.estimators.noise_level import NoiseLevel
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.networks.rbf import JacobianNetwork
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
 JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm

@@ -16,7 +16,7 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import check_filter_numbers, cholesky_of, split_update
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 FORMS = ("sigma_points", "split")
 

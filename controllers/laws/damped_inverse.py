@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 LARGEST = 1e9  # of ‖J‖²/δ²: beyond it rounding is no longer small against δ²
 

@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.estimators.noise_level import NoiseLevel
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 REST_DRIFT = 1e-4  # r, m: how far z may drift a period at rest
 OUTLIER = 25.0  # ‖y − z‖² over its expectation from which on the camera is right and z wrong

@@ -17,7 +17,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 PRIOR = 1e-5  # ρ_1, rad²: outweighed by one step of some milliradians
 GROWTH = 1.5  # of ρ_i from one period to the next: the later, the less is expected

@@ -7,7 +7,8 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics
-from servobench.plant.signals import FloatArray, Observation
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import Observation
 
 
 class Law(ABC):

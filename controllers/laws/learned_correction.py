@@ -24,7 +24,8 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.laws.damped_inverse import damped_inverse
 from servobench.controllers.networks.rbf import ControllerNetwork
-from servobench.plant.signals import FloatArray, Observation
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import Observation
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Law, scale_to_limit
-from servobench.plant.signals import FloatArray, Observation, check_number
+from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.signals import Observation
 
 
 @dataclass(frozen=True)

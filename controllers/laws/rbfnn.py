@@ -17,7 +17,8 @@ from servobench.controllers.laws.roll_out import (
 )
 from servobench.controllers.laws.row_space import project_to_row_space
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output
-from servobench.plant.signals import FloatArray, Observation, check_number
+from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.signals import Observation
 
 Position = Literal["measured", "commanded"]
 POSITIONS: tuple[str, ...] = get_args(Position)

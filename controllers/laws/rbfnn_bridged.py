@@ -30,7 +30,8 @@ from servobench.controllers.laws.learned_correction import CorrectionGains, Lear
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.laws.redistribution import redistribute
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.plant.signals import FloatArray, Observation, check_number
+from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.signals import Observation
 
 Base = Literal["jacobian", "network"]
 BASES: tuple[str, ...] = get_args(Base)

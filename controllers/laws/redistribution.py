@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from servobench.controllers.laws.damped_inverse import damped_inverse
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 NONE = 1e-9  # of its limit: a joint with less room than that has none
 DONE = 1e-6  # share of the step that need not be made

@@ -18,7 +18,7 @@ from functools import cache
 import numpy as np
 
 from servobench.controllers.networks.rbf import ControllerNetwork, information_vector
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 LARGEST_CONDITION = 1e3  # ‖Ĵ‖ ‖Ĵ⁺‖ up to which the normal equations, that square it, lose no more than six digits
 NEGLIGIBLE = 1e-15  # a singular value this small against the largest is rounding

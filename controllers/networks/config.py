@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from servobench.controllers.networks.rbf import KERNELS, Kernel
 from servobench.controllers.networks.samples import PLACEMENTS, Placement
-from servobench.plant.signals import FloatArray, as_vector, check_number
+from servobench.plant.checks import FloatArray, as_vector, check_number
 
 Fit = Literal["output", "entries"]
 FITS: tuple[str, ...] = get_args(Fit)

@@ -44,7 +44,8 @@ from servobench.controllers.networks.samples import (
     pool_size,
     unit_points,
 )
-from servobench.plant.signals import FloatArray, PlantSpec
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import PlantSpec
 
 Progress = Callable[[float, str], None]
 JACOBIAN_SHARE = 0.4  # of the work, for the progress bar

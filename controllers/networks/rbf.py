@@ -20,7 +20,7 @@ from typing import Literal, final, get_args
 
 import numpy as np
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)

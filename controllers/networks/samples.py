@@ -10,7 +10,7 @@ from scipy.cluster.vq import kmeans2
 
 from servobench.controllers.controller import JacobianFunction
 from servobench.controllers.networks.rbf import information_vector
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 Placement = Literal["halton", "sobol", "kmeans"]
 PLACEMENTS: tuple[str, ...] = get_args(Placement)

@@ -23,6 +23,12 @@ from servobench.harness.analysis.statistics import (
 from servobench.harness.config.settings import ConfigurationError, suggest
 from servobench.harness.run.episode import COMPLETED
 
+FEATURE_METRICS: Final = (
+    "steady_state_error",
+    "rms_error",
+    "max_error",
+    "rms_error_evaluated",
+)  # in the feature's unit
 PLACE: Final = ("plant", "task", "mismatch", "noise_factor", "latency_periods")
 TAIL: Final = 0.95
 
@@ -64,7 +70,7 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
                 "settled, %": _text(settled_share(own), 1),
                 "settling time, s": _median(settling_times(own), 1.0, 2),
                 "overshoot, %": _median(own.get("overshoot"), 100.0, 1),
-                "RMS end, mm": _median(own.get("rms_error_evaluated_m"), 1000.0, 1),
+                "RMS end, mm": _median(own.get("rms_error_evaluated"), 1000.0, 1),
                 "worst 5 %, mm": _tail(own),
                 "failures": ", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none",
             }
@@ -75,7 +81,7 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
 def usual_metric(runs: pd.DataFrame) -> str:
     """Return what the controllers of one task are compared by: settling time, or on a curve the error along it."""
     moves = column_of(runs, "overshoot").notna().any()
-    return "settling_time_s" if moves or "rms_error_evaluated_m" not in runs else "rms_error_evaluated_m"
+    return "settling_time_s" if moves or "rms_error_evaluated" not in runs else "rms_error_evaluated"
 
 
 def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> pd.DataFrame:
@@ -116,7 +122,7 @@ def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: fl
 
 def _in_units(metric: str) -> tuple[str, float]:
     """Return a column's name with a unit of handy size, and the factor to it."""
-    name, _, unit = metric.rpartition("_")
+    name, _, unit = (f"{metric}_m" if metric in FEATURE_METRICS else metric).rpartition("_")
     handy, factor = {"m": ("mm", 1000.0), "s": ("s", 1.0), "us": ("µs", 1.0), "rad": ("rad", 1.0)}.get(unit, ("", 1.0))
     return (f"{name.replace('_', ' ')}, {handy}" if handy else metric.replace("_", " ")), factor
 
@@ -132,9 +138,9 @@ def _median(values: pd.Series[float] | None, factor: float, digits: int) -> str:
 
 
 def _tail(runs: pd.DataFrame) -> str:
-    if "steady_state_error_m" not in runs:
+    if "steady_state_error" not in runs:
         return "–"
-    return f"{1000.0 * tail_mean(runs['steady_state_error_m'].where(runs['status'] == COMPLETED), TAIL):.1f}"
+    return f"{1000.0 * tail_mean(runs['steady_state_error'].where(runs['status'] == COMPLETED), TAIL):.1f}"
 
 
 def _text(estimate: Estimate, digits: int) -> str:

@@ -24,9 +24,9 @@ NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
 MEASURES = {  # column -> heading, factor, digits
     "settling_time_s": ("settling [s]", 1.0, 2),
     "overshoot": ("overshoot [%]", 100.0, 1),
-    "steady_state_error_m": ("last second [mm]", 1000.0, 2),
-    "rms_error_evaluated_m": ("RMS, evaluated part [mm]", 1000.0, 2),
-    "max_error_m": ("largest error [mm]", 1000.0, 1),
+    "steady_state_error": ("last second [mm]", 1000.0, 2),
+    "rms_error_evaluated": ("RMS, evaluated part [mm]", 1000.0, 2),
+    "max_error": ("largest error [mm]", 1000.0, 1),
     "path_length_ratio": ("path ratio", 1.0, 3),
     "jacobian_error_mean": ("mean Jacobian error [%]", 100.0, 1),
     "control_effort_rad": ("control effort [rad]", 1.0, 2),
@@ -80,7 +80,7 @@ def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
 
     A task of which no run was judged, as each ended before its first period, is in neither.
     """
-    judged = runs.loc[column_of(runs, "max_error_m").notna(), "task"].unique()
+    judged = runs.loc[column_of(runs, "max_error").notna(), "task"].unique()
     moves = runs.loc[column_of(runs, "overshoot").notna(), "task"].unique()
     curves = [task for task in judged if task not in moves]
     return runs[runs["task"].isin(moves)], runs[runs["task"].isin(curves)]
@@ -102,7 +102,7 @@ def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
             }
             | _median(group, "settling_time_s")
             | _median(group, "overshoot")
-            | _median(group, "steady_state_error_m")
+            | _median(group, "steady_state_error")
         )
     return pd.DataFrame(rows)
 
@@ -114,7 +114,7 @@ def tracking_table(runs: pd.DataFrame) -> pd.DataFrame:
     for key, group in _groups(curves, "task"):
         completed = int((group["status"] == COMPLETED).sum())
         row = key | {"runs": len(group), "completed": completed}
-        rows.append(row | _median(group, "rms_error_evaluated_m") | _median(group, "max_error_m"))
+        rows.append(row | _median(group, "rms_error_evaluated") | _median(group, "max_error"))
     return pd.DataFrame(rows)
 
 

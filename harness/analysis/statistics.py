@@ -23,7 +23,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from servobench.harness.run.episode import COMPLETED
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 2000

@@ -28,7 +28,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
         for name in (
             "settling_time_s",
             "overshoot",
-            "rms_error_evaluated_m",
+            "rms_error_evaluated",
             "path_length_ratio",
             "controller_time_median_us",
         ):
@@ -52,7 +52,7 @@ def summary_tables(runs: pd.DataFrame) -> Group:
                 f"{row['settled']}/{row['runs']}",
                 _number(row["settling_time_s"], 1.0, 2),
                 _number(row["overshoot"], 100.0, 0),
-                _number(row["rms_error_evaluated_m"], 1000.0, 1),
+                _number(row["rms_error_evaluated"], 1000.0, 1),
                 _number(row["path_length_ratio"], 1.0, 2),
                 _number(row["controller_time_median_us"], 1.0, 0),
             )

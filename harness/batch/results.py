@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from servobench.harness.config.settings import ConfigurationError
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"
 PARTS = "parts"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"

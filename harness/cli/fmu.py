@@ -14,7 +14,7 @@ from servobench.fmus.export import ExportOptions, export_fmu
 from servobench.fmus.information import read_information
 from servobench.fmus.validate import validate_fmu
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.fmu.slave import FmuError
+from servobench.plant.faults import FmuError
 from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import nominal_ur5
 from servobench.plant.seeds import named_seed

@@ -26,7 +26,7 @@ from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.style import figure_style, method_styles
 from servobench.harness.run.metrics import SETTLING_BAND
 from servobench.plant.bullet.detection import ByteArray
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
 WIDTH, HEIGHT = 960, 736  # px of a frame; ffmpeg wants multiples of 16
@@ -121,7 +121,7 @@ class _Board:
     def __init__(self, run: LoggedRun) -> None:
         self._run = run
         self._style = method_styles([run.row["controller"]])[run.row["controller"]]
-        self._error = 1000.0 * run.track.column("error_norm_m")
+        self._error = 1000.0 * run.track.column("error_norm")
         with figure_style():
             figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
             self._figure = figure

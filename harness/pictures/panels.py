@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from servobench.harness.pictures.style import MethodStyle
 from servobench.harness.pictures.tracks import Track, Tracks, label_of
 from servobench.harness.run.metrics import SETTLING_BAND
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 MILLI = 1000.0
 SETTLED = f"settling band, {MILLI * SETTLING_BAND:g} mm"
@@ -31,7 +31,7 @@ Styles = dict[str, MethodStyle]
 def draw_error(axes: Axes, tracks: Tracks, styles: Styles) -> None:
     """Draw the norm of the true error over time, logarithmic, with the band in which a run counts as settled."""
     metres = all(name.endswith("_m") for track in tracks.values() for name in track.features)
-    _draw_over_time(axes, tracks, styles, "error_norm_m", MILLI if metres else 1.0)
+    _draw_over_time(axes, tracks, styles, "error_norm", MILLI if metres else 1.0)
     if metres:
         axes.axhline(MILLI * SETTLING_BAND, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=SETTLED)
     axes.set_ylabel("true error [mm]" if metres else "true error")

@@ -20,12 +20,12 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
 from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, ur5_body
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
 from servobench.plant.seeds import named_seed
-from servobench.plant.signals import FloatArray
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import Scene, View

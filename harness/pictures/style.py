@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY, YELLOW, GREY, BLACK = (

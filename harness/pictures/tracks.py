@@ -12,7 +12,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import COMPLETED
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 FEATURE = "feature_"
 

@@ -16,8 +16,8 @@ from servobench.harness.run.experiment import RunRequest, build_experiment
 from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import Judgement, judge_run
+from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
-from servobench.plant.signals import RunFault
 
 COMPLETED = "completed"
 

@@ -31,6 +31,8 @@ from servobench.harness.run.tasks import (
     find_task,
     task_names,
 )
+from servobench.plant.checks import check_number
+from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import (
     Plant,
@@ -43,7 +45,7 @@ from servobench.plant.robot.mismatch import MismatchSample, parse_mismatch, samp
 from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_seed
-from servobench.plant.signals import PlantSpec, RunFault, check_number
+from servobench.plant.signals import PlantSpec
 
 
 @dataclass(frozen=True)

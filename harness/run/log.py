@@ -10,13 +10,8 @@ import numpy as np
 import pandas as pd
 
 from servobench.controllers.controller import Diagnostics
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    PlantSpec,
-    Truth,
-)
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 
 class StepLog:
@@ -76,7 +71,7 @@ class StepLog:
             row.update(
                 (f"{kind}_{name}_{unit}", value) for name, value in zip(spec.joint_names, values.tolist(), strict=True)
             )
-        row["error_norm_m"] = float(np.linalg.norm(reference - truth.feature))
+        row["error_norm"] = float(np.linalg.norm(reference - truth.feature))
         row["jacobian_error"], row["jacobian_condition"] = _judge_jacobian(estimate, truth.jacobian)
         row["feature_valid"] = observation.feature_valid
         row["controller_time_us"], row["plant_time_us"] = (time / 1000.0 for time in nanoseconds)

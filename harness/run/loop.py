@@ -16,9 +16,10 @@ from time import perf_counter_ns
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import StepLog
 from servobench.harness.run.references import Reference
-from servobench.plant.plant import FeatureLost, Plant
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import FeatureLost
+from servobench.plant.plant import Plant
 from servobench.plant.seeds import named_seed
-from servobench.plant.signals import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,9 @@
 | settling_time_s | first time after which the error stays within 5 mm, for at least half a second; NaN if never |
 | settling_time_5pct_s | the same for 5 % of the initial error |
 | overshoot | how far the feature passes a fixed target, as a share of the initial error; NaN when tracking |
-| steady_state_error_m | mean error of the last second |
-| rms_error_m, max_error_m | over the whole run |
-| rms_error_evaluated_m | over the evaluated part: the last lap, the last quarter of a move, the last half of a path |
+| steady_state_error | mean error of the last second |
+| rms_error, max_error | over the whole run |
+| rms_error_evaluated | over the evaluated part: the last lap, the last quarter of a move, the last half of a path |
 | path_length_ratio | true path over the straight line (point to point) or over the reference's path (tracking) |
 | control_effort_rad | Σ |u| dt over joints and periods |
 | saturation_fraction | share of periods in which a joint is commanded at its speed limit |
@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from servobench.plant.signals import FloatArray, PlantSpec
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import PlantSpec
 
 SETTLING_BAND = 0.005  # m
 SETTLING_SHARE = 0.05  # of the initial error
@@ -93,7 +94,7 @@ def judge_run(steps: pd.DataFrame, judgement: Judgement) -> dict[str, float]:
     """
     spec = judgement.spec
     unit = spec.feature_unit
-    error = steps["error_norm_m"].to_numpy()
+    error = steps["error_norm"].to_numpy()
     feature = steps[[f"true_feature_{name}_{unit}" for name in spec.feature_names]].to_numpy()
     reference = steps[[f"reference_{name}_{unit}" for name in spec.feature_names]].to_numpy()
     command = steps[[f"joint_velocity_command_{name}_rad_s" for name in spec.joint_names]].to_numpy()
@@ -106,10 +107,10 @@ def judge_run(steps: pd.DataFrame, judgement: Judgement) -> dict[str, float]:
         "settling_time_s": settling_time(error, SETTLING_BAND, spec.period),
         "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[0], spec.period),
         "overshoot": overshoot(feature, reference[0]) if judgement.point_to_point else np.nan,
-        "steady_state_error_m": float(np.mean(final)),
-        "rms_error_m": _rms(error),
-        "max_error_m": float(np.max(error)),
-        "rms_error_evaluated_m": _rms(evaluated) if len(evaluated) else np.nan,
+        "steady_state_error": float(np.mean(final)),
+        "rms_error": _rms(error),
+        "max_error": float(np.max(error)),
+        "rms_error_evaluated": _rms(evaluated) if len(evaluated) else np.nan,
         "path_length_ratio": path_length(feature) / way if way > 0.0 else np.nan,
         "control_effort_rad": float(np.abs(command).sum() * spec.period),
         "saturation_fraction": float(np.mean(saturated)),

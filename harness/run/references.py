@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 
 class Reference(ABC):

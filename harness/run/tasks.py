@@ -23,6 +23,7 @@ from servobench.harness.run.references import (
     line,
     read_waypoints,
 )
+from servobench.plant.checks import FloatArray, as_vector, check_number
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import (
     HOME,
@@ -31,7 +32,6 @@ from servobench.plant.robot.ur5 import (
     nominal_ur5,
 )
 from servobench.plant.seeds import named_generator
-from servobench.plant.signals import FloatArray, as_vector, check_number
 
 Vector = tuple[float, ...]
 

@@ -27,28 +27,15 @@ from servobench.plant.bullet.detection import (
     find_ball,
 )
 from servobench.plant.bullet.urdf import ArmBody
-from servobench.plant.plant import (
-    FeatureLost,
-    Plant,
-    PlantDiverged,
-    PlantEntry,
-    PlantSetup,
-    whole_steps,
-)
+from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.faults import FeatureLost, PlantDiverged
+from servobench.plant.plant import Plant, PlantEntry, PlantSetup, whole_steps
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.seeds import named_generator
 from servobench.plant.sensing import FeatureChannel, vary_sensing
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    PlantSpec,
-    Truth,
-    as_vector,
-    check_number,
-)
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import Scene

@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot.camera import PinholeCamera
-from servobench.plant.signals import FloatArray
 
 ByteArray = npt.NDArray[np.uint8]
 IntArray = npt.NDArray[np.intp]

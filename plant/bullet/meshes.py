@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 
 def sphere_mesh(subdivisions: int) -> tuple[FloatArray, npt.NDArray[np.int64]]:

@@ -22,8 +22,8 @@ from servobench.plant.robot.camera import PinholeCamera, view_matrix
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.detection import ByteArray
+    from servobench.plant.checks import FloatArray
     from servobench.plant.robot.arm import SerialArm
-    from servobench.plant.signals import FloatArray
 
 GRAVITY = 9.81  # m/s²
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep

@@ -22,8 +22,8 @@ from servobench.plant.bullet.urdf_elements import (
     draw_mesh,
     draw_sphere,
 )
+from servobench.plant.checks import FloatArray, as_vector, check_number
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
-from servobench.plant.signals import FloatArray, as_vector, check_number
 
 BASE_LINK, FLANGE_LINK, BALL_LINK = "base", "flange", "ball"
 ALUMINIUM = (0.76, 0.78, 0.80, 1.0)

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 Colour = tuple[float, float, float, float]
 

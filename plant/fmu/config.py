@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from servobench.plant.signals import check_number
+from servobench.plant.checks import check_number
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from servobench.plant.faults import FmuError
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.fmu_plant import FmuPlant
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
-from servobench.plant.fmu.slave import FmuError
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.sensing import vary_sensing
 

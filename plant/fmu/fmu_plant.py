@@ -17,32 +17,21 @@ from pathlib import Path
 
 import numpy as np
 
+from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import FmuFolder
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.description import FmuDescription, read_description
 from servobench.plant.fmu.mapping import FmuMapping, Names, mapping_spec
 from servobench.plant.fmu.model_exchange import FmuModel, mapped_model
-from servobench.plant.fmu.slave import (
-    Call,
-    FmuError,
-    Port,
-    Slave,
-)
+from servobench.plant.fmu.slave import Call, Port, Slave
 from servobench.plant.fmu.slave2 import Slave2
 from servobench.plant.fmu.slave3 import Slave3
 from servobench.plant.plant import Plant, TrueModel, whole_steps
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.seeds import named_generator
 from servobench.plant.sensing import FeatureChannel
-from servobench.plant.signals import (
-    Command,
-    FloatArray,
-    Observation,
-    PlantSpec,
-    Truth,
-    as_vector,
-    trusted_observation,
-)
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth, trusted_observation
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,8 +42,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.fmu.description import FmuDescription, total_size
-from servobench.plant.signals import FloatArray, PlantSpec, check_number
+from servobench.plant.signals import PlantSpec
 
 Names: TypeAlias = tuple[str, ...]
 

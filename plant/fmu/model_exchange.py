@@ -16,10 +16,10 @@ import casadi
 import numpy as np
 import numpy.typing as npt
 
+from servobench.plant.checks import FloatArray
 from servobench.plant.fmu.archive import FmuFolder
 from servobench.plant.fmu.description import FmuDescription, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping
-from servobench.plant.signals import FloatArray
 
 
 class FmuModel:

@@ -15,12 +15,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
-from servobench.plant.signals import FloatArray, RunFault
 
 logger = logging.getLogger("servobench.fmu")
 
@@ -30,12 +31,6 @@ STATUS_WORDS = ("ok", "warning", "discard", "error", "fatal", "pending")
 OK, WARNING, DISCARD = 0, 1, 2
 REMEMBERED = 5  # messages
 STATUS_LEVELS = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR, logging.ERROR, logging.DEBUG)
-
-
-class FmuError(RunFault):
-    """An FMU reported a failure, or answered with something that is not a number."""
-
-    status: ClassVar[str] = "fmu_error"
 
 
 class Port:

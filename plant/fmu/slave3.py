@@ -7,12 +7,8 @@ import os
 from collections.abc import Callable
 from functools import partial
 
-from servobench.plant.fmu.slave import (
-    FmuError,
-    Port,
-    RawCall,
-    Slave,
-)
+from servobench.plant.faults import FmuError
+from servobench.plant.fmu.slave import Port, RawCall, Slave
 
 LEAST_PROGRESS = 1e-9  # of a step
 LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from servobench.plant.signals import FloatArray, as_vector
+from servobench.plant.checks import FloatArray, as_vector
 
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 

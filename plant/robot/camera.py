@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 PIXEL_CENTRE = (0.0, 1.0)  # px, where TinyRenderer samples a pixel, from its upper left corner
 NOISE_MODELS = ("none", "stereo", "structured_light")

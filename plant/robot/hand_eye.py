@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.signals import FloatArray, PlantSpec, check_number
+from servobench.plant.signals import PlantSpec
 
 FEATURE_NAMES = ("x", "y", "z")
 

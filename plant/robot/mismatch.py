@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, ur5_arm_from_calibration
 from servobench.plant.seeds import named_generator
-from servobench.plant.signals import FloatArray, check_number
 
 MAX_TILT = math.radians(45.0)
 MAX_MOVE_TILT = math.radians(30.0)

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm, arm_from_calibration, arm_from_dh
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.signals import FloatArray
 
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 

@@ -148,9 +148,9 @@ def test_the_checked_subset_has_both_tasks_with_both_delays():
         (MOVE, {"settling_time_s": 2.5}, 0.25),
         (MOVE, {"settling_time_s": np.nan}, 1.0),
         (MOVE, {"settling_time_s": 2.5, "status": "feature_lost"}, 2.0),
-        (CURVE, {"rms_error_evaluated_m": 0.01}, 0.2),
-        (CURVE, {"rms_error_evaluated_m": 0.3}, 1.0),
-        (CURVE, {"rms_error_evaluated_m": np.nan, "status": "solver_failed"}, 2.0),
+        (CURVE, {"rms_error_evaluated": 0.01}, 0.2),
+        (CURVE, {"rms_error_evaluated": 0.3}, 1.0),
+        (CURVE, {"rms_error_evaluated": np.nan, "status": "solver_failed"}, 2.0),
     ],
 )
 def test_the_cost_of_a_run_computed_by_hand(task, row, cost):

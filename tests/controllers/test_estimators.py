@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from servobench.controllers.controller import FilterDiverged, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.kalman import (
@@ -20,6 +20,7 @@ from servobench.controllers.estimators.ukf import (
     sigma_weights,
     unscented_update,
 )
+from servobench.plant.faults import FilterDiverged
 from servobench.plant.signals import PlantSpec
 
 SIZES = [(2, 1), (6, 3), (8, 4)]

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from servobench.controllers.composed import compose
-from servobench.controllers.controller import ControllerDiverged, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.plant.faults import ControllerDiverged
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import nominal_ur5

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servobench.controllers import ukf_mpc
-from servobench.controllers.controller import RobotKnowledge, SolverFailed
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.mpc.closed_form import (
     constant_step,
     free_moves,
@@ -18,6 +18,7 @@ from servobench.controllers.laws.mpc.closed_form import (
 from servobench.controllers.laws.mpc.limits import LimitedProgram
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
+from servobench.plant.faults import SolverFailed
 from servobench.plant.signals import Observation, PlantSpec
 
 PERIOD = 0.05

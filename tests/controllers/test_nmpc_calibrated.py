@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servobench.controllers.controller import RobotKnowledge, SolverFailed
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.nmpc_calibrated import ENTRY, NmpcCalibrated, NmpcCalibratedConfig
+from servobench.plant.faults import SolverFailed
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec

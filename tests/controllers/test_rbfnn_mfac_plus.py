@@ -64,7 +64,7 @@ def test_it_is_sooner_there_with_less_overshoot_and_tracks_better_than_the_metho
         plus, paper = (row(name, "random", "moderate", seed) for name in (PLUS, PAPER))
         assert plus["settling_time_s"] < paper["settling_time_s"]
         assert plus["overshoot"] < 0.5 * paper["overshoot"] + 0.005
-    assert row(PLUS, "circle", "moderate", 1)["rms_error_evaluated_m"] < 0.004
+    assert row(PLUS, "circle", "moderate", 1)["rms_error_evaluated"] < 0.004
 
 
 def test_the_settings_reach_the_parts():

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from servobench.controllers.controller import ControllerDiverged, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.servo import ServoController
+from servobench.plant.faults import ControllerDiverged
 from servobench.plant.signals import Observation, PlantSpec
 
 SPEC = PlantSpec(("a", "b", "c"), ("x", "y"), np.ones(3), -np.ones(3), np.ones(3), 0.05)

@@ -17,7 +17,8 @@ from servobench.plant.bullet.bullet_plant import (
 )
 from servobench.plant.bullet.detection import find_patch, locate_ball
 from servobench.plant.bullet.scene import Scene, view_of
-from servobench.plant.plant import FeatureLost, PlantDiverged, PlantSetup
+from servobench.plant.faults import FeatureLost, PlantDiverged
+from servobench.plant.plant import PlantSetup
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera

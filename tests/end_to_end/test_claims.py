@@ -51,7 +51,7 @@ def table(seed: int, **changes) -> pd.DataFrame:
             for robot in SEEDS:
                 row = {
                     "settling_time_s": 2.0, "overshoot": 0.1, "path_length_ratio": 1.1, "jacobian_error_mean": 0.1,
-                    "rms_error_evaluated_m": 0.02, "controller_time_median_us": 100.0,
+                    "rms_error_evaluated": 0.02, "controller_time_median_us": 100.0,
                 }  # fmt: skip
                 row = {name: value * (1.0 + 1e-3 * generator.standard_normal()) for name, value in row.items()}
                 for name, change in changes.items():
@@ -100,7 +100,7 @@ def verdicts(made: dict[str, pd.DataFrame]) -> dict[str, str]:
                {PROPOSED: 1.0, "rbf_pid": 1.0}.get(controller, 0.0) * (task in ("exp1", "exp4"))},
          f"{DEPENDS}: holds in 2 of 3"),
         ("5", {}, NOT_REPRODUCED),
-        ("5", {"rms_error_evaluated_m": proposed(-0.015)}, REPRODUCED),
+        ("5", {"rms_error_evaluated": proposed(-0.015)}, REPRODUCED),
         ("6", {"controller_time_median_us": proposed(-60.0)}, REPRODUCED),
         ("6", {"controller_time_median_us": proposed(50.0)}, NOT_REPRODUCED),
         ("6", {"controller_time_median_us": proposed(-20.0)}, NOT_REPRODUCED),

@@ -67,14 +67,14 @@ def test_the_tables_have_the_promised_columns(monkeypatch, tmp_path):
     )  # fmt: skip
     runs = {
         "run_id", "plant", "controller", "task", "seed", "mismatch", "status", "settling_time_s",
-        "settling_time_5pct_s", "overshoot", "steady_state_error_m", "rms_error_m", "max_error_m",
+        "settling_time_5pct_s", "overshoot", "steady_state_error", "rms_error", "max_error",
         "path_length_ratio", "control_effort_rad",
         "saturation_fraction", "jacobian_error_mean", "jacobian_condition_max", "controller_time_median_us",
         "controller_time_p99_us", "plant_time_median_us",
     }  # fmt: skip
     steps = {
         "run_id", "step", "time_s", "reference_x_m", "feature_y_m", "true_feature_z_m", "joint_position_elbow_rad",
-        "joint_velocity_command_wrist_3_rad_s", "error_norm_m", "jacobian_error", "feature_valid", "controller_time_us",
+        "joint_velocity_command_wrist_3_rad_s", "error_norm", "jacobian_error", "feature_valid", "controller_time_us",
         "plant_time_us", "estimated_jacobian_x_elbow", "true_jacobian_z_wrist_1",
     }  # fmt: skip
     assert runs <= set(pd.read_parquet(out / "runs.parquet").columns)

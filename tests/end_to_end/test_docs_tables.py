@@ -17,10 +17,10 @@ from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import RunRequest
+from servobench.plant.faults import RunFault
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.mapping import _KEYS
 from servobench.plant.robot.mismatch import AXES, PROFILES, parse_mismatch
-from servobench.plant.signals import RunFault
 
 PACKAGE = "servobench"
 SETTINGS = {

@@ -17,12 +17,12 @@ import pytest
 
 from kit.foreign_fmu import build_crane, describe
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
+from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import PREFIX, FmuFolder, sweep_stale_folders
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.entry import mapped_entry
 from servobench.plant.fmu.fmu_plant import FmuPlant
 from servobench.plant.fmu.mapping import FmuMapping
-from servobench.plant.fmu.slave import FmuError
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command

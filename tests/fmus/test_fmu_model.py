@@ -18,10 +18,11 @@ from servobench.fmus.export import default_actuation
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
+from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import FmuFolder
 from servobench.plant.fmu.description import read_description
 from servobench.plant.fmu.fmu_plant import open_slave
-from servobench.plant.fmu.slave import FmuError, Port
+from servobench.plant.fmu.slave import Port
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch

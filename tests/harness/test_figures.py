@@ -109,7 +109,7 @@ def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
 def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
     short = made_up_steps("a", periods=1)
     gaps = made_up_steps("b")
-    gaps[["jacobian_error", "error_norm_m"]] = np.nan
+    gaps[["jacobian_error", "error_norm"]] = np.nan
     gaps.loc[5:9, ["true_feature_x_m", "feature_x_m"]] = np.nan
     rows = [made_up_row("a", controller="ukf_mfac"), made_up_row("b", controller="rbf_pid")]
     folder = write_folder(tmp_path / "out", rows, [short, gaps])

@@ -24,7 +24,7 @@ def runs() -> pd.DataFrame:
                     "mismatch": "moderate", "seed": seed, "noise_factor": 1.0, "latency_periods": None,
                     "status": "feature_lost" if lost else "completed",
                     "settling_time_s": np.nan if name == "slow" and seed < 4 else time,
-                    "overshoot": 0.1, "rms_error_evaluated_m": 0.002, "steady_state_error_m": 0.001 * (1 + seed),
+                    "overshoot": 0.1, "rms_error_evaluated": 0.002, "steady_state_error": 0.001 * (1 + seed),
                 }
             )  # fmt: skip
     return pd.DataFrame(rows)
@@ -52,7 +52,7 @@ def test_pairs_are_compared_on_common_seeds(runs):
 
 def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     better = runs["controller"] == "quick"
-    curve = runs.assign(overshoot=np.nan, rms_error_evaluated_m=np.where(better, 0.002, 0.0035), status="completed")
+    curve = runs.assign(overshoot=np.nan, rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
     (row,) = compare_controllers(curve).to_dict("records")
     assert row["difference in rms error evaluated, mm"] == "-1.50 [-1.50, -1.50]"
 

@@ -60,7 +60,7 @@ def make_steps() -> pd.DataFrame:
             "reference_x_m": 1.0,
             "true_feature_x_m": x,
             "joint_velocity_command_a_rad_s": [2.0, -2.0, 1.0, 0.0],
-            "error_norm_m": np.abs(1.0 - x),
+            "error_norm": np.abs(1.0 - x),
             "feature_valid": [True, True, True, False],
             "jacobian_error": [0.2, 0.4, np.nan, np.nan],
             "jacobian_condition": [1.0, 3.0, 2.0, 1.0],
@@ -74,10 +74,10 @@ def test_a_run_is_judged_by_hand_computed_figures():
     spec = PlantSpec(("a",), ("x",), np.array([2.0]), np.array([-9.0]), np.array([9.0]), period=1.0)
     got = judge_run(make_steps(), Judgement(spec, point_to_point=True, evaluate_from=1.0))
     assert got["settling_time_s"] == 2.0
-    assert got["rms_error_m"] == pytest.approx(np.sqrt(1.25 / 4))
-    assert got["rms_error_evaluated_m"] == pytest.approx(np.sqrt(0.25 / 3))
-    assert got["max_error_m"] == 1.0
-    assert got["steady_state_error_m"] == 0.0
+    assert got["rms_error"] == pytest.approx(np.sqrt(1.25 / 4))
+    assert got["rms_error_evaluated"] == pytest.approx(np.sqrt(0.25 / 3))
+    assert got["max_error"] == 1.0
+    assert got["steady_state_error"] == 0.0
     assert got["path_length_ratio"] == 1.0
     assert got["control_effort_rad"] == 5.0
     assert got["saturation_fraction"] == 0.5

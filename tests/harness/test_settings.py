@@ -11,7 +11,7 @@ from servobench.harness.config.settings import (
     flatten,
     read_settings,
 )
-from servobench.plant.signals import check_number
+from servobench.plant.checks import check_number
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def made_up_steps(
     for name in ("lift", "turn"):
         table[f"joint_position_{name}_rad"] = 0.01 * k
         table[f"joint_velocity_command_{name}_rad_s"] = 0.2
-    table["error_norm_m"] = 0.5 * np.exp(-k / 10.0)
+    table["error_norm"] = 0.5 * np.exp(-k / 10.0)
     table["jacobian_error"] = 0.3
     table["feature_valid"] = True
     table["controller_time_us"] = 100.0 + k
@@ -39,7 +39,7 @@ def made_up_row(run_id: str, **values: object) -> dict[str, object]:
     row: dict[str, object] = {
         "run_id": run_id, "plant": "kinematic", "controller": "ukf_mfac", "task": "exp1", "seed": 0,
         "mismatch": "moderate", "status": "completed", "settling_time_s": 1.5, "overshoot": 0.02,
-        "steady_state_error_m": 0.001, "rms_error_evaluated_m": 0.002, "max_error_m": 0.5, "control_effort_rad": 3.0,
+        "steady_state_error": 0.001, "rms_error_evaluated": 0.002, "max_error": 0.5, "control_effort_rad": 3.0,
         "saturation_fraction": 0.1, "jacobian_error_mean": 0.3, "controller_time_median_us": 130.0,
         "controller_time_p99_us": 159.0, "periods": 60, "reason": "", "mismatch_values": "{}",
     }  # fmt: skip

@@ -3,13 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from servobench.plant.checks import check_number
 from servobench.plant.plant import whole_steps
-from servobench.plant.signals import (
-    Command,
-    Observation,
-    PlantSpec,
-    check_number,
-)
+from servobench.plant.signals import Command, Observation, PlantSpec
 
 
 def test_messages_keep_read_only_copies():

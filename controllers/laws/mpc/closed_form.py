@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.plant.signals import FloatArray, check_number
+from servobench.plant.checks import FloatArray, check_number
 
 _SERIES_BELOW = 0.5  # under it the series of 18 terms is exact to rounding, above it the closed form is
 _SERIES_TERMS = 18

@@ -13,7 +13,8 @@ from servobench.controllers.laws.mpc.qp import (
     QpShape,
     QpSolution,
 )
-from servobench.plant.signals import FloatArray, PlantSpec
+from servobench.plant.checks import FloatArray
+from servobench.plant.signals import PlantSpec
 
 
 def joint_bounds(

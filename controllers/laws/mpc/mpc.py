@@ -9,7 +9,7 @@ from typing import Final, Literal, final, get_args
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge, SolverFailed
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.laws.law import Law, scale_to_limit
 from servobench.controllers.laws.mpc.closed_form import (
     constant_step,
@@ -26,12 +26,9 @@ from servobench.controllers.laws.mpc.qp import (
     QpShape,
     QpSolution,
 )
-from servobench.plant.signals import (
-    FloatArray,
-    Observation,
-    as_vector,
-    check_number,
-)
+from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.faults import SolverFailed
+from servobench.plant.signals import Observation
 
 Mode = Literal["moves", "constant"]
 Solver = Literal["daqp", "qpoases"]

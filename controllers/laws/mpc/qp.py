@@ -22,7 +22,7 @@ from typing import Any, Final
 import casadi
 import numpy as np
 
-from servobench.plant.signals import FloatArray
+from servobench.plant.checks import FloatArray
 
 # Tolerances are those of the constraints in rad: far below an encoder step, far above rounding.
 _SOLVER_OPTIONS: Final[dict[str, dict[str, Any]]] = {

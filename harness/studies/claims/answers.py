@@ -154,7 +154,7 @@ def _circle(tables: Tables, plant: str) -> Answer:
         for name in (PROPOSED, *OTHERS)
     ]
     own = runs[runs["controller"] == PROPOSED]
-    good = int(((own["rms_error_evaluated_m"] <= GOOD_CIRCLE) & (own["status"] == COMPLETED)).sum())
+    good = int(((own["rms_error_evaluated"] <= GOOD_CIRCLE) & (own["status"] == COMPLETED)).sum())
     rate = success_rate(good, len(own))
     share = Measurement("within 10 mm RMS, share", CIRCLE, PROPOSED, rate, rate.low > MOST)
     evidence = f"within 10 mm in {good} of {len(own)}; medians " + ", ".join(

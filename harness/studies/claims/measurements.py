@@ -123,7 +123,7 @@ def medians(runs: pd.DataFrame, panel: str) -> list[Measurement]:
 def circle_error(runs: pd.DataFrame, controller: str) -> Estimate:
     """Return the median RMS error of the second lap, mm; infinite if half of the runs do not complete."""
     own = runs[(runs["task"] == CIRCLE) & (runs["controller"] == controller)]
-    return median_with_interval(1000.0 * own["rms_error_evaluated_m"].where(own["status"] == COMPLETED))
+    return median_with_interval(1000.0 * own["rms_error_evaluated"].where(own["status"] == COMPLETED))
 
 
 def listed(medians: Sequence[Measurement]) -> str:

@@ -125,7 +125,7 @@ def run_cost(task: str, row: Mapping[str, Any]) -> float:
     if row["status"] != COMPLETED:
         return 1.0 + FAULT
     if task == CURVE:
-        return min(float(row["rms_error_evaluated_m"]) / WORST_RMS, 1.0)
+        return min(float(row["rms_error_evaluated"]) / WORST_RMS, 1.0)
     settling_time = float(row["settling_time_s"])
     return 1.0 if math.isnan(settling_time) else settling_time / float(find_task(MOVE).default.duration)
 
