@@ -136,7 +136,8 @@ def _carry_out(
     if in_worker:
         leave_interrupts_to_parent()
     result = run_experiment(request, settings, picture=picture, keep=folder)
-    results.write_part(folder, index, result.row, result.steps)
+    if result.steps is not None:
+        results.write_part(folder, index, result.row, result.steps)
     if result.picture is not None:
         (folder / PICTURES).mkdir(exist_ok=True)
         large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)

@@ -94,4 +94,6 @@ def _new_run(request: dict[str, Any], settings: Settings) -> LoggedRun:
         raise ConfigurationError(f"seed must not be negative, got {asked.seed}")
     settings.check_sections([*known_sections(), asked.plant, asked.controller])
     result = run_experiment(asked, settings)
+    if result.steps is None:
+        raise ConfigurationError(f"run {result.row['run_id']} has no steps to show")
     return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", BulletConfig())))

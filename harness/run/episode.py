@@ -24,27 +24,28 @@ COMPLETED = "completed"
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of it.
+    """What a run gives back.
 
     Attributes:
-        row: one row for the table of runs.
-        steps: one row a period.
-        picture: what the camera saw last, or None.
+        row: the run's row in the table of runs.
+        steps: one row a period; None where it was not asked for.
+        picture: what the camera saw last; None without a camera or where it was not asked for.
     """
 
     row: dict[str, Any]
-    steps: pd.DataFrame
+    steps: pd.DataFrame | None
     picture: ImageArray | None = field(default=None, repr=False)
 
 
 def run_experiment(
-    request: RunRequest, settings: Settings, *, picture: bool = False, keep: Path | None = None
+    request: RunRequest, settings: Settings, *, steps: bool = True, picture: bool = False, keep: Path | None = None
 ) -> RunResult:
-    """Carry one run out; a fault on the way is told in the row's `status` and `reason`.
+    """Carry one run out; the row's `status` and `reason` name a fault on the way.
 
     Args:
         request: what to run.
         settings: overrides of the defaults.
+        steps: also return one row a period.
         picture: also return what the camera saw last, where there is one.
         keep: results folder in which trained networks are kept beside the runs.
 
@@ -67,17 +68,17 @@ def run_experiment(
     finally:
         image = plant.picture() if picture and len(log) else None
         plant.close()
-    steps = log.table(request.run_id)
+    table = log.table(request.run_id)
     judgement = Judgement(spec, scenario.point_to_point, scenario.evaluate_from)
     row: dict[str, Any] = {
         **request.as_row(),
         "status": status,
-        **(judge_run(steps, judgement) if len(steps) else {}),
-        "periods": len(steps),
+        **(judge_run(table, judgement) if len(table) else {}),
+        "periods": len(table),
         "reason": reason,
         "mismatch_values": json.dumps(experiment.sample.as_record() if experiment.sample else {}),
     }
-    return RunResult(row, steps, image)
+    return RunResult(row, table if steps else None, image)
 
 
 def crashed_row(request: RunRequest, reason: str) -> dict[str, Any]:
