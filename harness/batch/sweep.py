@@ -28,7 +28,7 @@ from servobench.harness.batch.workers import leave_interrupts_to_parent
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import crashed_row, run_experiment
 from servobench.harness.run.experiment import RunRequest
-from servobench.plant.robot.mismatch import magnitude_texts
+from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
 
 CHUNK = 8  # runs; small enough to lose little, large enough that files and messages cost nothing
 
@@ -84,9 +84,7 @@ class SweepPlan:
 
 def vary(mismatch: str, axis: str, magnitude: str) -> str:
     """Return `mismatch` with one axis put on top of it; unchanged where `axis` is ""."""
-    if not axis:
-        return mismatch
-    return f"{axis}={magnitude}" if mismatch == "none" else f"{mismatch}+{axis}={magnitude}"
+    return str(Mismatch.parse(mismatch).with_axis(axis, Magnitude.parse(axis, magnitude))) if axis else mismatch
 
 
 def parse_variation(text: str) -> tuple[str, tuple[str, ...]]:
@@ -99,7 +97,7 @@ def parse_variation(text: str) -> tuple[str, tuple[str, ...]]:
     """
     axis, _, values = text.strip().partition("=")
     try:
-        return axis, magnitude_texts(axis, values)
+        return axis, tuple(str(magnitude) for magnitude in parse_magnitudes(axis, values))
     except ValueError as error:
         raise ConfigurationError(f"--vary: {error}") from error
 

@@ -15,7 +15,7 @@ from servobench.fmus.information import read_information
 from servobench.fmus.validate import validate_fmu
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.faults import FmuError
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import nominal_ur5
 from servobench.plant.seeds import named_seed
 
@@ -37,7 +37,7 @@ def export(
 ) -> None:
     """Export the UR5 with a mismatch as start values."""
     try:
-        model, _ = sample_mismatch(parse_mismatch(mismatch), nominal_ur5(), named_seed(seed, "mismatch"))
+        model, _ = sample_mismatch(Mismatch.parse(mismatch), nominal_ur5(), named_seed(seed, "mismatch"))
         words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
         options = ExportOptions(fmi, model, platforms=parse_platforms(platforms), mismatch=words)
         export_fmu(output, options)

@@ -24,7 +24,7 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.seeds import named_seed
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]
         ConfigurationError: its mismatch cannot be drawn, or other values come out than the table has.
     """
     try:
-        mismatch = parse_mismatch(row["mismatch"])
+        mismatch = Mismatch.parse(row["mismatch"])
         model, sample = sample_mismatch(mismatch, ur5.nominal_ur5(), named_seed(int(row["seed"]), "mismatch"))
     except ValueError as error:
         raise ConfigurationError(f"run {row['run_id']}: {error}") from error

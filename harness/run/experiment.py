@@ -41,7 +41,7 @@ from servobench.plant.plant import (
     TrueModel,
 )
 from servobench.plant.robot.hand_eye import FEATURE_NAMES, HandEyeModel, hand_eye_spec
-from servobench.plant.robot.mismatch import MismatchSample, parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_seed
@@ -152,7 +152,7 @@ def build_experiment(
         return _build_with_own_robot(request, settings, run, entry, keep, progress)
     nominal = nominal_ur5()
     try:
-        mismatch = parse_mismatch(request.mismatch)
+        mismatch = Mismatch.parse(request.mismatch)
         true, sample = sample_mismatch(mismatch, nominal, named_seed(request.seed, "mismatch"))
     except ValueError as error:
         raise ConfigurationError(str(error)) from error

@@ -29,7 +29,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.places import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.experiment import RunRequest
-from servobench.plant.robot.mismatch import magnitude_texts
+from servobench.plant.robot.mismatch import parse_magnitudes
 
 BASE: Final = "moderate"
 TASK: Final = "random"
@@ -63,14 +63,18 @@ class Line:
         return replace(request, mismatch=vary(request.mismatch, self.axis, place))
 
 
+def _texts(axis: str, text: str) -> tuple[str, ...]:
+    return tuple(str(magnitude) for magnitude in parse_magnitudes(axis, text))
+
+
 LINES: Final = (
-    Line("camera_rotation", "camera turned, °", magnitude_texts("camera_rotation", "0:180:30deg")),
-    Line("links", "link lengths wrong by up to, %", magnitude_texts("links", "0:30:10%")),
-    Line("joint_offsets", "joint zeros wrong by up to, °", magnitude_texts("joint_offsets", "0:20:5deg")),
-    Line("tool", "tool wrong by up to, mm", magnitude_texts("tool", "0:100:25mm")),
+    Line("camera_rotation", "camera turned, °", _texts("camera_rotation", "0:180:30deg")),
+    Line("links", "link lengths wrong by up to, %", _texts("links", "0:30:10%")),
+    Line("joint_offsets", "joint zeros wrong by up to, °", _texts("joint_offsets", "0:20:5deg")),
+    Line("tool", "tool wrong by up to, mm", _texts("tool", "0:100:25mm")),
     Line("latency", "camera latency, periods of 50 ms", tuple("012345")),
     Line("noise", "sensor noise, times the usual", ("0", "1", "2", "4", "8")),
-    Line(MOVE, "camera moved in mid-run, °", magnitude_texts(MOVE, "0:180:45deg")),
+    Line(MOVE, "camera moved in mid-run, °", _texts(MOVE, "0:180:45deg")),
 )
 
 

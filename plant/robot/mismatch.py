@@ -10,8 +10,8 @@ minus the magnitude. The camera turns about an axis drawn at random; by an angle
 magnitude in a profile, and by exactly the magnitude as a single axis. It turns about the middle of the workspace,
 which therefore stays where it was in the image, and the axis is drawn among those that tilt the optical axis by at
 most 45°: a camera tilted further would look from below the table. `camera_move` turns the camera in the same way, by
-exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a stream of
-its own, so that the same seed gives the same directions at all magnitudes.
+exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a random
+stream of its own, so the same seed gives the same directions at all magnitudes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import math
 import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,50 +45,168 @@ AXES = {
     "gear_ratio": (SHARE, "5%"),
     "camera_move": (ANGLE, "90deg"),
 }
+PROFILES: dict[str, dict[str, float]] = {
+    "none": {},
+    "factory": {},
+    "moderate": {
+        "links": 0.05,
+        "joint_offsets": math.radians(3.0),
+        "camera_rotation": math.radians(15.0),
+        "tool": 0.020,
+    },
+    "severe": {
+        "links": 0.10,
+        "joint_offsets": math.radians(6.0),
+        "camera_rotation": math.radians(45.0),
+        "tool": 0.040,
+    },
+}
+
+
+@dataclass(frozen=True)
+class Magnitude:
+    """How far one axis goes, such as 60deg; `str` gives it back with its unit."""
+
+    number: float
+    """In the unit, 0 or above."""
+    unit: str
+    """A unit of the axis; empty for a plain share."""
+
+    @classmethod
+    def parse(cls, axis: str, text: str) -> Self:
+        """Return the magnitude that `text` describes.
+
+        Args:
+            axis: name of the axis, a key of `AXES`.
+            text: number and unit, such as "60deg".
+
+        Raises:
+            ValueError: not a number with a unit of the axis.
+        """
+        match = re.fullmatch(r"([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*([a-z%]*)", text.strip())
+        if match is None:
+            raise _not_a_magnitude(axis, text)
+        magnitude = cls(float(match[1]), match[2])
+        magnitude.size(axis)
+        return magnitude
+
+    def size(self, axis: str) -> float:
+        """Return the magnitude in SI units [rad, m or 1].
+
+        Raises:
+            ValueError: the unit is none of the axis.
+        """
+        if self.unit not in AXES[axis][0]:
+            raise _not_a_magnitude(axis, str(self))
+        return self.number * AXES[axis][0][self.unit]
+
+    def __str__(self) -> str:
+        """Return the text that `parse` reads."""
+        return f"{self.number!r}".removesuffix(".0") + self.unit
+
+
+def _not_a_magnitude(axis: str, text: str) -> ValueError:
+    units, example = AXES[axis]
+    names = ", ".join(repr(unit) if unit else "none" for unit in units)
+    return ValueError(
+        f"mismatch axis {axis} needs a magnitude with one of the units {names}, such as {axis}={example}; got {text!r}"
+    )
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """How far the true robot may be from the nominal one.
+    """How far the true robot may be from the nominal one; `str` gives back the text that `parse` reads."""
 
-    Attributes:
-        links: largest relative error of each link length and offset.
-        joint_offsets: largest error of each joint's zero, rad.
-        camera_rotation: largest (or exact) rotation of the camera, rad.
-        tool: largest error of each component of the ball's place on the flange, m.
-        gear_ratio: largest relative error of each joint's motion.
-        camera_move: rotation of the camera in the middle of the run, rad.
-        camera_exact: the camera turns by exactly `camera_rotation`.
-        factory: the arm is that of a calibration file.
-        calibration: the calibration file; None for the one that the package brings.
-    """
-
-    links: float = 0.0
-    joint_offsets: float = 0.0
-    camera_rotation: float = 0.0
-    tool: float = 0.0
-    gear_ratio: float = 0.0
-    camera_move: float = 0.0
-    camera_exact: bool = False
-    factory: bool = False
-    calibration: Path | None = None
+    profile: str = "none"
+    """A key of `PROFILES`; empty where only axes are given."""
+    axes: tuple[tuple[str, Magnitude], ...] = ()
+    """Axes with their magnitudes, on top of the profile; the last entry of an axis counts."""
+    calibration: str | None = None
+    """Calibration file of the profile `factory`; None for the one that the package brings."""
 
     def __post_init__(self) -> None:
         """Check the magnitudes."""
-        check_number("links", self.links, at_least=0.0, below=1.0)
-        check_number("joint_offsets", self.joint_offsets, at_least=0.0, at_most=math.pi)
-        check_number("camera_rotation", self.camera_rotation, at_least=0.0, at_most=math.pi)
-        check_number("camera_move", self.camera_move, at_least=0.0, at_most=math.pi)
-        check_number("tool", self.tool, at_least=0.0, at_most=1.0)
-        check_number("gear_ratio", self.gear_ratio, at_least=0.0, below=1.0)
+        for axis, magnitude in self.axes:
+            size = magnitude.size(axis)
+            if AXES[axis][0] is SHARE:
+                check_number(axis, size, at_least=0.0, below=1.0)
+            else:
+                check_number(axis, size, at_least=0.0, at_most=1.0 if AXES[axis][0] is LENGTH else math.pi)
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the mismatch that `text` describes.
+
+        Args:
+            text: profiles and axes joined by `+`, see the module's docstring.
+
+        Raises:
+            ValueError: an unknown word, a missing or malformed magnitude, or one out of its bounds.
+        """
+        profile, calibration, axes = "", None, []
+        for position, word in enumerate(part.strip() for part in text.split("+")):
+            name, equals, value = word.partition("=")
+            if name in PROFILES and position == 0 and (name == "factory" or not equals):
+                profile, calibration = name, value if equals else None
+            elif name in AXES:
+                axes.append((name, Magnitude.parse(name, value)))
+            else:
+                examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
+                raise ValueError(
+                    f"mismatch {text!r}: {word!r} is not known here; wanted one profile ({', '.join(PROFILES)}, "
+                    f"factory=FILE) and then axes such as {examples}, joined by '+'"
+                )
+        return cls(profile, tuple(axes), calibration)
+
+    def __str__(self) -> str:
+        """Return the text that `parse` reads, as it stands in the column `mismatch`."""
+        profile = self.profile if self.calibration is None else f"{self.profile}={self.calibration}"
+        return "+".join([profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes])
+
+    def with_axis(self, axis: str, magnitude: Magnitude) -> Mismatch:
+        """Return this mismatch with one axis put on top of it."""
+        profile = "" if self == Mismatch() else self.profile
+        return replace(self, profile=profile, axes=(*self.axes, (axis, magnitude)))
+
+    def size(self, axis: str) -> float:
+        """Return the magnitude of an axis in SI units [rad, m or 1]; 0 where it is not given."""
+        size = PROFILES.get(self.profile, {}).get(axis, 0.0)
+        for name, magnitude in self.axes:
+            if name == axis:
+                size = magnitude.size(axis)
+        return size
+
+    @property
+    def camera_exact(self) -> bool:
+        """Whether the camera turns by exactly `camera_rotation`, not by an angle drawn below it."""
+        return any(axis == "camera_rotation" for axis, _ in self.axes)
 
 
-PROFILES = {
-    "none": Mismatch(),
-    "factory": Mismatch(factory=True),
-    "moderate": Mismatch(0.05, math.radians(3.0), math.radians(15.0), 0.020),
-    "severe": Mismatch(0.10, math.radians(6.0), math.radians(45.0), 0.040),
-}
+def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
+    """Return the magnitudes in `begin:end:step` (both ends included) or `one/another`, with the unit at the end.
+
+    Args:
+        axis: name of the axis, such as "camera_rotation".
+        text: such as "0:180:30deg" or "5/10/20mm".
+
+    Raises:
+        ValueError: an unknown axis, a malformed or an empty range.
+    """
+    if axis not in AXES:
+        raise ValueError(f"unknown mismatch axis {axis!r}; valid: {', '.join(AXES)}")
+    example = {"%": "30:10%", "deg": "180:30deg", "mm": "60:20mm"}[re.sub("[0-9.]", "", AXES[axis][1])]
+    number = r"[0-9]*\.?[0-9]+"
+    match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
+    if match is None:
+        raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}=0:{example}; got {text!r}")
+    numbers = [float(part) for part in re.split("[:/]", match[1])]
+    if ":" in match[1]:
+        begin, end, step = numbers
+        count = math.floor((end - begin) / step + 1e-9) + 1 if step > 0.0 else 0
+        numbers = [round(begin + i * step, 9) for i in range(count)]
+    if not numbers:
+        raise ValueError(f"the range {text!r} of {axis} is empty")
+    return tuple(Magnitude.parse(axis, f"{number!r}{match[2]}") for number in numbers)
 
 
 @dataclass(frozen=True)
@@ -127,66 +245,6 @@ class MismatchSample:
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
-def parse_mismatch(text: str) -> Mismatch:
-    """Return the mismatch that `text` describes.
-
-    Args:
-        text: profiles and axes joined by `+`, see the module's docstring.
-
-    Raises:
-        ValueError: an unknown word, a missing or malformed magnitude, or one out of its bounds.
-    """
-    mismatch = Mismatch()
-    for position, word in enumerate(part.strip() for part in text.split("+")):
-        name, equals, value = word.partition("=")
-        if name in PROFILES and position == 0 and (name == "factory" or not equals):
-            mismatch = PROFILES[name]
-            if equals:
-                mismatch = replace(mismatch, calibration=Path(value).expanduser())
-        elif name in AXES:
-            magnitude = _parse_magnitude(name, value)
-            exact = name == "camera_rotation" or mismatch.camera_exact
-            changes: dict[str, Any] = {name: magnitude, "camera_exact": exact}
-            mismatch = replace(mismatch, **changes)
-        else:
-            examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
-            raise ValueError(
-                f"mismatch {text!r}: {word!r} is not known here; wanted one profile ({', '.join(PROFILES)}, "
-                f"factory=FILE) and then axes such as {examples}, joined by '+'"
-            )
-    return mismatch
-
-
-def magnitude_texts(axis: str, text: str) -> tuple[str, ...]:
-    """Return the magnitudes in `begin:end:step` (both ends included) or `one/another`, each with the unit at the end.
-
-    Args:
-        axis: name of the axis, such as "camera_rotation".
-        text: such as "0:180:30deg" or "5/10/20mm".
-
-    Raises:
-        ValueError: an unknown axis, a malformed or an empty range.
-    """
-    if axis not in AXES:
-        raise ValueError(f"unknown mismatch axis {axis!r}; valid: {', '.join(AXES)}")
-    example = {"%": "30:10%", "deg": "180:30deg", "mm": "60:20mm"}[re.sub("[0-9.]", "", AXES[axis][1])]
-    number = r"[0-9]*\.?[0-9]+"
-    match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
-    if match is None:
-        raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}=0:{example}; got {text!r}")
-    numbers = [float(part) for part in re.split("[:/]", match[1])]
-    if ":" in match[1]:
-        begin, end, step = numbers
-        count = math.floor((end - begin) / step + 1e-9) + 1 if step > 0.0 else 0
-        numbers = [round(begin + i * step, 9) for i in range(count)]
-    if not numbers:
-        raise ValueError(f"the range {text!r} of {axis} is empty")
-    texts = tuple(f"{number:g}{match[2]}" for number in numbers)
-    for magnitude in texts:
-        _parse_magnitude(axis, magnitude)
-    return texts
-
-
 def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple[HandEyeModel, MismatchSample]:
     """Draw a true robot.
 
@@ -201,38 +259,28 @@ def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple
     Raises:
         ValueError: the calibration file is missing or malformed.
     """
-    n = model.arm.n
+    n, size = model.arm.n, mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
         return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, shape)
 
-    angle = mismatch.camera_rotation
+    angle, move = size("camera_rotation"), size("camera_move")
     sample = MismatchSample(
-        link_scale=1.0 + mismatch.links * draw("links", n + 1, 3),
-        joint_offset=mismatch.joint_offsets * draw("joint_offsets", n),
-        gear_ratio=1.0 + mismatch.gear_ratio * draw("gear_ratio", n),
-        tool_offset=mismatch.tool * draw("tool", 3),
+        link_scale=1.0 + size("links") * draw("links", n + 1, 3),
+        joint_offset=size("joint_offsets") * draw("joint_offsets", n),
+        gear_ratio=1.0 + size("gear_ratio") * draw("gear_ratio", n),
+        tool_offset=size("tool") * draw("tool", 3),
         camera_axis=_draw_camera_axis(angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")),
         camera_angle=angle if mismatch.camera_exact else float(angle * draw("camera_angle", 1)[0]),
-        move_axis=_draw_camera_axis(mismatch.camera_move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
-        move_angle=mismatch.camera_move,
+        move_axis=_draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
+        move_angle=move,
     )
-    arm = ur5_arm_from_calibration(mismatch.calibration) if mismatch.factory else model.arm
-    return HandEyeModel(
-        _perturb_arm(arm, sample), _turn_camera(model.X_BC, sample.camera_angle * sample.camera_axis)
-    ), sample
-
-
-def _parse_magnitude(axis: str, value: str) -> float:
-    units, example = AXES[axis]
-    match = re.fullmatch(r"([0-9]*\.?[0-9]+(?:e-?[0-9]+)?)\s*([a-z%]*)", value.strip())
-    if match is None or match[2] not in units:
-        names = ", ".join(repr(unit) if unit else "none" for unit in units)
-        raise ValueError(
-            f"mismatch axis {axis} needs a magnitude with one of the units {names}, "
-            f"such as {axis}={example}; got {value!r}"
-        )
-    return float(match[1]) * units[match[2]]
+    arm = model.arm
+    if mismatch.profile == "factory":
+        file = mismatch.calibration
+        arm = ur5_arm_from_calibration(None if file is None else Path(file).expanduser())
+    camera = _turn_camera(model.X_BC, sample.camera_angle * sample.camera_axis)
+    return HandEyeModel(_perturb_arm(arm, sample), camera), sample
 
 
 def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:

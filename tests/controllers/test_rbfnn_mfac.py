@@ -12,7 +12,7 @@ from servobench.harness.config.defaults import default_config
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.mismatch import PROFILES, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import (
     HOME,
     TRAINING_LOWER,
@@ -54,7 +54,7 @@ def true_errors(controller, plant, desired, steps, seed):
 def test_moderately_wrong_robots_settle_within_5_mm(preset, latency, knowledge):
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        robot, _ = sample_mismatch(PROFILES["moderate"], MODEL, seed)
+        robot, _ = sample_mismatch(Mismatch("moderate"), MODEL, seed)
         start, goal = rng.uniform(LOWER, UPPER), robot.feature(rng.uniform(LOWER, UPPER))
         plant = KinematicPlant(KinematicConfig(latency_periods=latency), PlantSetup(robot, start, PERIOD))
         controller = preset.ENTRY.build(default_config(preset.ENTRY), knowledge)
@@ -65,7 +65,7 @@ def test_moderately_wrong_robots_settle_within_5_mm(preset, latency, knowledge):
 
 def circle_error(config, knowledge):
     """Return the RMS error of the second lap of a circle of 0.3 m radius, 10 s a lap, m."""
-    robot, _ = sample_mismatch(PROFILES["moderate"], MODEL, 1)
+    robot, _ = sample_mismatch(Mismatch("moderate"), MODEL, 1)
     centre = MODEL.to_camera([0.5, 0.0, 0.3])
 
     def circle(k):

@@ -16,7 +16,7 @@ from servobench.harness.run.experiment import RunRequest
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.mismatch import PROFILES, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 
 PERIOD, PREVIEW = 0.05, 10
@@ -88,7 +88,7 @@ def knowledge():
 
 
 def commands(controller, steps=60):
-    robot, _ = sample_mismatch(PROFILES["moderate"], MODEL, 5)
+    robot, _ = sample_mismatch(Mismatch("moderate"), MODEL, 5)
     rng = np.random.default_rng(0)
     start, goal = (rng.uniform(TRAINING_LOWER, TRAINING_UPPER) for _ in range(2))
     plant, target = KinematicPlant(KinematicConfig(), PlantSetup(robot, start, PERIOD)), robot.feature(goal)

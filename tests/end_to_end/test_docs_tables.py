@@ -20,7 +20,7 @@ from servobench.harness.run.experiment import RunRequest
 from servobench.plant.faults import RunFault
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.mapping import _KEYS
-from servobench.plant.robot.mismatch import AXES, PROFILES, parse_mismatch
+from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
 PACKAGE = "servobench"
 SETTINGS = {
@@ -139,18 +139,17 @@ def test_the_profiles_have_the_magnitudes_of_the_code():
     assert {names(row[0])[0] for row in rows} == set(PROFILES)
     for name, *cells in rows:
         links, offset, camera, tool, gear = (float(cell.split()[0].rstrip("°")) for cell in cells)
-        profile = PROFILES[names(name)[0]]
+        profile = Mismatch(names(name)[0])
         told = (links / 100, math.radians(offset), math.radians(camera), tool / 1000, gear / 100)
-        assert told == pytest.approx(
-            (profile.links, profile.joint_offsets, profile.camera_rotation, profile.tool, profile.gear_ratio)
-        )
+        axes = ("links", "joint_offsets", "camera_rotation", "tool", "gear_ratio")
+        assert told == pytest.approx(tuple(profile.size(axis) for axis in axes))
 
 
 def test_the_axes_are_those_of_the_code_and_their_examples_are_understood():
     rows = next(rows for _, header, rows in tables(read("plants.md")) if header[0] == "axis")
     assert {names(row[0])[0] for row in rows} == set(AXES)
     for name, example, _ in rows:
-        assert getattr(parse_mismatch(names(example)[0]), names(name)[0]) > 0.0
+        assert Mismatch.parse(names(example)[0]).size(names(name)[0]) > 0.0
 
 
 def test_the_keys_of_a_mapping_are_those_of_the_code():

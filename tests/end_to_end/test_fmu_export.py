@@ -41,14 +41,14 @@ from servobench.fmus.variables import model_of, parameters_of
 from servobench.plant.fmu.archive import FmuFolder
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.arm import rotation_from_rpy, rpy_from_rotation
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, JOINT_NAMES, nominal_ur5
 
 VERSIONS = [2, 3]
 
 
 def mismatched(text: str, seed: int = 3):
-    return sample_mismatch(parse_mismatch(text), nominal_ur5(), seed)[0]
+    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[0]
 
 
 def setup(text: str = "none", period: float = 0.05) -> PlantSetup:

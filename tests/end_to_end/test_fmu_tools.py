@@ -19,7 +19,7 @@ from servobench.fmus.variables import parameters_of
 from servobench.plant.fmu.archive import FmuFolder
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
@@ -33,7 +33,7 @@ COMMANDS.setflags(write=False)
 
 @cache
 def model_of(mismatch: str):
-    return sample_mismatch(parse_mismatch(mismatch), nominal_ur5(), 3)[0]
+    return sample_mismatch(Mismatch.parse(mismatch), nominal_ur5(), 3)[0]
 
 
 @cache

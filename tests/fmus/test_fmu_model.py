@@ -25,7 +25,7 @@ from servobench.plant.fmu.fmu_plant import open_slave
 from servobench.plant.fmu.slave import Port
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
@@ -33,7 +33,7 @@ VERSIONS = [2, 3]
 
 
 def mismatched(text: str, seed: int = 3):
-    return sample_mismatch(parse_mismatch(text), nominal_ur5(), seed)[0]
+    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[0]
 
 
 def setup(text: str = "none", period: float = 0.05) -> PlantSetup:

@@ -22,7 +22,7 @@ from servobench.plant.fmu.archive import PREFIX
 from servobench.plant.fmu.entry import mapped_entry
 from servobench.plant.fmu.model_exchange import FmuModel
 from servobench.plant.plant import PlantSetup
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
@@ -54,7 +54,7 @@ def _nothing_is_left_behind(tmp_path, monkeypatch):
 
 
 def mismatched(text: str):
-    return sample_mismatch(parse_mismatch(text), nominal_ur5(), 3)[0]
+    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), 3)[0]
 
 
 def mapped(tmp_path: Path, text: str = MAPPING, description: str | None = None) -> Path:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import re
 
 import numpy as np
@@ -10,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from servobench.plant.robot.mismatch import (
     MAX_TILT,
+    Magnitude,
     Mismatch,
-    magnitude_texts,
-    parse_mismatch,
+    parse_magnitudes,
     sample_mismatch,
 )
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
@@ -21,12 +22,12 @@ POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
 
 
 def test_no_mismatch_leaves_the_model_as_it_is():
-    model, _ = sample_mismatch(parse_mismatch("none"), nominal_ur5(), 3)
+    model, _ = sample_mismatch(Mismatch.parse("none"), nominal_ur5(), 3)
     np.testing.assert_allclose(model.feature(POSES), nominal_ur5().feature(POSES), rtol=0, atol=1e-12)
 
 
 def test_the_same_seed_draws_the_same_robot_and_another_seed_another():
-    mismatch = parse_mismatch("severe")
+    mismatch = Mismatch.parse("severe")
     records = [sample_mismatch(mismatch, nominal_ur5(), seed)[1].as_record() for seed in (5, 5, 6)]
     assert records[0] == records[1]
     assert records[0] != records[2]
@@ -37,7 +38,7 @@ def test_the_same_seed_draws_the_same_robot_and_another_seed_another():
     ("text", "links", "offset", "angle", "tool"), [("moderate", 0.05, 3, 15, 0.02), ("severe", 0.1, 6, 45, 0.04)]
 )
 def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset, angle, tool):
-    samples = [sample_mismatch(parse_mismatch(text), nominal_ur5(), seed)[1] for seed in range(200)]
+    samples = [sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[1] for seed in range(200)]
     for values, bound in (
         ([sample.link_scale - 1 for sample in samples], links),
         ([sample.joint_offset for sample in samples], math.radians(offset)),
@@ -53,7 +54,7 @@ def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset,
 def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(angle):
     nominal = nominal_ur5()
     for seed in range(100):
-        true, _ = sample_mismatch(parse_mismatch(f"camera_rotation={angle}deg"), nominal, seed)
+        true, _ = sample_mismatch(Mismatch.parse(f"camera_rotation={angle}deg"), nominal, seed)
         R = nominal.X_BC[:3, :3].T @ true.X_BC[:3, :3]
         assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(math.radians(angle), abs=1e-6)
         assert math.acos(min(R[2, 2], 1.0)) <= MAX_TILT + 1e-9
@@ -61,23 +62,55 @@ def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(a
 
 
 def test_a_larger_magnitude_goes_further_in_the_same_direction():
-    small, large = (sample_mismatch(parse_mismatch(f"links={size}%"), nominal_ur5(), 4)[1] for size in (5, 10))
+    small, large = (sample_mismatch(Mismatch.parse(f"links={size}%"), nominal_ur5(), 4)[1] for size in (5, 10))
     np.testing.assert_allclose(2 * (small.link_scale - 1), large.link_scale - 1, atol=1e-12)
 
 
 def test_axes_add_to_a_profile():
-    both = parse_mismatch("moderate+gear_ratio=5%")
-    assert (both.links, both.gear_ratio) == (0.05, 0.05)
+    both = Mismatch.parse("moderate+gear_ratio=5%")
+    assert (both.size("links"), both.size("gear_ratio")) == (0.05, 0.05)
     assert not both.camera_exact
 
 
+def test_of_an_axis_given_twice_the_last_magnitude_counts():
+    twice = Mismatch.parse("moderate+camera_rotation=60deg+camera_rotation=0.5rad")
+    assert twice.size("camera_rotation") == 0.5
+    assert twice.camera_exact
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "none",
+        "severe",
+        "none+links=10%",
+        "moderate+camera_rotation=60deg",
+        "links=20%+tool=60mm+tool=1.5cm",
+        "gear_ratio=0.05",
+        "factory",
+        "factory=~/arm.yaml+camera_move=90deg",
+    ],
+)
+def test_a_mismatch_prints_the_text_it_was_read_from_and_travels(text):
+    mismatch = Mismatch.parse(text)
+    assert str(mismatch) == text
+    assert {pickle.loads(pickle.dumps(mismatch)), mismatch} == {Mismatch.parse(str(mismatch))}
+
+
+def test_an_axis_is_put_on_top_of_a_mismatch():
+    turned = Magnitude(60.0, "deg")
+    assert str(Mismatch().with_axis("camera_rotation", turned)) == "camera_rotation=60deg"
+    assert str(Mismatch.parse("moderate").with_axis("camera_rotation", turned)) == "moderate+camera_rotation=60deg"
+    assert str(Mismatch.parse("tool=5mm").with_axis("camera_rotation", turned)) == "tool=5mm+camera_rotation=60deg"
+
+
 def test_factory_takes_the_arm_of_the_calibration_file():
-    true, _ = sample_mismatch(parse_mismatch("factory"), nominal_ur5(), 0)
+    true, _ = sample_mismatch(Mismatch.parse("factory"), nominal_ur5(), 0)
     np.testing.assert_allclose(true.arm.ball_position(POSES), ur5_arm_from_calibration().ball_position(POSES))
 
 
 def test_a_gear_ratio_scales_the_motion_but_not_the_reported_position():
-    true, sample = sample_mismatch(parse_mismatch("gear_ratio=5%"), nominal_ur5(), 0)
+    true, sample = sample_mismatch(Mismatch.parse("gear_ratio=5%"), nominal_ur5(), 0)
     expected = nominal_ur5().jacobian(sample.gear_ratio * POSES) * sample.gear_ratio
     np.testing.assert_allclose(true.jacobian(POSES), expected, atol=1e-12)
 
@@ -98,17 +131,17 @@ def test_a_gear_ratio_scales_the_motion_but_not_the_reported_position():
 )
 def test_a_malformed_mismatch_is_refused(text, message):
     with pytest.raises(ValueError, match=message):
-        parse_mismatch(text)
+        Mismatch.parse(text)
 
 
 def test_a_missing_calibration_file_is_named():
     with pytest.raises(ValueError, match="nowhere.yaml cannot be read"):
-        sample_mismatch(parse_mismatch("factory=nowhere.yaml"), nominal_ur5(), 0)
+        sample_mismatch(Mismatch.parse("factory=nowhere.yaml"), nominal_ur5(), 0)
 
 
 def test_a_negative_magnitude_is_refused():
     with pytest.raises(ValueError, match="tool must be at least 0"):
-        Mismatch(tool=-0.1)
+        Mismatch().with_axis("tool", Magnitude(-0.1, "m"))
 
 
 @pytest.mark.parametrize(
@@ -122,7 +155,7 @@ def test_a_negative_magnitude_is_refused():
     ],
 )
 def test_a_range_of_magnitudes_includes_both_ends(axis, text, magnitudes):
-    assert magnitude_texts(axis, text) == magnitudes
+    assert tuple(str(each) for each in parse_magnitudes(axis, text)) == magnitudes
 
 
 @pytest.mark.parametrize(
@@ -138,12 +171,12 @@ def test_a_range_of_magnitudes_includes_both_ends(axis, text, magnitudes):
 )
 def test_a_bad_range_of_magnitudes_is_refused(axis, text, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        magnitude_texts(axis, text)
+        parse_magnitudes(axis, text)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
-    model, sample = sample_mismatch(parse_mismatch("camera_move=120deg"), nominal_ur5(), seed)
+    model, sample = sample_mismatch(Mismatch.parse("camera_move=120deg"), nominal_ur5(), seed)
     moved = sample.moved(model)
     turn = Rotation.from_matrix(model.X_BC[:3, :3].T @ moved.X_BC[:3, :3])
     assert turn.magnitude() == pytest.approx(np.radians(120.0))
@@ -153,5 +186,5 @@ def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
 
 
 def test_without_a_move_there_is_no_moved_robot():
-    model, sample = sample_mismatch(parse_mismatch("severe"), nominal_ur5(), 0)
+    model, sample = sample_mismatch(Mismatch.parse("severe"), nominal_ur5(), 0)
     assert sample.moved(model) is None

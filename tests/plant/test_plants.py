@@ -7,7 +7,7 @@ import pytest
 
 from servobench.harness.config.registry import find_plant, plant_names
 from servobench.plant.plant import PlantEntry, PlantSetup
-from servobench.plant.robot.mismatch import parse_mismatch, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
@@ -22,7 +22,7 @@ def entry(request) -> PlantEntry:
 
 @pytest.fixture
 def plant(entry):
-    model, _ = sample_mismatch(parse_mismatch("moderate+gear_ratio=5%"), nominal_ur5(), 1)
+    model, _ = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%"), nominal_ur5(), 1)
     made = entry.build(entry.config(), PlantSetup(model, np.array(HOME), PERIOD))
     yield made
     made.close()
@@ -130,7 +130,7 @@ def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):
 
 
 def test_a_moved_camera_shows_the_ball_elsewhere_until_the_reset(plant):
-    model, sample = sample_mismatch(parse_mismatch("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
+    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
     moved = sample.moved(model)
     plant.reset(0)
     before = plant.truth()
@@ -167,7 +167,7 @@ START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the po
 
 
 def test_latency_shows_a_moved_camera_late(entry):
-    model, sample = sample_mismatch(parse_mismatch("camera_move=20deg"), nominal_ur5(), 1)
+    model, sample = sample_mismatch(Mismatch.parse("camera_move=20deg"), nominal_ur5(), 1)
     plant = entry.build(entry.vary_sensing(entry.config(), 0.0, 3), PlantSetup(model, START, PERIOD))
     first = plant.reset(0).feature
     plant.move_camera(sample.moved(model).X_BC)
