@@ -1,1 +1,1 @@
-"""FMU models that servobench exports, a folder each, and the exporters."""
+"""Exports FMUs: one folder for each model, `fmi` for the FMI functions, and the modules that put an FMU together."""

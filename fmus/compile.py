@@ -1,4 +1,4 @@
-"""Compiles the C sources of an FMU: by the system's C compiler for this machine, or by zig for many at once."""
+"""Compiles the C sources of an FMU with the system's C compiler for this machine, or with zig for other platforms."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ COMPILERS = ("cc", "gcc", "clang")
 
 
 class CompilerMissing(ValueError):
-    """There is no C compiler for what was asked; the message names the ways out."""
+    """No C compiler is installed for a platform; the message names the remedies."""
 
 
 class CompilationFailed(ValueError):
-    """The compiler refused the sources; the message is the compiler's first error."""
+    """The compiler rejected the sources; the message holds the compiler's first error."""
 
 
 @dataclass(frozen=True)
 class Platform:
-    """A kind of machine.
+    """A combination of processor and operating system.
 
     Attributes:
         name: platform tuple of FMI 3.0.
-        fmi2_folder: what FMI 2.0 calls it.
-        suffix: of shared libraries.
-        zig_target: what zig calls it.
+        fmi2_folder: its name in FMI 2.0.
+        suffix: file name suffix of shared libraries.
+        zig_target: its name in zig.
         flags: compiler flags.
     """
 
@@ -54,7 +54,7 @@ _DARWIN = ("-fPIC", "-Wl,-install_name,@rpath/fmu.dylib", "-s")
 PLATFORMS = {
     platform.name: platform
     for platform in (
-        # glibc 2.17 is what the oldest supported distributions have.
+        # glibc 2.17 is that of the oldest supported distributions.
         Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17", _LINUX),
         Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17", _LINUX),
         Platform("x86_64-darwin", "darwin64", ".dylib", "x86_64-macos", _DARWIN),
@@ -79,10 +79,10 @@ def this_platform() -> Platform:
 
 
 def parse_platforms(text: str | None) -> tuple[Platform, ...]:
-    """Return the platforms that `text` names, separated by commas: None for this machine, "all" for all.
+    """Return the platforms in a comma-separated list; None stands for this machine, "all" for all.
 
     Raises:
-        ValueError: a name that is not known.
+        ValueError: unknown name.
     """
     if text is None:
         return (this_platform(),)
@@ -99,14 +99,14 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
     """Compile `sources` in `folder` into the shared library `library`.
 
     Args:
-        folder: where the sources and their headers are; the compiler runs there, so that no path gets into the library.
+        folder: of the sources and headers; the compiler runs there, so that no path enters the library.
         sources: file names.
-        target: for which platform.
+        target: platform of the library.
         library: the file to write.
 
     Raises:
         CompilerMissing: no compiler for this platform is installed.
-        CompilationFailed: the compiler did not accept the sources.
+        CompilationFailed: the compiler rejected the sources.
     """
     library.parent.mkdir(parents=True, exist_ok=True)
     output = library.resolve()
@@ -122,7 +122,7 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
 
 
 def _compiler(target: Platform) -> list[str]:
-    """Return the command that compiles for `target`; the system's compiler knows this machine only."""
+    """Return the command that compiles for `target`: the system's compiler for this machine, zig for the others."""
     if target == this_platform():
         named = os.environ.get("CC")
         for command in [named] if named else COMPILERS:

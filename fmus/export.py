@@ -50,32 +50,33 @@ from servobench.plant.checks import as_vector
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 
-IDENTIFIER = "ur5_mismatched"
+IDENTIFIER = "ur5_mismatched"  # name of the libraries and of the folder of the model
+MACHINERY = "fmi"  # folder of the FMI functions, which know no model
 HEADERS = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
-OWN_HEADERS = ("instance.h", "kinematics.h", "model.h")
-LAYERS = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_absent.c")}
-MODEL_SOURCES = ("model.c", "instance.c", "kinematics.c")
-EARLIEST_DATE = (1980, 1, 1, 0, 0, 0)  # that a zip can hold
+FMI_SOURCES = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_absent.c")}
+SHARED_SOURCES = ("model.c", "instance.c", "kinematics.c")
+COMMITTED = {MACHINERY: ("instance.h", "instance.c"), IDENTIFIER: ("kinematics.h", "model.h", "model.c")}
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 
 
 def default_actuation() -> Actuation:
-    """Return lag and limits as the kinematic plant has them by default, and a home above the workspace."""
+    """Return the default lag and limits of the kinematic plant, and a home above the workspace."""
     return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=as_vector("home", HOME, len(HOME)))
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What to export.
+    """Options of an export.
 
     Attributes:
         fmi_version: 2 (co-simulation and model exchange) or 3 (co-simulation).
         model: arm and camera whose numbers become the start values.
         actuation: lag, limits and home that become start values.
-        platforms: for which to compile.
-        mismatch: how the model differs from the nominal one, in words, for the documentation.
+        platforms: platforms to compile for.
+        mismatch: text for the documentation that says how the model differs from the nominal one.
     """
 
     fmi_version: int = 2
@@ -86,18 +87,18 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
-        if self.fmi_version not in LAYERS:
+        if self.fmi_version not in FMI_SOURCES:
             raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
 
 
 def export_fmu(path: Path, options: ExportOptions) -> Path:
-    """Write the FMU to `path`, whole or not at all.
+    """Write the FMU to `path` atomically.
 
     Args:
         path: the .fmu file; its folder must exist.
-        options: what to export.
+        options: version, model, platforms.
 
     Returns:
         The path.
@@ -105,7 +106,7 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
     Raises:
         ValueError: the folder does not exist.
         CompilerMissing: no compiler for one of the platforms.
-        CompilationFailed: a compiler refused the sources.
+        CompilationFailed: a compiler rejected the sources.
     """
     if not path.parent.is_dir():
         raise ValueError(f"the folder {path.parent} for the FMU does not exist")
@@ -122,7 +123,7 @@ def export_fmu(path: Path, options: ExportOptions) -> Path:
 
 
 def fingerprint(options: ExportOptions) -> str:
-    """Return a text that changes with whatever decides how the FMU behaves: sources, descriptions, compilation."""
+    """Return a hash of all that determines the behaviour of the FMU: sources, descriptions, compilation."""
     contents = {name: text.encode() for name, text in source_files(options).items()}
     contents |= _descriptions(options, _PLACEHOLDER)
     for platform in options.platforms:
@@ -131,24 +132,25 @@ def fingerprint(options: ExportOptions) -> str:
 
 
 def source_files(options: ExportOptions) -> dict[str, str]:
-    """Return the C files of the FMU by their place in the archive; the token in them is still a placeholder."""
+    """Return the C files of the FMU by their path in the archive, with a placeholder for the token."""
     layout, start = arm_layout(options.model.arm.n), parameters_of(options.model, options.actuation)
-    own = (*OWN_HEADERS, *LAYERS[options.fmi_version], *(name for name in MODEL_SOURCES if name != "kinematics.c"))
-    texts = {name: _own_file(name) for name in own} | {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
+    texts = {name: _committed(folder, name) for folder, names in COMMITTED.items() for name in names}
+    texts |= {name: _committed(MACHINERY, name) for name in FMI_SOURCES[options.fmi_version]}
+    texts |= {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
     texts["kinematics.c"] = _kinematics(layout)
     texts["layout.h"] = layout_header(layout, start, IDENTIFIER, _PLACEHOLDER)
     return {f"sources/{name}": text for name, text in texts.items()}
 
 
 def _companion_files(options: ExportOptions) -> dict[str, str]:
-    """Return documentation, licence and reference run by their place in the archive."""
+    """Return documentation, licence and reference run by their path in the archive."""
     layout = arm_layout(options.model.arm.n)
     run = reference_run(options.model, options.actuation)
     return {
         INPUT_FILE: input_csv(run, layout),
         OUTPUT_FILE: output_csv(run, layout),
         "documentation/index.html": _documentation(layout, options),
-        "documentation/licenses/license.txt": _own_file("license.txt"),
+        "documentation/licenses/license.txt": _committed(IDENTIFIER, "license.txt"),
     }
 
 
@@ -166,8 +168,8 @@ def _kinematics(layout: Layout) -> str:
     return kinematics_source(layout)
 
 
-def _own_file(name: str) -> str:
-    return (files("servobench.fmus") / IDENTIFIER / name).read_text(encoding="utf-8")
+def _committed(folder: str, name: str) -> str:
+    return (files("servobench.fmus") / folder / name).read_text(encoding="utf-8")
 
 
 def _fmi_header(name: str) -> str:
@@ -175,7 +177,7 @@ def _fmi_header(name: str) -> str:
 
 
 def _descriptions(options: ExportOptions, token: str) -> dict[str, bytes]:
-    """Return what is written in XML by its place in the archive."""
+    """Return the XML files by their path in the archive."""
     description = _description(options)
     if options.fmi_version == 2:
         return {"modelDescription.xml": write_fmi2(description, token)}
@@ -192,7 +194,7 @@ def _description(options: ExportOptions) -> Description:
         summary=_SUMMARY,
         layout=arm_layout(options.model.arm.n),
         start=parameters_of(options.model, options.actuation),
-        sources=(*LAYERS[options.fmi_version], *MODEL_SOURCES),
+        sources=(*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES),
         tool=f"servobench {version('servobench')}",
     )
 
@@ -203,7 +205,7 @@ _SUMMARY = (
 
 
 def _token(contents: Mapping[str, bytes]) -> str:
-    """Return a GUID that changes with anything in the FMU but its libraries."""
+    """Return a GUID that is a hash of everything in the FMU except its libraries."""
     digest = hashlib.sha256()
     for name in sorted(contents):
         digest.update(name.encode() + b"\0" + contents[name] + b"\0")
@@ -212,7 +214,7 @@ def _token(contents: Mapping[str, bytes]) -> str:
 
 
 def _documentation(layout: Layout, options: ExportOptions) -> str:
-    template = _own_file("documentation.html")
+    template = _committed(IDENTIFIER, "documentation.html")
     rows = [
         f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
         f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
@@ -237,7 +239,7 @@ def _compile(folder: Path, contents: dict[str, bytes], options: ExportOptions) -
             file.write_bytes(content)
     for target in options.platforms:
         library = folder / "library" / target.name / f"{IDENTIFIER}{target.suffix}"
-        compile_library(folder / "sources", (*LAYERS[options.fmi_version], *MODEL_SOURCES), target, library)
+        compile_library(folder / "sources", (*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES), target, library)
         contents[f"binaries/{target.folder(options.fmi_version)}/{library.name}"] = library.read_bytes()
 
 
@@ -246,7 +248,7 @@ def _write_archive(path: Path, contents: Mapping[str, bytes]) -> None:
     try:
         with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
             for inside in sorted(contents, key=lambda name: (name != "modelDescription.xml", name)):
-                entry = zipfile.ZipInfo(inside, EARLIEST_DATE)
+                entry = zipfile.ZipInfo(inside, ZIP_EPOCH)
                 entry.compress_type, entry.create_system = zipfile.ZIP_DEFLATED, 3
                 entry.external_attr = 0o644 << 16
                 archive.writestr(entry, contents[inside], compresslevel=9)

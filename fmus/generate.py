@@ -1,6 +1,6 @@
-"""Generates the C that depends on the arm: its kinematics, from the project's symbolic model, and the layout header.
+"""Generates the C code that depends on the arm: its kinematics, from the symbolic arm model, and the layout header.
 
-The kinematic core holds three functions, each in CasADi's calling convention and without anything but libm:
+The kinematic core has three functions in CasADi's calling convention. They need libm only:
 
     arm_ball      q, p -> y                    ball in the camera frame
     arm_jacobian  q, p -> J                    row-major, 3 × n
@@ -27,7 +27,7 @@ from servobench.fmus.variables import (
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot.symbolic import SX, HandEyeGeometry, feature_and_jacobian
 
-# Generated functions leave parts of their calling convention unused, and none of them is an entry point of the library.
+# Generated functions do not use all of their parameters; none of them is exported by the library.
 KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */
 #ifdef __GNUC__
 #pragma GCC diagnostic ignored "-Wunused-parameter"
@@ -56,7 +56,7 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: s
         layout: groups of the model.
         start: start values of parameters, flat arrays by group.
         model_name: for log messages.
-        token: what `fmi2Instantiate` and `fmi3Instantiate…` must be given.
+        token: GUID that the importer passes to `fmi2Instantiate` or `fmi3Instantiate…`.
     """
     lines = [
         "/* Generated from the table of variables; not meant to be edited. */",
@@ -82,7 +82,7 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: s
 
 
 def kinematic_size(layout: Layout) -> int:
-    """Return how many numbers the kinematic parameters hold."""
+    """Return the number of kinematic parameters."""
     return sum(group.size for group in layout.groups[:KINEMATIC_PARAMETERS])
 
 

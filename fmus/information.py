@@ -1,4 +1,4 @@
-"""Tells what an FMU is: version, interfaces, platforms, capabilities and variables."""
+"""Reads version, interfaces, platforms, capabilities and variables of an FMU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from servobench.plant.fmu.description import parse_description
 
 @dataclass(frozen=True)
 class VariableInformation:
-    """One variable, as the description has it."""
+    """One variable of the model description."""
 
     name: str
     type: str
@@ -28,17 +28,17 @@ class VariableInformation:
 
 @dataclass(frozen=True)
 class FmuInformation:
-    """What an FMU says about itself.
+    """Content of a model description.
 
     Attributes:
         fmi_version: as written.
-        model_name: for people.
+        model_name: display name.
         token: GUID or instantiation token.
-        tool: what made it.
-        interfaces: of co-simulation, model exchange and scheduled execution, those it offers; with the names of the
-            boolean capabilities that are true for each.
+        tool: generation tool.
+        interfaces: those of co-simulation, model exchange and scheduled execution that it offers, each with the names
+            of its capabilities.
         platforms: folders below binaries/.
-        has_sources: it can be compiled.
+        has_sources: whether it holds its C sources.
         variables: all of them, in order.
     """
 
@@ -85,7 +85,7 @@ INTERFACES = {
 
 
 def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
-    """Return the capabilities by interface, as written: fmpy does not keep all of FMI 3."""
+    """Return the capabilities by interface from the XML, since fmpy does not read all of FMI 3."""
     description = ET.parse(root / "modelDescription.xml").getroot()
     elements = {name: description.find(tag) for tag, name in INTERFACES.items()}
     return {

@@ -1,6 +1,6 @@
 """Writes modelDescription.xml for FMI 2.0 (co-simulation and model exchange) and FMI 3.0 (co-simulation).
 
-Dependencies are explicit. No date and no machine enters, so that equal models give equal bytes.
+Dependencies are explicit. The text holds no date and no machine name, so equal models give equal bytes.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ DEFAULT_EXPERIMENT = {"startTime": "0", "stopTime": "10", "stepSize": "0.05"}
 
 @dataclass(frozen=True)
 class Description:
-    """What goes into a model description.
+    """Content of a model description.
 
     Attributes:
-        model_name: for people.
+        model_name: display name.
         model_identifier: file name of the libraries.
         summary: one sentence.
         layout: the variables.
         start: start values of parameters, flat arrays by group.
-        sources: C files that have to be compiled, in order.
+        sources: C files to compile, in order.
         tool: name and version of the exporter.
     """
 

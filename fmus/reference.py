@@ -1,4 +1,4 @@
-"""The reference run that every exported FMU brings: random commands and what numpy, not the FMU, makes of them."""
+"""The reference run inside every exported FMU: random commands, and the outputs that numpy computes for them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from servobench.plant.kinematic import discretise_lag
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.seeds import named_generator
 
-STEP = 0.05  # s
+STEP = 0.05  # [s]
 STEPS = 200
 INPUT_FILE = "extra/servobench/reference_input.csv"
 OUTPUT_FILE = "extra/servobench/reference_output.csv"
@@ -39,7 +39,7 @@ class ReferenceRun:
 
 
 def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
-    """Return the reference run of `model`, by numpy; some of the commands lie beyond the speed limit."""
+    """Return the reference run of `model`; some of its commands exceed the speed limit."""
     n = model.arm.n
     limit, reach = actuation.max_speed, actuation.joint_range
     wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, n))
@@ -57,12 +57,12 @@ def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
 
 
 def input_csv(run: ReferenceRun, layout: Layout) -> str:
-    """Return the commands as CSV, a column a scalar."""
+    """Return the commands as CSV with one column for each scalar."""
     return _table(run.time, {COMMAND: run.command}, layout)
 
 
 def output_csv(run: ReferenceRun, layout: Layout) -> str:
-    """Return the outputs as CSV, a column a scalar."""
+    """Return the outputs as CSV with one column for each scalar."""
     return _table(run.time, run.outputs, layout)
 
 
@@ -70,7 +70,7 @@ def read_table(text: str) -> tuple[list[str], FloatArray]:
     """Return the header and the numbers of a CSV table.
 
     Raises:
-        ValueError: not such a table.
+        ValueError: the text has no rows.
     """
     rows = list(csv.reader(io.StringIO(text)))
     if len(rows) < 2:

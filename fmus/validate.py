@@ -1,4 +1,4 @@
-"""Checks an FMU: the archive, fmpy's validation of the description, and a run against the reference it brings."""
+"""Checks an FMU: the archive, the description (by fmpy), and a run against the reference inside it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Validation:
-    """What was found.
+    """Result of the checks.
 
     Attributes:
-        problems: one line each; none if the FMU is sound.
-        deviation: largest difference from the reference run, or None if there was none to compare with.
+        problems: one line for each; empty if there are none.
+        deviation: largest difference from the reference run, or None without a reference run.
     """
 
     problems: tuple[str, ...]
@@ -36,7 +36,7 @@ def validate_fmu(path: Path) -> Validation:
     """Check the FMU at `path`.
 
     Raises:
-        ValueError: it is not a co-simulation FMU of FMI 2 or 3 that could be checked at all.
+        ValueError: it is not a co-simulation FMU of FMI 2 or 3.
     """
     folder = FmuFolder(path)
     try:
@@ -81,7 +81,7 @@ def _deviation(description: FmuDescription, folder: FmuFolder) -> float:
 
 
 def _variables(description: FmuDescription, header: list[str]) -> list[Variable]:
-    """Return the variables of the columns; where FMI 3 has an array, its columns `name[1]`, … are one variable."""
+    """Return the variables of the columns; in FMI 3 the columns `name[1]`, … belong to one array variable."""
     known = {variable.name for variable in description.variables}
     names = [name if name in known else name.partition("[")[0] for name in header[1:]]
     return [variable for name in dict.fromkeys(names) for variable in description.find(name, "reference run")]

@@ -1,4 +1,6 @@
-"""The variables of the exported arm: one table from which the description, the C header and the documentation are made.
+"""The variables of the exported arm, as one table.
+
+The model description, the C header and the documentation are generated from it.
 
 Every variable is a group of numbers in row-major order. FMI 2 shows each number as a scalar, `lag[3]`; FMI 3 shows the
 group as an array, `lag`. Both use the group's offset in one flat vector of values as value reference.
@@ -43,7 +45,7 @@ class Group:
 
     @property
     def size(self) -> int:
-        """How many numbers it holds."""
+        """Number of scalars."""
         return prod(self.shape)
 
     def scalar_names(self) -> Iterator[str]:
@@ -94,13 +96,13 @@ KINEMATIC_PARAMETERS = 13  # of the groups above, from the first
 
 @dataclass(frozen=True)
 class Layout:
-    """The groups and where each begins in the flat vector of values."""
+    """The groups and their offsets in the flat vector of values."""
 
     groups: tuple[Group, ...]
 
     @cached_property
     def offsets(self) -> dict[str, int]:
-        """First index of each group; it is the value reference."""
+        """Offset of each group, which is its value reference."""
         offsets, offset = {}, 0
         for group in self.groups:
             offsets[group.name] = offset
@@ -109,7 +111,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """How many numbers there are in all."""
+        """Number of all scalars."""
         return sum(group.size for group in self.groups)
 
     def of_role(self, *roles: str) -> list[Group]:
@@ -119,13 +121,13 @@ class Layout:
 
 @dataclass(frozen=True)
 class Actuation:
-    """Everything of the model that is not geometry.
+    """Parameters of the model other than its geometry.
 
     Attributes:
-        lag: time constants of the velocity loops, s.
-        max_speed: rad/s.
-        joint_range: rad, each way.
-        home: (n,), rad, reported joint positions at the start.
+        lag: time constants of the velocity loops [s].
+        max_speed: limit of the joint speeds [rad/s].
+        joint_range: distance of the stops from zero [rad].
+        home: (n,) reported joint positions at the start [rad].
     """
 
     lag: float
@@ -135,7 +137,7 @@ class Actuation:
 
 
 def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:
-    """Return the FMU's parameters, flat arrays by group, that describe `model` and `actuation`."""
+    """Return the FMU's parameters for `model` and `actuation` as flat arrays by group."""
     arm, n = model.arm, model.arm.n
     columns = {"a": 0, "y": 1, "d": 2}
     angles = {"alpha": 0, "pitch": 1, "yaw": 2}

@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servobench.fmus import compile as compiling
+from servobench.fmus import export
 from servobench.fmus.compile import (
     PLATFORMS,
     CompilationFailed,
@@ -34,7 +35,7 @@ from servobench.fmus.export import (
     fingerprint,
 )
 from servobench.fmus.information import read_information
-from servobench.fmus.reference import OUTPUT_FILE, reference_run
+from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.validate import validate_fmu
 from servobench.fmus.variables import model_of, parameters_of
@@ -61,6 +62,17 @@ def test_fmpy_finds_no_problem_and_the_reference_run_agrees(version):
     found = validate_fmu(cached_fmu(version))
     assert found.problems == ()
     assert found.deviation < 1e-12
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_the_committed_reference_is_still_that_of_the_model(version):
+    folder = Path(export.__file__).parent / "ur5_mismatched"
+    with zipfile.ZipFile(cached_fmu(version)) as archive:
+        for name, tolerance in ((INPUT_FILE, 0.0), (OUTPUT_FILE, 1e-12)):
+            header, wanted = read_table((folder / Path(name).name).read_text())
+            own_header, came = read_table(archive.read(name).decode())
+            assert own_header == header
+            np.testing.assert_allclose(came, wanted, rtol=0, atol=tolerance)
 
 
 @settings(max_examples=50, deadline=None)
