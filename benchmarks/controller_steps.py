@@ -35,14 +35,14 @@ class Loop:
         self._experiment = build_experiment(request, Settings())
         self._observation = self._experiment.plant.reset(named_seed(request.seed, "plant"))
         self._experiment.controller.reset(self._observation, named_seed(request.seed, "controller"))
+        run = self._experiment.run
+        self._desired = self._experiment.scenario.reference.sampled(run.period, self._experiment.periods + run.preview)
         self.times: list[float] = []
 
     def advance(self) -> None:
         """Take a step and note what the controller's part of it cost, s."""
-        experiment = self._experiment
-        desired = experiment.scenario.reference.preview(
-            len(self.times), experiment.run.period, 1 + experiment.run.preview
-        )
+        experiment, k = self._experiment, len(self.times)
+        desired = self._desired[k : k + 1 + experiment.run.preview]
         began = time.process_time()
         command = experiment.controller.step(self._observation, desired)
         self.times.append(time.process_time() - began)

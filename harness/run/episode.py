@@ -15,7 +15,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import RunRequest, build_experiment
 from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import run_loop
-from servobench.harness.run.metrics import Judgement, judge_run
+from servobench.harness.run.metrics import judge_run
 from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
 
@@ -53,8 +53,8 @@ def run_experiment(
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
     experiment = build_experiment(request, settings, keep=keep)
-    plant, spec, scenario = experiment.plant, experiment.plant.spec, experiment.scenario
-    log = StepLog(spec, full_jacobian=experiment.run.full_jacobian)
+    plant, scenario = experiment.plant, experiment.scenario
+    log = StepLog(plant.spec, experiment.periods)
     status, reason = COMPLETED, ""
     try:
         with threadpool_limits(1), np.errstate(divide="raise", over="raise", invalid="raise"):
@@ -66,19 +66,22 @@ def run_experiment(
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
         status, reason = "crashed", f"{type(error).__name__}: {_one_line(error)}"
     finally:
-        image = plant.picture() if picture and len(log) else None
+        logged = log.steps()
+        image = plant.picture() if picture and len(logged) else None
         plant.close()
-    table = log.table(request.run_id)
-    judgement = Judgement(spec, scenario.point_to_point, scenario.evaluate_from)
+    metrics = {}
+    if len(logged):
+        metrics = judge_run(logged, point_to_point=scenario.point_to_point, evaluate_from=scenario.evaluate_from)
     row: dict[str, Any] = {
         **request.as_row(),
         "status": status,
-        **(judge_run(table, judgement) if len(table) else {}),
-        "periods": len(table),
+        **metrics,
+        "periods": len(logged),
         "reason": reason,
         "mismatch_values": json.dumps(experiment.sample.as_record() if experiment.sample else {}),
     }
-    return RunResult(row, table if steps else None, image)
+    table = logged.table(request.run_id, full_jacobian=experiment.run.full_jacobian) if steps else None
+    return RunResult(row, table, image)
 
 
 def crashed_row(request: RunRequest, reason: str) -> dict[str, Any]:

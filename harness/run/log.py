@@ -1,36 +1,138 @@
-"""The log of one run: a row a control period.
+"""The log of one run: arrays with one row a control period, made into a table once the run is over.
 
 Row k holds instant t_k: reference, observation, command, truth and how long controller and plant took. The error is
-judged on the true feature. Times are wall clock and the only columns that differ between two runs of the same seed.
+that of the true feature. Times are wall clock and the only columns that differ between two runs of the same seed.
 """
 
 from __future__ import annotations
 
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 
 from servobench.controllers.controller import Diagnostics
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
+JOINT_UNIT = "rad"
+COMMAND_UNIT = "rad/s"
 
-class StepLog:
-    """Collects the rows of one run."""
 
-    def __init__(self, spec: PlantSpec, *, full_jacobian: bool = False) -> None:
-        """Prepare an empty log.
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """A run as arrays of k rows; NaN where a number is not known.
 
-        Args:
-            spec: names and units for the columns.
-            full_jacobian: also keep every entry of the estimated and of the true Jacobian.
-        """
-        self._spec = spec
-        self._full_jacobian = full_jacobian
-        self._rows: list[dict[str, float | bool]] = []
+    Attributes:
+        spec: names and units for the columns.
+        time: (k,) [s].
+        reference: (k, m) [unit of the feature].
+        feature: (k, m), what the controller saw [unit of the feature].
+        true_feature: (k, m) [unit of the feature].
+        joint_position: (k, n), as the encoders report it [rad].
+        command: (k, n) [rad/s].
+        feature_valid: (k,), whether a measurement arrived.
+        estimated_jacobian: (k, m, n), the one that the controller used [unit of the feature per rad].
+        true_jacobian: (k, m, n) [unit of the feature per rad].
+        controller_time: (k,) [µs].
+        plant_time: (k,) [µs].
+        diagnostics: (k,) for each number that the controller gave at least once.
+    """
+
+    spec: PlantSpec
+    time: FloatArray
+    reference: FloatArray
+    feature: FloatArray
+    true_feature: FloatArray
+    joint_position: FloatArray
+    command: FloatArray
+    feature_valid: npt.NDArray[np.bool_]
+    estimated_jacobian: FloatArray
+    true_jacobian: FloatArray
+    controller_time: FloatArray
+    plant_time: FloatArray
+    diagnostics: Mapping[str, FloatArray]
 
     def __len__(self) -> int:
         """Number of rows."""
-        return len(self._rows)
+        return len(self.time)
+
+    def error_norm(self) -> FloatArray:
+        """Return ‖reference − true feature‖, (k,) [unit of the feature]."""
+        return row_norms(self.reference - self.true_feature)
+
+    def jacobian_error(self) -> FloatArray:
+        """Return ‖Ĵ − J‖ / ‖J‖ (Frobenius), (k,)."""
+        with np.errstate(all="ignore"):
+            difference = row_norms(self.estimated_jacobian - self.true_jacobian)
+            return np.asarray(difference / row_norms(self.true_jacobian))
+
+    def jacobian_condition(self) -> FloatArray:
+        """Return the largest over the smallest singular value of J, (k,); infinite where J has lost rank."""
+        condition = np.full(len(self), np.nan)
+        known = np.isfinite(self.true_jacobian).all(axis=(1, 2))
+        singular = np.linalg.svd(self.true_jacobian[known], compute_uv=False)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            condition[known] = np.where(singular[:, -1] > 0.0, singular[:, 0] / singular[:, -1], np.inf)
+        return condition
+
+    def table(self, run_id: str, *, full_jacobian: bool = False) -> pd.DataFrame:
+        """Return a table with one row a period.
+
+        Args:
+            run_id: what the first column holds.
+            full_jacobian: add every entry of the estimated and of the true Jacobian.
+        """
+        columns: dict[str, object] = {"run_id": run_id, "step": np.arange(len(self)), "time_s": self.time}
+        features, joints, unit = self.spec.feature_names, self.spec.joint_names, self.spec.feature_unit
+        columns.update(_named("reference", features, unit, self.reference))
+        columns.update(_named("feature", features, unit, self.feature))
+        columns.update(_named("true_feature", features, unit, self.true_feature))
+        columns.update(_named("joint_position", joints, JOINT_UNIT, self.joint_position))
+        columns.update(_named("joint_velocity_command", joints, COMMAND_UNIT, self.command))
+        columns["error_norm"] = self.error_norm()
+        columns["jacobian_error"] = self.jacobian_error()
+        columns["jacobian_condition"] = self.jacobian_condition()
+        columns["feature_valid"] = self.feature_valid
+        columns["controller_time_us"], columns["plant_time_us"] = self.controller_time, self.plant_time
+        columns.update((f"diagnostic_{name}", values) for name, values in self.diagnostics.items())
+        if full_jacobian:
+            columns.update(self._entries("estimated_jacobian", self.estimated_jacobian))
+            columns.update(self._entries("true_jacobian", self.true_jacobian))
+        return pd.DataFrame(columns)
+
+    def _entries(self, kind: str, jacobian: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+        if np.isnan(jacobian).all():
+            return
+        for i, feature in enumerate(self.spec.feature_names):
+            for j, joint in enumerate(self.spec.joint_names):
+                yield f"{kind}_{feature}_{joint}", jacobian[:, i, j]
+
+
+class StepLog:
+    """Collects the rows of one run in arrays that are made beforehand."""
+
+    def __init__(self, spec: PlantSpec, periods: int) -> None:
+        """Prepare an empty log.
+
+        Args:
+            spec: sizes, names and units.
+            periods: how many rows there is room for.
+        """
+        m, n = spec.m, spec.n
+        self._spec = spec
+        self._count = 0
+        self._time = np.empty(periods)
+        self._reference, self._feature, self._true_feature = np.empty((3, periods, m))
+        self._joint_position, self._command = np.empty((2, periods, n))
+        self._valid = np.empty(periods, dtype=np.bool_)
+        self._estimated_jacobian, self._true_jacobian = np.full((2, periods, m, n), np.nan)
+        self._nanoseconds = np.empty((2, periods))
+        self._diagnostics: dict[str, FloatArray] = {}
 
     def add(
         self,
@@ -46,64 +148,64 @@ class StepLog:
 
         Args:
             observation: what the controller saw.
-            reference: (m,), the desired feature now.
-            command: what it answered.
+            reference: (m,), the desired feature now [unit of the feature].
+            command: the controller's answer.
             truth: the true feature and Jacobian of this instant.
-            estimate: (m, n), the Jacobian it used, or None.
-            diagnostics: what the controller tells about itself.
+            estimate: (m, n), the Jacobian that the controller used, or None [unit of the feature per rad].
+            diagnostics: the controller's own numbers; a name may come later than the first row.
             nanoseconds: how long the controller's and the plant's step took.
         """
-        spec = self._spec
-        row: dict[str, float | bool] = {"time_s": observation.time}
-        for kind, values in (
-            ("reference", reference),
-            ("feature", observation.feature),
-            ("true_feature", truth.feature),
-        ):
-            row.update(
-                (f"{kind}_{name}_{spec.feature_unit}", value)
-                for name, value in zip(spec.feature_names, values.tolist(), strict=True)
-            )
-        for kind, unit, values in (
-            ("joint_position", "rad", observation.joint_position),
-            ("joint_velocity_command", "rad_s", command.joint_velocity),
-        ):
-            row.update(
-                (f"{kind}_{name}_{unit}", value) for name, value in zip(spec.joint_names, values.tolist(), strict=True)
-            )
-        row["error_norm"] = float(np.linalg.norm(reference - truth.feature))
-        row["jacobian_error"], row["jacobian_condition"] = _judge_jacobian(estimate, truth.jacobian)
-        row["feature_valid"] = observation.feature_valid
-        row["controller_time_us"], row["plant_time_us"] = (time / 1000.0 for time in nanoseconds)
-        row.update((f"diagnostic_{name}", float(value)) for name, value in diagnostics.items())
-        if self._full_jacobian:
-            for kind, jacobian in (("estimated", estimate), ("true", truth.jacobian)):
-                if jacobian is not None:
-                    row.update(self._entries(f"{kind}_jacobian", jacobian))
-        self._rows.append(row)
+        k = self._count
+        self._time[k] = observation.time
+        self._reference[k] = reference
+        self._feature[k] = observation.feature
+        self._true_feature[k] = truth.feature
+        self._joint_position[k] = observation.joint_position
+        self._command[k] = command.joint_velocity
+        self._valid[k] = observation.feature_valid
+        if estimate is not None:
+            self._estimated_jacobian[k] = estimate
+        if truth.jacobian is not None:
+            self._true_jacobian[k] = truth.jacobian
+        self._nanoseconds[:, k] = nanoseconds
+        for name, value in diagnostics.items():
+            if name not in self._diagnostics:
+                self._diagnostics[name] = np.full(len(self._time), np.nan)
+            self._diagnostics[name][k] = value
+        self._count += 1
 
-    def table(self, run_id: str) -> pd.DataFrame:
-        """Return the rows as a table with the columns run_id and step in front."""
-        table = pd.DataFrame(self._rows)
-        table.insert(0, "run_id", run_id)
-        table.insert(1, "step", np.arange(len(table)))
-        return table
-
-    def _entries(self, kind: str, jacobian: FloatArray) -> dict[str, float]:
-        spec = self._spec
-        return {
-            f"{kind}_{feature}_{joint}": float(jacobian[i, j])
-            for i, feature in enumerate(spec.feature_names)
-            for j, joint in enumerate(spec.joint_names)
-        }
+    def steps(self) -> Steps:
+        """Return the rows so far."""
+        k = self._count
+        controller_time, plant_time = self._nanoseconds[:, :k] / 1000.0
+        return Steps(
+            self._spec,
+            self._time[:k],
+            self._reference[:k],
+            self._feature[:k],
+            self._true_feature[:k],
+            self._joint_position[:k],
+            self._command[:k],
+            self._valid[:k],
+            self._estimated_jacobian[:k],
+            self._true_jacobian[:k],
+            controller_time,
+            plant_time,
+            {name: values[:k] for name, values in self._diagnostics.items()},
+        )
 
 
-def _judge_jacobian(estimate: FloatArray | None, true: FloatArray | None) -> tuple[float, float]:
-    """Return ‖Ĵ − J‖/‖J‖ (Frobenius) and cond(J); NaN where one of them is not known."""
-    if true is None:
-        return np.nan, np.nan
-    singular = np.linalg.svd(true, compute_uv=False)
-    condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else np.inf
-    if estimate is None:
-        return np.nan, condition
-    return float(np.linalg.norm(estimate - true) / np.linalg.norm(true)), condition
+def column_unit(unit: str) -> str:
+    """Return a unit as the names of columns end with it: `rad/s` -> `rad_s`."""
+    return re.sub(r"\W+", "_", unit)
+
+
+def row_norms(rows: FloatArray) -> FloatArray:
+    """Return the norm of all entries of each row of (k, ...), with the bits of `numpy.linalg.norm` of the row alone."""
+    flat = rows.reshape(len(rows), math.prod(rows.shape[1:]))
+    return np.asarray(np.sqrt(np.matmul(flat[:, None, :], flat[:, :, None])[:, 0, 0]))
+
+
+def _named(kind: str, names: tuple[str, ...], unit: str, values: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+    for name, column in zip(names, values.T, strict=True):
+        yield f"{kind}_{name}_{column_unit(unit)}", column

@@ -24,54 +24,59 @@ from servobench.plant.seeds import named_seed
 
 @dataclass(frozen=True, eq=False)
 class CameraMove:
-    """A change of the camera's pose during a run, of which the controller is not told."""
+    """A change of the camera's pose during a run that the controller must notice by itself.
 
-    period: int  # from this period on
-    X_BC: FloatArray  # (4, 4), the new pose in the base frame
+    Attributes:
+        period: the first period with the new pose.
+        X_BC: (4, 4), the new pose in the base frame.
+    """
+
+    period: int
+    X_BC: FloatArray
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How long a run is and what ends it early."""
+    """How long a run is and what ends it early.
 
-    periods: int  # control periods in the run
-    preview: int  # future rows of the reference that a controller sees
-    lost_after_periods: int  # that many periods in a row without a valid feature end the run
-    camera_move: CameraMove | None = None  # somebody knocks against the camera
+    Attributes:
+        periods: control periods in the run.
+        preview: future rows of the reference that a controller sees.
+        lost_after_periods: a run ends after so many periods in a row without a valid feature.
+        camera_move: a move of the camera in the middle of the run, or None.
+    """
+
+    periods: int
+    preview: int
+    lost_after_periods: int
+    camera_move: CameraMove | None = None
 
 
 def run_loop(
     plant: Plant, controller: Controller, reference: Reference, settings: LoopSettings, seed: int, log: StepLog
 ) -> None:
-    """Step `plant` and `controller` against `reference` and write a row a period into `log`.
+    """Step `plant` and `controller` against `reference` and write one row a period into `log`.
 
     Raises:
         RunFault: the run ended before its last period; the rows so far are in the log.
     """
-    period, rows = plant.spec.period, 1 + settings.preview
+    rows, move = 1 + settings.preview, settings.camera_move
+    desired = reference.sampled(plant.spec.period, settings.periods + settings.preview)
     observation = plant.reset(named_seed(seed, "plant"))
     controller.reset(observation, named_seed(seed, "controller"))
     lost = 0
     for k in range(settings.periods):
-        desired = reference.preview(k, period, rows)
         began = perf_counter_ns()
-        command = controller.step(observation, desired)
+        command = controller.step(observation, desired[k : k + rows])
         decided = perf_counter_ns()
         truth = plant.truth()
-        if settings.camera_move is not None and k == settings.camera_move.period:
-            plant.move_camera(settings.camera_move.X_BC)
+        if move is not None and k == move.period:
+            plant.move_camera(move.X_BC)
         released = perf_counter_ns()
         following = plant.step(command)
-        arrived = perf_counter_ns()
-        log.add(
-            observation,
-            desired[0],
-            command,
-            truth,
-            controller.estimated_jacobian(),
-            controller.diagnostics(),
-            (decided - began, arrived - released),
-        )
+        spent = (decided - began, perf_counter_ns() - released)
+        estimate, diagnostics = controller.estimated_jacobian(), controller.diagnostics()
+        log.add(observation, desired[k], command, truth, estimate, diagnostics, spent)
         observation = following
         lost = 0 if observation.feature_valid else lost + 1
         if lost >= settings.lost_after_periods:

@@ -16,46 +16,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-import pandas as pd
 
+from servobench.harness.run.log import Steps
 from servobench.plant.checks import FloatArray
-from servobench.plant.signals import PlantSpec
 
-SETTLING_BAND = 0.005  # m
-SETTLING_SHARE = 0.05  # of the initial error
-DWELL = 0.5  # s that the error must have stayed in the band by the end
-FINAL_SPAN = 1.0  # s over which the steady state is averaged
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """What the metrics need to know about a run besides its rows.
-
-    Attributes:
-        spec: names, limits and period.
-        point_to_point: the reference is a fixed target.
-        evaluate_from: s, where the evaluated part begins.
-    """
-
-    spec: PlantSpec
-    point_to_point: bool
-    evaluate_from: float
+SETTLING_BAND = 0.005  # [m]
+SETTLING_SHARE = 0.05  # band as a share of the initial error
+DWELL = 0.5  # [s] least time within the band at the end of a run
+FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
 
 
 def settling_time(error: FloatArray, band: float, period: float, dwell: float = DWELL) -> float:
     """Return the first time after which `error` stays within `band`.
 
     Args:
-        error: (k,), m, one value a period.
-        band: m.
-        period: s.
-        dwell: s, least time within the band at the end.
+        error: (k,), one value a period [unit of the feature].
+        band: [unit of the feature].
+        period: [s].
+        dwell: least time within the band at the end [s].
 
     Returns:
-        s; NaN if the error is outside at the end, or came in less than `dwell` before it.
+        [s]; NaN if the error is outside at the end, or came in less than `dwell` before it.
     """
     outside = np.flatnonzero(~(error <= band))
     first = int(outside[-1]) + 1 if len(outside) else 0
@@ -66,8 +48,8 @@ def overshoot(feature: FloatArray, target: FloatArray) -> float:
     """Return how far the feature passes the target along the initial error, as a share of that.
 
     Args:
-        feature: (k, m), m.
-        target: (m,), m.
+        feature: (k, m) [unit of the feature].
+        target: (m,) [unit of the feature].
 
     Returns:
         At least 0; NaN if the run starts at the target.
@@ -78,35 +60,34 @@ def overshoot(feature: FloatArray, target: FloatArray) -> float:
 
 
 def path_length(points: FloatArray) -> float:
-    """Return the length of the path through `points`, (k, m) m."""
+    """Return the length of the path through `points`, (k, m) [their unit]."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def judge_run(steps: pd.DataFrame, judgement: Judgement) -> dict[str, float]:
+def judge_run(steps: Steps, *, point_to_point: bool, evaluate_from: float) -> dict[str, float]:
     """Return the metrics of one run.
 
     Args:
         steps: its rows, at least one.
-        judgement: what to judge them by.
+        point_to_point: the reference is a fixed target.
+        evaluate_from: where the evaluated part begins [s].
 
     Returns:
         Metric name -> value; NaN where a metric does not apply.
     """
-    spec = judgement.spec
-    unit = spec.feature_unit
-    error = steps["error_norm"].to_numpy()
-    feature = steps[[f"true_feature_{name}_{unit}" for name in spec.feature_names]].to_numpy()
-    reference = steps[[f"reference_{name}_{unit}" for name in spec.feature_names]].to_numpy()
-    command = steps[[f"joint_velocity_command_{name}_rad_s" for name in spec.joint_names]].to_numpy()
-    evaluated = error[steps["time_s"].to_numpy() >= judgement.evaluate_from - 1e-9]
+    spec, error = steps.spec, steps.error_norm()
+    # Column after column: the order of a sum decides its last bits, and stored tables are compared bit for bit.
+    feature, reference, command = map(np.asfortranarray, (steps.true_feature, steps.reference, steps.command))
+    evaluated = error[steps.time >= evaluate_from - 1e-9]
     final = error[-max(1, round(FINAL_SPAN / spec.period)) :]
-    way = float(np.linalg.norm(reference[0] - feature[0])) if judgement.point_to_point else path_length(reference)
+    way = float(np.linalg.norm(reference[0] - feature[0])) if point_to_point else path_length(reference)
     saturated = np.any(np.abs(command) >= spec.joint_velocity_limit * (1 - 1e-9), axis=1)
-    jacobian_error = steps["jacobian_error"].dropna()
+    jacobian_error, condition = (values[~np.isnan(values)] for values in (
+        steps.jacobian_error(), steps.jacobian_condition()))  # fmt: skip
     return {
         "settling_time_s": settling_time(error, SETTLING_BAND, spec.period),
         "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[0], spec.period),
-        "overshoot": overshoot(feature, reference[0]) if judgement.point_to_point else np.nan,
+        "overshoot": overshoot(feature, reference[0]) if point_to_point else np.nan,
         "steady_state_error": float(np.mean(final)),
         "rms_error": _rms(error),
         "max_error": float(np.max(error)),
@@ -114,12 +95,12 @@ def judge_run(steps: pd.DataFrame, judgement: Judgement) -> dict[str, float]:
         "path_length_ratio": path_length(feature) / way if way > 0.0 else np.nan,
         "control_effort_rad": float(np.abs(command).sum() * spec.period),
         "saturation_fraction": float(np.mean(saturated)),
-        "feature_invalid_fraction": float(np.mean(~steps["feature_valid"].to_numpy())),
-        "jacobian_error_mean": float(jacobian_error.mean()) if len(jacobian_error) else np.nan,
-        "jacobian_condition_max": float(steps["jacobian_condition"].max()),
-        "controller_time_median_us": float(steps["controller_time_us"].median()),
-        "controller_time_p99_us": float(steps["controller_time_us"].quantile(0.99)),
-        "plant_time_median_us": float(steps["plant_time_us"].median()),
+        "feature_invalid_fraction": float(np.mean(~steps.feature_valid)),
+        "jacobian_error_mean": float(np.mean(jacobian_error)) if len(jacobian_error) else np.nan,
+        "jacobian_condition_max": float(np.max(condition)) if len(condition) else np.nan,
+        "controller_time_median_us": float(np.median(steps.controller_time)),
+        "controller_time_p99_us": float(np.quantile(steps.controller_time, 0.99)),
+        "plant_time_median_us": float(np.median(steps.plant_time)),
     }
 
 

@@ -1,7 +1,4 @@
-"""What the feature should do: a function of time, and the rows of it that a controller sees.
-
-Row 0 of a preview is now, the rest are the next control instants.
-"""
+"""What the feature should do: a function of time, evaluated once for all control instants of a run."""
 
 from __future__ import annotations
 
@@ -23,9 +20,16 @@ class Reference(ABC):
     def at(self, time: npt.ArrayLike) -> FloatArray:
         """Return the desired feature, (..., m) m, at `time` (...), s."""
 
-    def preview(self, k: int, period: float, rows: int) -> FloatArray:
-        """Return the desired features of instants k … k + rows − 1, (rows, m) m."""
-        return self.at(np.arange(k, k + rows) * period)
+    def sampled(self, period: float, count: int) -> FloatArray:
+        """Return the desired features of the first `count` control instants, (count, m), read-only.
+
+        Args:
+            period: control period [s].
+            count: periods of the run and the rows that are previewed beyond its end.
+        """
+        rows = self.at(np.arange(count) * period)
+        rows.flags.writeable = False
+        return rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,17 +3,15 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-import pandas as pd
 import pytest
 
+from kit.straight_move import straight_move
 from servobench.harness.run.metrics import (
-    Judgement,
     judge_run,
     overshoot,
     path_length,
     settling_time,
 )
-from servobench.plant.signals import PlantSpec
 
 PERIOD = 0.1
 
@@ -51,28 +49,8 @@ def test_the_path_length_of_a_square_is_its_circumference():
     assert path_length(np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]], dtype=float)) == 4.0
 
 
-def make_steps() -> pd.DataFrame:
-    """A straight move of 1 m along x in four periods, one joint, saturated in half of them."""
-    x = np.array([0.0, 0.5, 1.0, 1.0])
-    return pd.DataFrame(
-        {
-            "time_s": np.arange(4) * 1.0,
-            "reference_x_m": 1.0,
-            "true_feature_x_m": x,
-            "joint_velocity_command_a_rad_s": [2.0, -2.0, 1.0, 0.0],
-            "error_norm": np.abs(1.0 - x),
-            "feature_valid": [True, True, True, False],
-            "jacobian_error": [0.2, 0.4, np.nan, np.nan],
-            "jacobian_condition": [1.0, 3.0, 2.0, 1.0],
-            "controller_time_us": [1.0, 2.0, 3.0, 4.0],
-            "plant_time_us": 5.0,
-        }
-    )
-
-
 def test_a_run_is_judged_by_hand_computed_figures():
-    spec = PlantSpec(("a",), ("x",), np.array([2.0]), np.array([-9.0]), np.array([9.0]), period=1.0)
-    got = judge_run(make_steps(), Judgement(spec, point_to_point=True, evaluate_from=1.0))
+    got = judge_run(straight_move().steps(), point_to_point=True, evaluate_from=1.0)
     assert got["settling_time_s"] == 2.0
     assert got["rms_error"] == pytest.approx(np.sqrt(1.25 / 4))
     assert got["rms_error_evaluated"] == pytest.approx(np.sqrt(0.25 / 3))
@@ -88,6 +66,5 @@ def test_a_run_is_judged_by_hand_computed_figures():
     assert got["overshoot"] == 0.0
 
 
-def test_overshoot_of_a_moving_reference_is_not_told():
-    spec = PlantSpec(("a",), ("x",), np.array([2.0]), np.array([-9.0]), np.array([9.0]), period=1.0)
-    assert np.isnan(judge_run(make_steps(), Judgement(spec, point_to_point=False, evaluate_from=0.0))["overshoot"])
+def test_a_moving_reference_has_no_overshoot():
+    assert np.isnan(judge_run(straight_move().steps(), point_to_point=False, evaluate_from=0.0)["overshoot"])

@@ -16,14 +16,21 @@ CENTRE = np.array([0.1, -0.2, 1.2])
 NAMES = ("x", "y", "z")
 
 
-def test_a_preview_starts_now_and_shows_the_next_instants():
-    circle = Circle(CENTRE, 0.3, 10.0)
-    rows = circle.preview(7, 0.05, 4)
-    np.testing.assert_array_equal(rows, np.stack([circle.at(k * 0.05) for k in (7, 8, 9, 10)]))
-
-
-def test_a_fixed_point_stays():
-    np.testing.assert_array_equal(FixedPoint(CENTRE).preview(3, 0.1, 2), [CENTRE, CENTRE])
+@pytest.mark.parametrize(
+    "reference",
+    [
+        FixedPoint(CENTRE),
+        Circle(CENTRE, 0.3, 10.0),
+        Lemniscate(CENTRE, 0.25, 7.0),
+        Waypoints(np.array([0.3, 1.1, 4.0]), np.random.default_rng(0).normal(size=(3, 3))),
+    ],
+)
+def test_a_reference_sampled_at_once_has_the_bits_of_every_instant_by_itself(reference):
+    rows = reference.sampled(0.05, 211)
+    np.testing.assert_array_equal(rows, np.stack([reference.at(k * 0.05) for k in range(211)]))
+    np.testing.assert_array_equal(rows[190:201], reference.at(np.arange(190, 201) * 0.05))
+    with pytest.raises(ValueError, match="read-only"):
+        rows[0] = 0.0
 
 
 def test_a_circle_keeps_its_radius_its_depth_and_its_lap():

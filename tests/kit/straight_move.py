@@ -1,0 +1,29 @@
+"""The log of a run made by hand: a move of 1 m along x in four periods of 1 s, whose figures are known."""
+
+import numpy as np
+
+from servobench.harness.run.log import StepLog
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+
+SPEC = PlantSpec(("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0)
+X = (0.0, 0.5, 1.0, 1.0)
+VELOCITY = (2.0, -2.0, 1.0, 0.0)  # of joint a; its limit is 2
+CONDITION = (1.0, 3.0, 2.0, 1.0)
+ESTIMATE = (1.2, 1.4, None, None)  # times the true Jacobian
+
+
+def straight_move(diagnostics=({}, {}, {}, {})):
+    """Return the log, full; the last period has no valid feature."""
+    log = StepLog(SPEC, 4)
+    for k in range(4):
+        jacobian = np.diag([CONDITION[k], 1.0])
+        log.add(
+            Observation(float(k), [0.1 * k, 0.0], [X[k] + 0.01, 0.0], k < 3),
+            np.array([1.0, 0.0]),
+            Command([VELOCITY[k], 0.0]),
+            Truth(np.array([X[k], 0.0]), jacobian),
+            None if ESTIMATE[k] is None else ESTIMATE[k] * jacobian,
+            diagnostics[k],
+            (1000 * (k + 1), 5000),
+        )
+    return log
