@@ -7,7 +7,7 @@ All functions are pure, and seeded where they draw. What a run that never settle
 | `success_rate` | is no success |
 | `median_with_interval`, `tail_mean` | counts as +∞: so does a median where half of the runs or more never settle |
 | `compare_pairs` | counts as `never`, the duration of the run: a bound from below, as ranks need finite numbers |
-| `outcomes`, `failure_table` | is `not_settled` if it completed, else the fault |
+| `outcomes` | is `not_settled` if it completed, else the fault |
 
 A run that did not complete never settled, whatever its error was before: `settling_times` says so.
 """
@@ -74,12 +74,13 @@ def success_rate(successes: int, runs: int, confidence: float = CONFIDENCE) -> E
     Raises:
         ValueError: no run, or more successes than runs.
     """
-    from statsmodels.stats.proportion import proportion_confint  # noqa: PLC0415 - half a second, to judge alone
+    from scipy import stats  # noqa: PLC0415 - half a second, to judge alone
 
     if not 0 <= successes <= runs or runs < 1:
         raise ValueError(f"successes must be from 0 to runs, and runs at least 1; got {successes} of {runs}")
-    low, high = proportion_confint(successes, runs, alpha=1.0 - confidence, method="wilson")
-    return Estimate(successes / runs, float(low), float(high), runs)
+    with np.errstate(under="ignore"):  # scipy also takes a p-value, however small
+        interval = stats.binomtest(successes, runs).proportion_ci(confidence, method="wilson")
+    return Estimate(successes / runs, float(interval.low), float(interval.high), runs)
 
 
 def median_with_interval(
@@ -190,9 +191,11 @@ def compare_pairs(
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values after Holm's correction for their number."""
-    from statsmodels.stats.multitest import multipletests  # noqa: PLC0415 - as above
-
-    return [float(value) for value in multipletests(p_values, method="holm")[1]]
+    order = np.argsort(p_values)
+    scaled = np.asarray(p_values)[order] * np.arange(len(order), 0, -1)
+    corrected = np.empty(len(order))
+    corrected[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return [float(value) for value in corrected]
 
 
 def signed_rank_p_value(differences: ArrayLike) -> float:
@@ -229,21 +232,6 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
     """Return for each run `settled`, `not_settled` (it completed, outside the band) or the fault that ended it."""
     settled = pd.Series(np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED), index=runs.index)
     return settled.where(runs["status"] == COMPLETED, runs["status"]).rename("outcome").astype(str)
-
-
-def failure_table(runs: pd.DataFrame, by: Sequence[str] = ("controller",)) -> pd.DataFrame:
-    """Return how many runs ended how: a row for each group, a column for each outcome that occurs.
-
-    Columns: `settled` and `not_settled` always and first, then the faults by name. Rows in order of first appearance.
-    """
-    ended = outcomes(runs)
-    faults = sorted(set(ended) - {SETTLED, NOT_SETTLED})
-    groups = [runs[name] for name in by]
-    counts = ended.groupby([*groups, ended], sort=False).size().unstack(fill_value=0)
-    order = pd.MultiIndex.from_frame(runs[list(by)]).unique() if len(by) > 1 else pd.Index(runs[by[0]].unique())
-    return counts.reindex(index=order, columns=[SETTLED, NOT_SETTLED, *faults], fill_value=0).rename_axis(
-        index=list(by), columns=None
-    )
 
 
 def _sample(values: ArrayLike, missing: Literal["infinite", "left_out"]) -> FloatArray:

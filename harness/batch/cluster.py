@@ -45,10 +45,8 @@ def open_backend(scheduler: str | None, workers: int) -> Iterator[Backend]:
         return
     if not re.fullmatch(r"(?:[a-z]+://)?\S+:\d+", scheduler):
         raise ConfigurationError(f"--scheduler needs an address such as tcp://127.0.0.1:8786, got {scheduler!r}")
-    try:
-        from distributed import Client, KilledWorker  # noqa: PLC0415 - an optional extra
-    except ImportError as error:
-        raise ConfigurationError("--scheduler needs Dask: pip install 'servobench[cluster]'") from error
+    from distributed import Client, KilledWorker  # noqa: PLC0415 - only the extra cluster brings it
+
     try:
         client = Client(scheduler, timeout=ANSWER_WITHIN, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

@@ -8,7 +8,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import cv2
 import joblib
 from joblib.externals.loky import get_reusable_executor
 
@@ -140,6 +139,8 @@ def _carry_out(
         results.write_part(folder, index, result.row, result.steps)
     if result.picture is not None:
         (folder / PICTURES).mkdir(exist_ok=True)
+        import cv2  # noqa: PLC0415 - only the extra bullet brings it
+
         large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
         cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), cv2.cvtColor(large, cv2.COLOR_RGB2BGR))
     return result.row

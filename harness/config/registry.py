@@ -12,6 +12,7 @@ from pathlib import Path
 
 from servobench.controllers.composed import compose
 from servobench.controllers.controller import ControllerEntry
+from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError, suggest
 from servobench.plant.fmu.entry import mapped_entry
 from servobench.plant.plant import PlantEntry
@@ -108,4 +109,7 @@ def _load(group: str, kind: str, name: str) -> object:
     try:
         return points[name].load()
     except (ImportError, AttributeError) as error:
-        raise ConfigurationError(f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}") from error
+        missing = missing_extra(error, f"{kind} {name!r}") if isinstance(error, ImportError) else None
+        raise ConfigurationError(
+            missing or f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}"
+        ) from error

@@ -19,7 +19,6 @@ import io
 from dataclasses import dataclass
 from typing import Any, Final
 
-import casadi
 import numpy as np
 
 from servobench.plant.checks import FloatArray
@@ -139,6 +138,8 @@ class QpProgram:
 
     def reset(self) -> None:
         """Forget the warm start; the solver is made anew because it may keep a working set of its own."""
+        import casadi  # noqa: PLC0415 - only the extra mpc brings it
+
         problem = {"x": self.x, "p": self.p, "f": self.objective, "g": self.rows}
         options = {"error_on_fail": False, "print_time": False, **_SOLVER_OPTIONS[self._solver]}
         with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made and first used
@@ -214,6 +215,8 @@ def _repeat(row: FloatArray, count: int) -> FloatArray:
 
 def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
     """Return variables, parameters, criterion and rows as SX expressions."""
+    import casadi  # noqa: PLC0415 - only the extra mpc brings it
+
     blocks = shape.horizon if shape.varying_jacobian else 1
     J = [casadi.SX.sym(f"J{t}", shape.m, shape.n) for t in range(blocks)]
     dq = casadi.SX.sym("dq", shape.n, shape.moves)
