@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.closed_form import decay_targets
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.checks import FloatArray
@@ -108,7 +109,7 @@ def main() -> None:
     difference = 0.0
     for J, observation, reference in problems():
         started = time.process_time()
-        own_step = law.command(J, observation, reference) * SPEC.period
+        own_step = law.command(Estimate(J), observation, reference) * SPEC.period
         between = time.process_time()
         other_step = other.step(J, observation, reference)
         ended = time.process_time()

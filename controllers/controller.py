@@ -1,4 +1,4 @@
-"""The contract of a controller: reset, step, diagnostics; and what it may know about the robot.
+"""The contract of a controller: reset, step, diagnostics, save, restore; and what it may know about the robot.
 
 A controller never sees a plant, a simulator, a file or the truth. Adding one: a frozen configuration dataclass, a
 builder, and a `ControllerEntry` that is named in `harness.config.registry` or published under the entry-point group
@@ -9,16 +9,13 @@ builder, and a `ControllerEntry` that is named in `harness.config.registry` or p
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Command, Observation, PlantSpec
-
-if TYPE_CHECKING:
-    from servobench.controllers.networks.config import TrainingConfig
-    from servobench.controllers.networks.file import TrainedNetworks
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 SymbolicFeature: TypeAlias = Callable[[Any], Any]
@@ -39,7 +36,8 @@ class RobotKnowledge:
             under the same condition.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
-        train: returns trained networks, from a cache where it has them; None: networks are trained on the spot.
+        train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
+            needs the training knows both types. None: it is run when the controller is built.
     """
 
     spec: PlantSpec
@@ -48,7 +46,7 @@ class RobotKnowledge:
     true_jacobian: JacobianFunction | None = None
     true_symbolic: SymbolicFeature | None = None
     region: tuple[FloatArray, FloatArray] | None = None
-    train: Callable[[TrainingConfig], TrainedNetworks] | None = None
+    train: Callable[[Any], Any] | None = None
 
 
 class Controller(ABC):
@@ -79,6 +77,27 @@ class Controller(ABC):
     def diagnostics(self) -> Diagnostics:
         """Return named numbers about the last step; for the log only."""
 
+    def save(self) -> object:
+        """Return the state, for `restore`."""
+        return self._copy(self.__dict__)
+
+    def restore(self, state: object) -> None:
+        """Go back to a state that `save` of this controller returned; the state may be restored again.
+
+        Raises:
+            TypeError: not such a state.
+        """
+        if not isinstance(state, dict):
+            raise TypeError(f"state must come from save, got {type(state).__name__}")
+        self.__dict__ = self._copy(state)
+
+    def _shared(self) -> Iterable[object]:
+        """Return what `save` and `restore` keep instead of copying: models and handles, which never change."""
+        return ()
+
+    def _copy(self, state: dict[str, Any]) -> dict[str, Any]:
+        return deepcopy(state, {id(thing): thing for thing in self._shared()})
+
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the Jacobian (m, n) that the last step used, or None where the method has none; for the log only."""
         return None
@@ -91,13 +110,13 @@ class ControllerEntry:
     Attributes:
         name: the word on the command line.
         summary: one line for `servobench controllers`.
-        config: frozen dataclass with a default for every field.
-        build: makes the controller from its configuration and what it may know.
-        needs_truth: it is told the true Jacobian and kinematics: a bound, not a competitor.
+        config: returns the default settings, a frozen dataclass; a dataclass with a default for every field does.
+        build: makes the controller from its settings and what it may know.
+        needs_truth: whether it is given the true Jacobian and kinematics: a bound, not a competitor.
     """
 
     name: str
     summary: str
-    config: type[Any]
+    config: Callable[[], Any]
     build: Callable[[Any, RobotKnowledge], Controller]
     needs_truth: bool = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, final, get_args
 
@@ -147,6 +148,9 @@ class NmpcCalibrated(Controller):
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the true Jacobian (m, n) at the last observation, or None before there was one."""
         return None if self._jacobian is None else self._jacobian.copy()
+
+    def _shared(self) -> Iterable[object]:
+        return self._model, self._along_plan
 
     def _forget(self) -> None:
         n, delay = self._spec.n, self._config.delay_periods

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from servobench.controllers.composed import servo_entry
+
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig

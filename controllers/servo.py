@@ -2,12 +2,13 @@
 
     J(k) ← estimator(Δy, Δq),      u(k) = law(J(k), y(k), y_ref(k), y_ref(k+1), …)
 
-Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.composed`.
+Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.parts`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import final
 
 import numpy as np
@@ -40,9 +41,13 @@ class ServoController(Controller):
         self.estimator = estimator
         self.law = law
         self._initial = initial
+        self._knowledge = knowledge
         self._spec = knowledge.spec
         self._preview = knowledge.preview
         self._forget()
+
+    def _shared(self) -> Iterable[object]:
+        return vars(self._knowledge).values()
 
     def _forget(self) -> None:
         self._ready = False
@@ -80,11 +85,11 @@ class ServoController(Controller):
             self.law.reset(observation)
             self._ready, self._probing = True, False
         self._learn(observation, reference)
-        J = self._jacobian = self.estimator.jacobian(observation.joint_position)
+        estimate = self.estimator.estimate(observation.joint_position)
+        J = self._jacobian = estimate.jacobian
         if not np.isfinite(J).all():
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
-        self.law.expect_delay(self.estimator.delay())
-        u = self.law.command(J, observation, reference)
+        u = self.law.command(estimate, observation, reference)
         if not np.isfinite(u).all():
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from servobench.controllers.composed import servo_entry
+
 from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.laws.mpc.mpc import MpcConfig

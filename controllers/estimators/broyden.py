@@ -13,7 +13,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray, check_number
 
@@ -51,8 +51,8 @@ def projection_update(
 class BroydenEstimator(Estimator):
     """Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / ‖Δq‖² for every motion above a minimum ‖Δq‖."""
 
-    def __init__(self, config: BroydenConfig) -> None:
-        """Take the settings."""
+    def __init__(self, config: BroydenConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
         self._config = config
 
     def reset(self, jacobian: FloatArray) -> None:

@@ -13,7 +13,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.broyden import projection_update
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray, check_number
@@ -46,8 +46,8 @@ class CfdlEstimator(Estimator):
     The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, what was learnt stays.
     """
 
-    def __init__(self, config: CfdlConfig) -> None:
-        """Take the settings."""
+    def __init__(self, config: CfdlConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
         self._config = config
 
     def reset(self, jacobian: FloatArray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import final
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
 
@@ -18,6 +18,9 @@ class ConstantConfig:
 @final
 class ConstantEstimator(Estimator):
     """Ĵ(k) = Ĵ₀ for ever."""
+
+    def __init__(self, config: ConstantConfig | None = None, knowledge: RobotKnowledge | None = None) -> None:
+        """Take nothing: there are no settings, and nothing about the robot is needed."""
 
     def reset(self, jacobian: FloatArray) -> None:
         """Keep Ĵ₀, (m, n), m/rad."""

@@ -1,4 +1,4 @@
-"""The contract of a Jacobian estimator: what it is told after each period, and the Jacobian it answers with."""
+"""The contract of a Jacobian estimator: what it learns from, and the estimate that it returns."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimate import Estimate
 from servobench.plant.checks import FloatArray
-
-LONGEST_DELAY = 14  # periods: no estimator tells of a longer one, so that laws know how much past to keep
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +44,9 @@ class Estimator(ABC):
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad, as an (m, n) array in m/rad that the caller may keep."""
 
-    def delay(self) -> int:
-        """Return by how many periods features are late, at most `LONGEST_DELAY`; 0 where that is not estimated."""
-        return 0
+    def estimate(self, joint_position: FloatArray) -> Estimate:
+        """Return what the law needs to know; an estimator of delay or noise overrides this."""
+        return Estimate(self.jacobian(joint_position))
 
     @abstractmethod
     def diagnostics(self) -> Diagnostics:

@@ -16,7 +16,7 @@ from typing import Literal, final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.faults import FilterDiverged
@@ -136,8 +136,8 @@ class KalmanEstimator(Estimator):
     J changes only where the arm moves, so a motion that is left out adds no process noise either.
     """
 
-    def __init__(self, config: KalmanConfig) -> None:
-        """Take the settings."""
+    def __init__(self, config: KalmanConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
         self._config = config
         self._q = config.process_deviation**2
         self._r = 2.0 * config.feature_noise**2

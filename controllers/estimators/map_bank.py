@@ -18,8 +18,9 @@ All functions are pure; the leading axis runs over the candidates.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dgesdd, dposv
+from scipy.linalg.lapack import dposv
 
+from servobench.controllers.rotation import nearest_rotation
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FilterDiverged
 
@@ -46,25 +47,6 @@ def map_update(
     nu = known[:, :m]
     surprise = np.add.reduce(nu * nu, axis=1) / s
     return bank - known[:, :, None] * (Px / s[:, None])[:, None, :], surprise, s
-
-
-def nearest_rotation(M: FloatArray) -> FloatArray:
-    """Return the rotation R, (m, m), nearest to M, (m, m), in the Frobenius norm: it maximises trace(RᵀM)."""
-    left, _, right, failed = dgesdd(M)
-    if failed:
-        raise FilterDiverged(f"map has no nearest rotation: {M.tolist()}")
-    R: FloatArray = left.dot(right)
-    if _determinant(R) < 0.0:
-        left[:, -1] = -left[:, -1]
-        R = left.dot(right)
-    return R
-
-
-def _determinant(R: FloatArray) -> float:
-    if len(R) != 3:
-        return float(np.linalg.det(R))
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
 def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:

@@ -9,9 +9,10 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.networks.rbf import JacobianNetwork, LatestFeatures, jacobian_output
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.networks.rbf import LatestFeatures, jacobian_output
 from servobench.plant.checks import FloatArray, check_number
 
 
@@ -76,11 +77,11 @@ class RbfEstimator(Estimator):
     there; the sum in α₂ runs over the same window as the gradient (the paper's has one term more).
     """
 
-    def __init__(self, config: RbfConfig, network: JacobianNetwork) -> None:
-        """Start from the offline `network`."""
+    def __init__(self, config: RbfConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
+        """Start from the offline Jacobian network."""
         self._config = config
-        self._network = network
-        self._features = LatestFeatures(network)
+        self._network = networks.jacobian
+        self._features = LatestFeatures(self._network)
         self._count = 0
         self._restore()
 

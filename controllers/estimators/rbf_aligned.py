@@ -14,12 +14,13 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
-from servobench.controllers.estimators.estimator import LONGEST_DELAY, Estimator, Motion
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import MAX_DELAY, Estimate
+from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.map_bank import map_update, near_rotation
-from servobench.controllers.estimators.noise_level import NoiseLevel
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
-from servobench.controllers.networks.rbf import JacobianNetwork
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray, check_number
 
 ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
@@ -60,7 +61,7 @@ class RbfAlignedConfig:
             check_number(name, getattr(self, name), above=0.0)
         for name in ("walk", "model_error", "rotation_deviation", "margin"):
             check_number(name, getattr(self, name), at_least=0.0)
-        check_number("longest_delay", self.longest_delay, at_least=0, at_most=LONGEST_DELAY)
+        check_number("longest_delay", self.longest_delay, at_least=0, at_most=MAX_DELAY)
         check_number("forgetting", self.forgetting, above=0.0, at_most=1.0)
 
 
@@ -81,11 +82,11 @@ class RbfAlignedEstimator(Estimator):
     gate. M stays, as the best guess.
     """
 
-    def __init__(self, config: RbfAlignedConfig, network: JacobianNetwork, period: float) -> None:
-        """Start from the offline `network`; `period` is the control period, s."""
-        self._config = config
-        self._network = RbfEstimator(RbfConfig(config.window, config.k2, config.epsilon), network)
-        self._period = period
+    def __init__(self, config: RbfAlignedConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
+        """Start from the offline Jacobian network."""
+        self._config, network = config, networks.jacobian
+        self._network = RbfEstimator(RbfConfig(config.window, config.k2, config.epsilon), knowledge, networks)
+        self._period = knowledge.spec.period
         self._eye = np.eye(network.m)
         self._n, self._m = network.n, network.m
         self._candidates = 1 + (config.longest_delay if config.find_delay else 0)
@@ -119,9 +120,9 @@ class RbfAlignedEstimator(Estimator):
         self._network.reset(jacobian)
         self._forget()
 
-    def delay(self) -> int:
-        """Return d, periods."""
-        return self._delay
+    def estimate(self, joint_position: FloatArray) -> Estimate:
+        """Return Ĵ at `joint_position` (n,), rad, with d and σ."""
+        return Estimate(self.jacobian(joint_position), self._delay, math.sqrt(self._noise.variance))
 
     def update(self, motion: Motion) -> None:
         """Learn map, delay and network from one motion."""

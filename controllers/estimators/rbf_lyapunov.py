@@ -7,9 +7,10 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.networks.rbf import JacobianNetwork, LatestFeatures, jacobian_output
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.networks.rbf import LatestFeatures, jacobian_output
 from servobench.plant.checks import FloatArray, check_number
 
 
@@ -64,12 +65,12 @@ class RbfLyapunovEstimator(Estimator):
     small: n₃ Σ Δq_i² ‖θ_i‖² / duration < 2 for the s-part alone.
     """
 
-    def __init__(self, config: RbfLyapunovConfig, network: JacobianNetwork) -> None:
-        """Start from the offline `network`."""
+    def __init__(self, config: RbfLyapunovConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
+        """Start from the offline Jacobian network."""
         self._config = config
-        self._network = network
-        self._features = LatestFeatures(network)
-        self._weights = network.weights
+        self._network = networks.jacobian
+        self._features = LatestFeatures(self._network)
+        self._weights: FloatArray = self._network.weights
         self._restore()
 
     @property

@@ -13,7 +13,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
 from servobench.plant.checks import FloatArray, check_number
@@ -66,8 +66,8 @@ class RlsEstimator(Estimator):
     of at most `covariance_limit`; scaling keeps it symmetric and positive definite.
     """
 
-    def __init__(self, config: RlsConfig) -> None:
-        """Take the settings."""
+    def __init__(self, config: RlsConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
         self._config = config
 
     def reset(self, jacobian: FloatArray) -> None:

@@ -21,7 +21,7 @@ class TrueConfig:
 class TrueEstimator(Estimator):
     """Ĵ(k) = J(q(k)), the Jacobian of the true robot."""
 
-    def __init__(self, knowledge: RobotKnowledge) -> None:
+    def __init__(self, config: TrueConfig, knowledge: RobotKnowledge) -> None:
         """Take the true Jacobian.
 
         Raises:

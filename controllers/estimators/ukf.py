@@ -20,7 +20,7 @@ from typing import Literal, final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import check_filter_numbers, cholesky_of, split_update
 from servobench.plant.checks import FloatArray, check_number
@@ -128,8 +128,8 @@ class UkfEstimator(Estimator):
     say how P₀, Q and R are chosen, nor what happens at rest; R is kept honest here (2σ² of the feature's noise).
     """
 
-    def __init__(self, config: UkfConfig) -> None:
-        """Take the settings."""
+    def __init__(self, config: UkfConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
         self._config = config
         self._q = config.process_deviation**2
         self._r = 2.0 * config.feature_noise**2

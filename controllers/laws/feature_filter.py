@@ -14,7 +14,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.estimators.noise_level import NoiseLevel
+from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 
 REST_DRIFT = 1e-4  # r, m: how far z may drift a period at rest

@@ -1,4 +1,4 @@
-"""The contract of a control law: Jacobian, observation and reference in, joint velocity out."""
+"""The contract of a control law: estimate, observation and reference in, joint velocity out."""
 
 from __future__ import annotations
 
@@ -7,32 +7,30 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics
+from servobench.controllers.estimate import Estimate
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Observation
 
 
 class Law(ABC):
-    """Turns the error into a joint velocity with the help of a Jacobian; any law works with any estimator."""
+    """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator."""
 
     @abstractmethod
     def reset(self, observation: Observation) -> None:
         """Forget everything and prepare for a run that starts with `observation`."""
 
     @abstractmethod
-    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return the joint velocity for the period that begins now.
 
         Args:
-            jacobian: Ĵ, (m, n), m/rad.
+            estimate: the Jacobian, and delay and noise where they are identified.
             observation: what is seen now.
             reference: (1 + preview, m): row 0 is now, the rest are the next control instants.
 
         Returns:
             (n,), rad/s, within the joint-speed limits.
         """
-
-    def expect_delay(self, delay: int) -> None:  # noqa: B027 - most laws bridge no delay
-        """Be told before a command by how many periods features are late; a law that bridges no delay ignores it."""
 
     @abstractmethod
     def diagnostics(self) -> Diagnostics:

@@ -14,6 +14,7 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, scale_to_limit
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.signals import Observation
@@ -73,9 +74,9 @@ class MfacLaw(Law):
         """Forget the last command; the law itself has no state."""
         self._saturated = False
 
-    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return u, (n,), rad/s; see `Law.command`."""
-        config = self._config
+        config, jacobian = self._config, estimate.jacobian
         dq = mfac_step(jacobian, reference[0] - observation.feature, config.step_factor, config.step_weight)
         if config.feedforward:
             dq = dq + mfac_step(jacobian, reference[1] - reference[0], 1.0, config.step_weight)

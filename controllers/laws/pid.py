@@ -17,6 +17,7 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.damped_inverse import damped_inverse
 from servobench.controllers.laws.law import Law, scale_to_limit
 from servobench.plant.checks import FloatArray, check_number
@@ -78,7 +79,7 @@ class PidLaw(Law):
         """Forget integral and derivative."""
         self._forget()
 
-    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return u, (n,), rad/s; see `Law.command`."""
         config = self._config
         e = reference[0] - observation.feature
@@ -88,7 +89,7 @@ class PidLaw(Law):
         v = config.proportional_gain * e + config.integral_gain * integral + config.derivative_gain * self._derivative
         if config.feedforward:
             v = v + reference_velocity(reference, self._dt)
-        wanted = damped_inverse(jacobian, config.damping) @ v
+        wanted = damped_inverse(estimate.jacobian, config.damping) @ v
         u = scale_to_limit(wanted, self._limit)
         self._saturated = bool((np.abs(wanted) > self._limit).any())
         if not self._saturated or integral @ integral < self._integral @ self._integral:

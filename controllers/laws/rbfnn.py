@@ -8,6 +8,7 @@ from typing import Literal, final, get_args
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, scale_to_limit
 from servobench.controllers.laws.roll_out import (
     RollOut,
@@ -16,7 +17,8 @@ from servobench.controllers.laws.roll_out import (
     update_step,
 )
 from servobench.controllers.laws.row_space import project_to_row_space
-from servobench.controllers.networks.rbf import ControllerNetwork, controller_output
+from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.networks.rbf import controller_output
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.signals import Observation
 
@@ -68,13 +70,13 @@ class RbfnnLaw(Law):
     - Without a valid feature nothing is learned; the last error is held.
     """
 
-    def __init__(self, config: RbfnnConfig, network: ControllerNetwork, knowledge: RobotKnowledge) -> None:
-        """Take the settings, the offline network, limits, period and preview.
+    def __init__(self, config: RbfnnConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
+        """Take the settings, the offline networks, limits, period and preview.
 
         Raises:
             ValueError: a network of other sizes than the plant, or a preview shorter than the horizon.
         """
-        spec = knowledge.spec
+        spec, network = knowledge.spec, networks.controller
         if (network.n, network.m) != (spec.n, spec.m):
             raise ValueError(
                 f"network must be of {spec.n} joints and {spec.m} features, got {network.n} and {network.m}"
@@ -112,9 +114,9 @@ class RbfnnLaw(Law):
         """Restore the offline network and empty both histories."""
         self._forget()
 
-    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return u, (n,), rad/s; see `Law.command`."""
-        config, network = self._config, self._network
+        config, network, jacobian = self._config, self._network, estimate.jacobian
         self._errors = _pushed(self._errors, reference[0] - observation.feature, network.error_history)
         if self._positions is None or config.position == "measured":
             self._positions = _pushed(self._positions, observation.joint_position, network.position_history)

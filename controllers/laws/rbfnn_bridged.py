@@ -19,9 +19,7 @@ from typing import Literal, final, get_args
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import LONGEST_DELAY
-from servobench.controllers.estimators.map_bank import nearest_rotation
-from servobench.controllers.estimators.noise_level import NoiseLevel
+from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.laws.damped_inverse import damped_inverse
 from servobench.controllers.laws.feature_filter import FeatureFilter
 from servobench.controllers.laws.joint_response import JointResponse
@@ -30,6 +28,8 @@ from servobench.controllers.laws.learned_correction import CorrectionGains, Lear
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.laws.redistribution import redistribute
 from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.noise_level import NoiseLevel
+from servobench.controllers.rotation import nearest_rotation
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.signals import Observation
 
@@ -96,7 +96,7 @@ class RbfnnBridgedLaw(Law):
     beyond the preview it goes on as in its last period.
     """
 
-    def __init__(self, config: RbfnnBridgedConfig, networks: TrainedNetworks, knowledge: RobotKnowledge) -> None:
+    def __init__(self, config: RbfnnBridgedConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
         """Take the settings, the offline networks, limits, period and preview.
 
         Raises:
@@ -117,12 +117,11 @@ class RbfnnBridgedLaw(Law):
         self._region = centres.min(axis=(0, 1)), centres.max(axis=(0, 1))  # where the networks were trained
         if config.base == "network":
             settings = RbfnnConfig(config.horizon, config.k, config.epsilon, preview=not config.feedforward)
-            self._law: LearnedCorrection | RbfnnLaw = RbfnnLaw(settings, network, knowledge)
+            self._law: LearnedCorrection | RbfnnLaw = RbfnnLaw(settings, knowledge, networks)
         else:
             posture = centres.mean(axis=(0, 1))
             self._law = LearnedCorrection(config.gains(spec.period), network, posture, self._limit)
         self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
-        self._delay = 0
         self._forget()
 
     def _forget(self) -> None:
@@ -136,27 +135,22 @@ class RbfnnBridgedLaw(Law):
     def reset(self, observation: Observation) -> None:
         """Forget everything that was learned and seen."""
         self._law.reset(observation)
-        self._delay = 0
         self._forget()
 
-    def expect_delay(self, delay: int) -> None:
-        """Take the camera's delay, periods, for the next command.
+    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
+        """Return u, (n,), rad/s; see `Law.command`.
 
         Raises:
-            ValueError: a delay beyond what a law keeps of the past.
+            ValueError: a delay beyond what the law keeps of the past.
         """
-        if delay != self._delay:
-            check_number("delay", delay, at_least=0, at_most=LONGEST_DELAY)
-        self._delay = delay
-
-    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return u, (n,), rad/s; see `Law.command`."""
-        config = self._config
+        if not 0 <= estimate.delay <= MAX_DELAY:
+            raise ValueError(f"delay must be from 0 to {MAX_DELAY} periods, got {estimate.delay}")
+        config, jacobian = self._config, estimate.jacobian
         past = self._extended_past(observation.joint_position)
         delay, flight, lead = 0, np.zeros(self._n), 0.0
         if config.bridge:
             self._response.learn(past[0] - past[1])
-            delay, flight, lead = self._delay, self._response.flight(), self._response.lead
+            delay, flight, lead = estimate.delay, self._response.flight(), self._response.lead
         seen = self._seen(jacobian, past, delay, observation)
         ahead, q = seen + jacobian @ (past[0] - past[delay] + flight), past[0] + flight
         wanted = self._wanted = self._wanted_step(jacobian, ahead, q, shifted(reference, lead, self._rows), observation)
@@ -178,7 +172,7 @@ class RbfnnBridgedLaw(Law):
 
     def _extended_past(self, joint_position: FloatArray) -> FloatArray:
         if self._past is None:  # the arm was at rest
-            self._past = np.repeat(joint_position[None], LONGEST_DELAY + 2, axis=0)
+            self._past = np.repeat(joint_position[None], MAX_DELAY + 2, axis=0)
         else:
             self._past = np.concatenate([joint_position[None], self._past[:-1]])
         return self._past
@@ -209,7 +203,7 @@ class RbfnnBridgedLaw(Law):
             reference = np.repeat(reference[:1], len(reference), axis=0)
         F = self._frame(jacobian, q)
         predicted = Observation(observation.time, q, F @ y, observation.feature_valid)
-        law.command(F @ jacobian, predicted, reference @ F.T)
+        law.command(Estimate(F @ jacobian), predicted, reference @ F.T)
         return np.asarray(law.wanted + damped_inverse(jacobian, config.damping) @ forward)
 
     def _frame(self, jacobian: FloatArray, q: FloatArray) -> FloatArray:

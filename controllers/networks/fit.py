@@ -116,7 +116,7 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
         config = replace(config, lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
     spec = knowledge.spec
     if knowledge.train is not None:
-        networks = knowledge.train(config)
+        networks: TrainedNetworks = knowledge.train(config)
     elif knowledge.nominal_jacobian is not None:
         networks = train(config, knowledge.nominal_jacobian, spec)
     else:

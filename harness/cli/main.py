@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from servobench.controllers.composed import ESTIMATORS, LAWS
+from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.analysis.summary import summary_tables
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import (

@@ -11,17 +11,15 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import Any, Final
+from typing import Any
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.settings import ConfigurationError, Settings
 
-SAME_AS: Final = {"kalman_mfac": "ukf_mfac"}  # the same filter in another form takes the same values, untuned
-
 
 def tuned_file(name: str) -> Traversable:
     """Return where the tuned values of the controller called `name` lie, if it has any."""
-    return files("servobench.controllers") / "tuned" / f"{SAME_AS.get(name, name)}.toml"
+    return files("servobench.controllers") / "tuned" / f"{name}.toml"
 
 
 def default_config(entry: ControllerEntry) -> Any:  # noqa: ANN401 - any configuration dataclass

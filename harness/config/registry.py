@@ -10,8 +10,8 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from servobench.controllers.composed import compose
 from servobench.controllers.controller import ControllerEntry
+from servobench.controllers.methods import METHODS, compose
 from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError, suggest
 from servobench.plant.fmu.entry import mapped_entry
@@ -26,20 +26,8 @@ PLANTS = {
     "fmu": "servobench.fmus.ur5_plant:ENTRY",
 }
 MAPPED = "fmu:"
-CONTROLLERS = {
-    "rbfnn_mfac": "servobench.controllers.rbfnn_mfac:ENTRY",
-    "rbfnn_mfac_plus": "servobench.controllers.rbfnn_mfac_plus:ENTRY",
-    "ukf_mfac": "servobench.controllers.ukf_mfac:ENTRY",
-    "ukf_mpc": "servobench.controllers.ukf_mpc:ENTRY",
-    "rbf_pid": "servobench.controllers.rbf_pid:ENTRY",
-    "constant": "servobench.controllers.constant:ENTRY",
-    "calibrated": "servobench.controllers.calibrated:ENTRY",
-    "nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY",
-    "broyden": "servobench.controllers.broyden:ENTRY",
-    "rls": "servobench.controllers.rls:ENTRY",
-    "kalman_mfac": "servobench.controllers.kalman_mfac:ENTRY",
-    "cfdl_mfac": "servobench.controllers.cfdl_mfac:ENTRY",
-}
+NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
+CONTROLLERS = (*METHODS, *NOT_COMPOSED)
 
 
 def plant_names() -> list[str]:
@@ -49,7 +37,7 @@ def plant_names() -> list[str]:
 
 def controller_names() -> list[str]:
     """Return the names of all controllers, those of this package first."""
-    return list(_points(CONTROLLER_GROUP))
+    return list(dict.fromkeys([*METHODS, *_points(CONTROLLER_GROUP)]))
 
 
 def find_plant(name: str) -> PlantEntry:
@@ -83,7 +71,7 @@ def find_controller(name: str) -> ControllerEntry:
             return compose(law, estimator)
         except ValueError as error:
             raise ConfigurationError(f"controller {name!r}: {error}") from error
-    entry = _load(CONTROLLER_GROUP, "controller", name)
+    entry = METHODS.get(name) or _load(CONTROLLER_GROUP, "controller", name)
     if not isinstance(entry, ControllerEntry):
         raise ConfigurationError(
             f"controller {name!r} is published as {type(entry).__name__}, "
@@ -94,7 +82,7 @@ def find_controller(name: str) -> ControllerEntry:
 
 @cache
 def _points(group: str) -> dict[str, EntryPoint]:
-    own = PLANTS if group == PLANT_GROUP else CONTROLLERS
+    own = PLANTS if group == PLANT_GROUP else NOT_COMPOSED
     points = {name: EntryPoint(name, value, group) for name, value in own.items()}
     for point in entry_points(group=group):
         points.setdefault(point.name, point)
@@ -105,7 +93,8 @@ def _points(group: str) -> dict[str, EntryPoint]:
 def _load(group: str, kind: str, name: str) -> object:
     points = _points(group)
     if name not in points:
-        raise ConfigurationError(f"unknown {kind} {name!r}: {suggest(name, points)}")
+        known = plant_names() if group == PLANT_GROUP else controller_names()
+        raise ConfigurationError(f"unknown {kind} {name!r}: {suggest(name, known)}")
     try:
         return points[name].load()
     except (ImportError, AttributeError) as error:

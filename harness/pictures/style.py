@@ -78,7 +78,6 @@ _STYLES = {
     "constant": MethodStyle(GREY, ":", "v"),
     "broyden": MethodStyle(PURPLE, "--", "P"),
     "rls": MethodStyle(SKY, "-.", "X"),
-    "kalman_mfac": MethodStyle(SKY, "-", "+"),
     "cfdl_mfac": MethodStyle(YELLOW, (0, (3, 1, 1, 1)), "*"),
 }
 _OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILLION, BLUE, GREEN)

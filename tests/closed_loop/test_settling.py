@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from servobench.controllers import broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rls, ukf_mfac
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig
+from servobench.controllers.methods import METHODS
 from servobench.harness.config.defaults import default_config
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
@@ -22,7 +22,7 @@ from servobench.plant.robot.ur5 import (
     nominal_ur5,
 )
 
-PRESETS = [module.ENTRY for module in (broyden, calibrated, cfdl_mfac, constant, kalman_mfac, rls, ukf_mfac)]
+PRESETS = [METHODS[name] for name in ("broyden", "calibrated", "cfdl_mfac", "constant", "rls", "ukf_mfac")]
 START = np.array([0.35, -1.69, -2.34, 0.89, 1.22, 0.0])
 GOAL = START + np.array([0.3, 0.25, 0.3, -0.2, 0.1, 0.0])
 BAND = 0.005  # m
@@ -59,12 +59,12 @@ def test_a_preset_settles_within_5_mm(entry, settings):
 
 
 def test_an_estimator_settles_where_its_first_jacobian_comes_from_probing_alone():
-    config = dataclasses.replace(default_config(ukf_mfac.ENTRY), initial=InitialConfig("probe"))
-    assert true_errors(ukf_mfac.ENTRY, config, degrees=90.0, periods=220)[-40:].max() < BAND
+    config = dataclasses.replace(default_config(METHODS["ukf_mfac"]), initial=InitialConfig("probe"))
+    assert true_errors(METHODS["ukf_mfac"], config, degrees=90.0, periods=220)[-40:].max() < BAND
 
 
 def test_an_estimator_beats_the_constant_jacobian_under_a_strongly_turned_camera():
     def periods_outside(entry):
         return int(np.sum(true_errors(entry, default_config(entry), degrees=50.0) > BAND))
 
-    assert periods_outside(ukf_mfac.ENTRY) < periods_outside(constant.ENTRY)
+    assert periods_outside(METHODS["ukf_mfac"]) < periods_outside(METHODS["constant"])

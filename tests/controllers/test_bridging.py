@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servobench.controllers.estimators.noise_level import NoiseLevel
 from servobench.controllers.laws.feature_filter import FeatureFilter
 from servobench.controllers.laws.joint_response import JointResponse
 from servobench.controllers.laws.law import scale_to_limit
 from servobench.controllers.laws.rbfnn_bridged import shifted
 from servobench.controllers.laws.redistribution import redistribute
+from servobench.controllers.noise_level import NoiseLevel
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
 

@@ -1,53 +1,31 @@
-"""Contract tests over every composed controller: any size, any finite observation, nothing remembered after reset."""
+"""Contract tests over every method: any size, any finite observation, reset, save and restore, settings.
+
+Pairs of a law and an estimator are tested along one row and one column of their table.
+"""
 
 import dataclasses
+import pickle
 
+import casadi
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servobench.controllers import (
-    broyden,
-    calibrated,
-    cfdl_mfac,
-    constant,
-    kalman_mfac,
-    rbf_pid,
-    rbfnn_mfac,
-    rbfnn_mfac_plus,
-    rls,
-    ukf_mfac,
-)
-from servobench.controllers.composed import (
-    ESTIMATORS,
-    LAWS,
-    compose,
-    servo_entry,
-)
+from servobench.controllers import nmpc_calibrated
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig
+from servobench.controllers.methods import METHODS, compose
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
 from servobench.controllers.networks.fit import train
+from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
 from servobench.harness.config.defaults import default_config
 from servobench.plant.signals import Observation, PlantSpec
 
-MODULES = (
-    broyden,
-    calibrated,
-    cfdl_mfac,
-    constant,
-    kalman_mfac,
-    rbf_pid,
-    rbfnn_mfac,
-    rbfnn_mfac_plus,
-    rls,
-    ukf_mfac,
-)
-PRESETS = [module.ENTRY for module in MODULES]
-PAIRS = [compose(law, estimator) for law in sorted(LAWS) for estimator in sorted(ESTIMATORS)]
-ENTRIES = [pytest.param(entry, id=entry.name) for entry in PRESETS + PAIRS]
+PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [compose(law, "kalman") for law in LAWS]
+COMPOSED = [pytest.param(entry, id=entry.name) for entry in dict.fromkeys([*METHODS.values(), *PAIRS])]
+ALL = [*COMPOSED, pytest.param(nmpc_calibrated.ENTRY, id="nmpc_calibrated")]
 PREVIEW = 20
 SMALL = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 
@@ -73,12 +51,13 @@ def robot(n, m, seed):
         region=(np.full(n, -1.0), np.full(n, 1.0)),
         train=train_small,
         true_jacobian=lambda q: 1.1 * A * (B * np.cos(B * q))[..., None, :],
+        true_symbolic=lambda q: casadi.mtimes(casadi.DM(1.1 * A), casadi.sin(casadi.DM(B) * q)),
     )
 
 
-def random_run(controller, spec, seed, scale, steps=12):
+def random_run(controller, spec, seed, scale, steps=12, start=True):
     """Feed random finite observations and return commands, Jacobians and diagnostics."""
-    rng, told = np.random.default_rng(seed), []
+    rng, found = np.random.default_rng(seed), []
     for k in range(steps):
         observation = Observation(
             k * spec.period,
@@ -86,15 +65,15 @@ def random_run(controller, spec, seed, scale, steps=12):
             rng.normal(scale=scale, size=spec.m),
             bool(rng.random() < 0.8),
         )
-        if k == 0:
+        if k == 0 and start:
             controller.reset(observation, 0)
         reference = rng.normal(scale=scale, size=(1 + PREVIEW, spec.m))
         u = controller.step(observation, reference).joint_velocity
-        told.append((u, controller.estimated_jacobian(), dict(controller.diagnostics())))
-    return told
+        found.append((u, controller.estimated_jacobian(), dict(controller.diagnostics())))
+    return found
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
+@pytest.mark.parametrize("entry", ALL)
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-3, 6))
 def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n, m, seed, exponent):
@@ -107,8 +86,8 @@ def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n,
         assert all(isinstance(value, float) for value in diagnostics.values())
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
 @pytest.mark.parametrize("source", ["nominal", "probe"])
+@pytest.mark.parametrize("entry", COMPOSED)
 def test_reset_forgets_everything(entry, source):
     knowledge = robot(5, 3, 7)
     initial = InitialConfig(source=source, probe_step=1e-3, settle_periods=1, average_periods=1)
@@ -119,11 +98,22 @@ def test_reset_forgets_everything(entry, source):
     np.testing.assert_equal(random_run(controller, knowledge.spec, 1, 0.5, steps), first)
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
-def test_estimator_law_and_servo_tell_different_things(entry):
+@pytest.mark.parametrize("entry", ALL)
+def test_a_restored_controller_goes_on_as_the_saved_one_did(entry):
+    knowledge = robot(6, 3, 9)
+    controller = entry.build(default_config(entry), knowledge)
+    random_run(controller, knowledge.spec, 1, 0.5, steps=7)
+    saved = controller.save()
+    expected = random_run(controller, knowledge.spec, 2, 0.5, start=False)
+    for _ in range(2):  # restoring does not use the saved state up
+        controller.restore(saved)
+        np.testing.assert_equal(random_run(controller, knowledge.spec, 2, 0.5, start=False), expected)
+
+
+@pytest.mark.parametrize("entry", COMPOSED)
+def test_estimator_law_and_servo_report_different_things(entry):
     knowledge = robot(4, 2, 3)
-    settings_, names = default_config(entry), ["probing", "jacobian_prediction_error"]
-    controller = entry.build(settings_, knowledge)
+    controller, names = entry.build(default_config(entry), knowledge), ["probing", "jacobian_prediction_error"]
     (_, _, merged), *_ = random_run(controller, knowledge.spec, 3, 0.5)
     assert isinstance(controller, ServoController)
     for part in (controller.estimator, controller.law):
@@ -131,33 +121,43 @@ def test_estimator_law_and_servo_tell_different_things(entry):
     assert sorted(names) == sorted(merged)
 
 
-def test_only_the_calibrated_controller_is_told_the_truth():
-    assert [entry.name for entry in PRESETS if entry.needs_truth] == ["calibrated"]
+@pytest.mark.parametrize("entry", ALL)
+def test_settings_can_be_pickled(entry):
+    assert pickle.loads(pickle.dumps(default_config(entry))) == default_config(entry)
+
+
+def test_only_the_calibrated_method_needs_the_truth():
+    assert [name for name, entry in METHODS.items() if entry.needs_truth] == ["calibrated"]
     assert compose("mfac", "true").needs_truth
     knowledge = dataclasses.replace(robot(3, 2, 0), true_jacobian=None)
     with pytest.raises(ValueError, match="true_jacobian must be known"):
-        calibrated.ENTRY.build(calibrated.CalibratedConfig(), knowledge)
+        METHODS["calibrated"].build(METHODS["calibrated"].config(), knowledge)
 
 
-def test_the_kalman_preset_commands_what_the_unscented_one_does():
+def test_the_kalman_filter_commands_what_the_unscented_one_does():
     knowledge = robot(6, 3, 11)
     runs = [
-        random_run(entry.build(default_config(entry), knowledge), knowledge.spec, 5, 0.5, steps=60)
-        for entry in (ukf_mfac.ENTRY, kalman_mfac.ENTRY)
+        random_run(entry.build(entry.config(), knowledge), knowledge.spec, 5, 0.5, steps=60)
+        for entry in (METHODS["ukf_mfac"], compose("mfac", "kalman"))
     ]
     for (u, J, _), (u_kalman, J_kalman, _) in zip(*runs, strict=True):
         np.testing.assert_allclose(u, u_kalman, atol=1e-9)
         np.testing.assert_allclose(J, J_kalman, atol=1e-9)
 
 
-def test_composing_the_same_pair_twice_gives_the_same_entry():
-    assert compose("pid", "rls") is compose("pid", "rls")
+def test_a_row_of_the_table_may_change_defaults_of_its_law():
+    assert METHODS["calibrated"].config().law.feedforward
+    assert not compose("pid", "true").config().law.feedforward
+
+
+def test_a_pair_is_called_by_its_parts_and_has_a_training_only_with_networks():
     assert compose("pid", "rls").name == "pid+rls"
-    assert [f.name for f in dataclasses.fields(compose("pid", "rls").config)] == ["estimator", "law", "initial"]
+    assert [f.name for f in dataclasses.fields(compose("pid", "rls").config())] == ["estimator", "law", "initial"]
+    assert hasattr(compose("pid", "rbf").config(), "training")
 
 
 def test_an_unknown_part_is_refused_with_the_valid_choices():
     with pytest.raises(ValueError, match=r"law must be one of .*mfac.*pid.*, got 'lqr'"):
         compose("lqr", "rls")
     with pytest.raises(ValueError, match=r"estimator must be one of .*ukf, got 'ekf'"):
-        servo_entry("x", "y", ukf_mfac.UkfMfacConfig, law="pid", estimator="ekf")
+        compose("pid", "ekf")

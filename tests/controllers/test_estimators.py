@@ -13,7 +13,7 @@ from servobench.controllers.estimators.kalman import (
     measurement_matrix,
     split_update,
 )
-from servobench.controllers.estimators.true import TrueEstimator
+from servobench.controllers.estimators.true import TrueConfig, TrueEstimator
 from servobench.controllers.estimators.ukf import (
     UkfConfig,
     UkfEstimator,
@@ -154,11 +154,11 @@ def test_the_constant_estimator_keeps_the_first_jacobian():
 
 def test_the_true_estimator_answers_with_the_truth_where_the_arm_is():
     spec = PlantSpec(("a", "b"), ("y",), np.ones(2), -np.ones(2), np.ones(2), 0.05)
-    estimator = TrueEstimator(RobotKnowledge(spec, 0, true_jacobian=lambda q: q[None, :] ** 2))
+    estimator = TrueEstimator(TrueConfig(), RobotKnowledge(spec, 0, true_jacobian=lambda q: q[None, :] ** 2))
     estimator.reset(np.zeros((1, 2)))
     np.testing.assert_array_equal(estimator.jacobian(np.array([2.0, 3.0])), [[4.0, 9.0]])
     with pytest.raises(ValueError, match="true_jacobian must be known"):
-        TrueEstimator(RobotKnowledge(spec, 0))
+        TrueEstimator(TrueConfig(), RobotKnowledge(spec, 0))
 
 
 @pytest.mark.parametrize("config", [KalmanConfig, UkfConfig])

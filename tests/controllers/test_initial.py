@@ -1,11 +1,13 @@
 """Tests of the providers of the first Jacobian, alone and inside a controller on the kinematic plant."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from servobench.controllers.composed import compose
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.methods import compose
 from servobench.plant.faults import ControllerDiverged
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
@@ -80,7 +82,9 @@ def test_a_joint_that_does_not_move_is_a_named_fault():
 
 def test_a_controller_says_that_it_probes_and_servoes_afterwards():
     entry, plant = compose("mfac", "kalman"), kinematic()
-    controller = entry.build(entry.config(initial=InitialConfig(source="probe")), RobotKnowledge(plant.spec, 0))
+    controller = entry.build(
+        replace(entry.config(), initial=InitialConfig(source="probe")), RobotKnowledge(plant.spec, 0)
+    )
     observation = plant.reset(1)
     controller.reset(observation, 1)
     goal, probing = plant.truth().feature + 0.1, []

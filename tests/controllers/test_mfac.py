@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw, mfac_step
 from servobench.plant.signals import Observation, PlantSpec
 
@@ -36,27 +37,27 @@ def test_with_the_exact_jacobian_and_no_weight_an_affine_plant_arrives_in_one_st
     rng = np.random.default_rng(2)
     J, y = rng.normal(size=(3, 6)), rng.normal(size=3)
     law, ref = fresh(6, 3, step_factor=1.0, step_weight=1e-13), rng.normal(size=(2, 3))
-    u = law.command(J, Observation(0.0, np.zeros(6), y), ref)
+    u = law.command(Estimate(J), Observation(0.0, np.zeros(6), y), ref)
     np.testing.assert_allclose(y + J @ u * 0.05, ref[0], atol=1e-10)
 
 
 def test_the_first_step_equals_the_one_computed_by_hand():
     law = fresh(1, 1, step_factor=0.5, step_weight=0.75)
     # dq = 0.5 · 0.5 · 0.1 / (0.75 + 0.25) = 0.025, u = dq / 0.05
-    u = law.command(np.array([[0.5]]), Observation(0.0, np.zeros(1), np.zeros(1)), np.full((2, 1), 0.1))
+    u = law.command(Estimate(np.array([[0.5]])), Observation(0.0, np.zeros(1), np.zeros(1)), np.full((2, 1), 0.1))
     np.testing.assert_allclose(u, [0.5], rtol=1e-14)
 
 
 def test_feedforward_adds_the_next_step_of_the_reference():
     law = fresh(1, 1, step_factor=0.5, step_weight=0.75, feedforward=True)
     # dq = (0.5 · 0.1 + 0.02) · 0.5 / (0.75 + 0.25) = 0.035
-    u = law.command(np.array([[0.5]]), Observation(0.0, np.zeros(1), np.zeros(1)), np.array([[0.1], [0.12]]))
+    u = law.command(Estimate(np.array([[0.5]])), Observation(0.0, np.zeros(1), np.zeros(1)), np.array([[0.1], [0.12]]))
     np.testing.assert_allclose(u, [0.7], rtol=1e-13)
 
 
 def test_the_command_keeps_the_limit_and_says_so():
     law = fresh(2, 1, limit=0.1)
-    u = law.command(np.array([[1.0, 0.5]]), Observation(0.0, np.zeros(2), np.zeros(1)), np.ones((2, 1)))
+    u = law.command(Estimate(np.array([[1.0, 0.5]])), Observation(0.0, np.zeros(2), np.zeros(1)), np.ones((2, 1)))
     np.testing.assert_allclose(u, [0.1, 0.05])
     assert law.diagnostics()["saturated"] == 1.0
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servobench.controllers import ukf_mpc
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.closed_form import (
     constant_step,
     free_moves,
@@ -18,6 +18,7 @@ from servobench.controllers.laws.mpc.closed_form import (
 from servobench.controllers.laws.mpc.limits import LimitedProgram
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
+from servobench.controllers.methods import METHODS
 from servobench.plant.faults import SolverFailed
 from servobench.plant.signals import Observation, PlantSpec
 
@@ -83,7 +84,7 @@ def test_first_step_of_the_constant_mode_by_hand():
     # One joint, J = 1, α = 1, H = 2: a = 8/3, b = 2, c = ∫ τ e^{−τ} dτ = 1 − 3 e^{−2}; with q = 1/3 dq = (b − c) e / 3.
     spec = make_spec(1, 1, speed=10.0)
     law = make_law(spec, mode="constant", horizon=2, rho=1.0, move_weight=1 / 3)
-    velocity = law.command(np.array([[1.0]]), observe(spec), hold([0.3]))
+    velocity = law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.3]))
     np.testing.assert_allclose(velocity, [(1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0 / PERIOD], rtol=1e-9)
 
 
@@ -91,7 +92,7 @@ def test_first_step_of_free_moves_by_hand():
     # H = 1, J = 2, q = 1, β = ½: min ½ (0.5·0.2 − 2 dq)² + ½ dq², so dq = 2·0.1 / (4 + 1) = 0.04.
     spec = make_spec(1, 1)
     law = make_law(spec, horizon=1, rho=math.log(2.0), move_weight=1.0)
-    velocity = law.command(np.array([[2.0]]), observe(spec), hold([0.2]))
+    velocity = law.command(Estimate(np.array([[2.0]])), observe(spec), hold([0.2]))
     np.testing.assert_allclose(velocity, [0.04 / PERIOD], rtol=1e-9)
 
 
@@ -103,7 +104,7 @@ def test_constant_mode_without_active_limits_is_equation_46(seed, solver):
     J, e = random_jacobian(seed), np.random.default_rng(seed + 9).normal(scale=0.2, size=3)
     abc = horizon_integrals(10, 0.9, MpcConfig.rho)
     printed = np.linalg.pinv(abc.a * J + np.linalg.pinv(J.T) * 0.5) @ ((abc.b - abc.c) * e)
-    np.testing.assert_allclose(law.command(J, observe(spec), hold(e)) * PERIOD, printed, atol=1e-8)
+    np.testing.assert_allclose(law.command(Estimate(J), observe(spec), hold(e)) * PERIOD, printed, atol=1e-8)
 
 
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
@@ -186,10 +187,10 @@ def test_position_rows_out_of_reach_change_nothing(constant, travel):
 def test_the_preset_starts_as_the_law_on_the_nominal_jacobian():
     J, spec = random_jacobian(5), make_spec()
     knowledge = RobotKnowledge(spec, 20, nominal_jacobian=lambda q: J)
-    controller = ukf_mpc.ENTRY.build(ukf_mpc.UkfMpcConfig(), knowledge)
+    controller = METHODS["ukf_mpc"].build(METHODS["ukf_mpc"].config(), knowledge)
     controller.reset(observe(spec), 0)
     command = controller.step(observe(spec), hold([0.2, 0.1, -0.1]))
-    expected = make_law(spec).command(J, observe(spec), hold([0.2, 0.1, -0.1]))
+    expected = make_law(spec).command(Estimate(J), observe(spec), hold([0.2, 0.1, -0.1]))
     np.testing.assert_array_equal(command.joint_velocity, expected)
     assert controller.diagnostics()["solver_success"] == 1.0
 
@@ -209,9 +210,9 @@ def test_a_moving_reference_is_met_with_the_feedforward_of_its_preview():
     J = np.eye(2)
     for mode in ("moves", "constant"):
         law = make_law(spec, mode=mode, move_weight=1e-9)
-        np.testing.assert_allclose(law.command(J, observe(spec), ramp) * PERIOD, [0.01, -0.02], rtol=1e-6)
+        np.testing.assert_allclose(law.command(Estimate(J), observe(spec), ramp) * PERIOD, [0.01, -0.02], rtol=1e-6)
     held = make_law(spec, preview=0, use_preview=False)
-    np.testing.assert_allclose(held.command(J, observe(spec), ramp[:1]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(held.command(Estimate(J), observe(spec), ramp[:1]), 0.0, atol=1e-12)
 
 
 def test_commands_already_sent_bridge_the_delay():
@@ -221,7 +222,7 @@ def test_commands_already_sent_bridge_the_delay():
     q, queue, errors = np.zeros(2), [np.zeros(2)] * 2, []
     for _ in range(8):
         errors.append(np.array([0.3, -0.2]) - q)
-        queue.append(law.command(np.eye(2), observe(spec, q, q), hold([0.3, -0.2])) * PERIOD)
+        queue.append(law.command(Estimate(np.eye(2)), observe(spec, q, q), hold([0.3, -0.2])) * PERIOD)
         q = q + queue.pop(0)
     for k in range(2, 7):
         np.testing.assert_allclose(errors[k + 1], np.exp(-0.5) * errors[k], rtol=1e-6)
@@ -233,7 +234,7 @@ def test_acceleration_is_limited_between_commands():
     J = random_jacobian(3)
     last = np.zeros(6)
     for target in ([0.5, 0.5, 0.5], [0.5, 0.5, 0.5], [-0.5, 0.5, 0.0], [-0.5, 0.0, 0.0]):
-        velocity = law.command(J, observe(spec), hold(target))
+        velocity = law.command(Estimate(J), observe(spec), hold(target))
         assert np.abs(velocity - last).max() <= 2.0 * PERIOD + 1e-8
         last = velocity
     assert law.diagnostics()["active_limits"] > 0
@@ -244,14 +245,14 @@ def test_acceleration_is_limited_between_commands():
 def test_position_limits_are_kept_and_an_arm_outside_may_return(mode):
     spec = make_spec(1, 1, reach=1.0)
     law = make_law(spec, mode=mode)
-    near = law.command(np.array([[1.0]]), observe(spec, np.array([0.99])), hold([5.0]))
+    near = law.command(Estimate(np.array([[1.0]])), observe(spec, np.array([0.99])), hold([5.0]))
     assert 0.0 < near[0] <= 0.01 / PERIOD + 1e-7
     outside = observe(spec, np.array([1.2]))
-    assert law.command(np.array([[1.0]]), outside, hold([5.0]))[0] == pytest.approx(0.0, abs=1e-7)
-    assert law.command(np.array([[1.0]]), outside, hold([-5.0]))[0] < -0.1
+    assert law.command(Estimate(np.array([[1.0]])), outside, hold([5.0]))[0] == pytest.approx(0.0, abs=1e-7)
+    assert law.command(Estimate(np.array([[1.0]])), outside, hold([-5.0]))[0] < -0.1
     assert law.diagnostics()["solver_success"] == 1.0
     free = make_law(spec, mode=mode, limit_position=False)
-    assert free.command(np.array([[1.0]]), outside, hold([5.0]))[0] > 0.1
+    assert free.command(Estimate(np.array([[1.0]])), outside, hold([5.0]))[0] > 0.1
 
 
 @pytest.mark.parametrize("mode", ["moves", "constant"])
@@ -260,14 +261,14 @@ def test_the_predicted_feature_stays_in_the_pyramid_of_view(mode):
     settings = {"mode": mode, "view_tangent": (0.5, 0.4), "rho": 3.0, "horizon": 4}
     law = make_law(spec, **settings)
     y = np.array([0.46, 0.0, 1.0])
-    velocity = law.command(np.eye(3), observe(spec, feature=y), hold([0.9, 0.0, 1.0]))
+    velocity = law.command(Estimate(np.eye(3)), observe(spec, feature=y), hold([0.9, 0.0, 1.0]))
     reached = y + velocity * PERIOD
     assert reached[0] <= 0.5 * reached[2] + 1e-8
     assert law.diagnostics()["active_limits"] > 0
     unlimited = make_law(spec, **{**settings, "view_tangent": ()})
-    reached = y + unlimited.command(np.eye(3), observe(spec, feature=y), hold([0.9, 0.0, 1.0])) * PERIOD
+    reached = y + unlimited.command(Estimate(np.eye(3)), observe(spec, feature=y), hold([0.9, 0.0, 1.0])) * PERIOD
     assert reached[0] > 0.5 * reached[2] + 1e-3 or mode == "constant"
-    back = law.command(np.eye(3), observe(spec, feature=[0.6, 0.0, 1.0]), hold([0.0, 0.0, 1.0]))
+    back = law.command(Estimate(np.eye(3)), observe(spec, feature=[0.6, 0.0, 1.0]), hold([0.0, 0.0, 1.0]))
     assert back[0] < 0.0
 
 
@@ -278,7 +279,7 @@ def infeasible(fallback, mode="moves"):
     law = make_law(spec, **config)
     J = np.eye(2)
     for _ in range(40):
-        law.command(J, observe(spec, [-0.9, 0.0], [-0.9, 0.0]), hold([5.0, 0.0]))
+        law.command(Estimate(J), observe(spec, [-0.9, 0.0], [-0.9, 0.0]), hold([5.0, 0.0]))
     assert law.diagnostics()["fallbacks"] == 0
     return law, J, observe(spec, [0.99, 0.0], [0.99, 0.0]), hold([5.0, 0.0])
 
@@ -287,20 +288,20 @@ def infeasible(fallback, mode="moves"):
 def test_without_a_solution_the_arm_holds_and_it_is_counted(mode):
     law, J, observation, reference = infeasible("hold", mode)
     for count in (1, 1):
-        np.testing.assert_array_equal(law.command(J, observation, reference), 0.0)
+        np.testing.assert_array_equal(law.command(Estimate(J), observation, reference), 0.0)
         diagnostics = law.diagnostics()
         assert diagnostics["fallbacks"] == count
         assert diagnostics["solver_success"] == 0.0
         assert math.isnan(diagnostics["objective"])
         law.reset(observation)
-        assert law.command(J, observation, reference).any()
+        assert law.command(Estimate(J), observation, reference).any()
         law, J, observation, reference = infeasible("hold", mode)
 
 
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 def test_without_a_solution_the_closed_form_is_scaled_to_the_speed_limit(mode):
     law, J, observation, reference = infeasible("closed_form", mode)
-    velocity = law.command(J, observation, reference)
+    velocity = law.command(Estimate(J), observation, reference)
     assert law.diagnostics()["fallbacks"] == 1
     assert velocity[0] == pytest.approx(1.0)  # 4 m away: the limit binds, the direction stays
     assert abs(velocity[1]) < 1e-6
@@ -309,7 +310,7 @@ def test_without_a_solution_the_closed_form_is_scaled_to_the_speed_limit(mode):
 def test_without_a_solution_and_fallback_it_is_a_named_failure():
     law, J, observation, reference = infeasible("raise")
     with pytest.raises(SolverFailed, match="daqp found no solution within the limits"):
-        law.command(J, observation, reference)
+        law.command(Estimate(J), observation, reference)
     assert SolverFailed.status == "solver_failed"
 
 
@@ -318,11 +319,11 @@ def test_reset_forgets_everything_bit_for_bit(solver):
     spec = make_spec()
     law, fresh = (make_law(spec, solver=solver, joint_acceleration_limit=3.0, delay_periods=2) for _ in range(2))
     for k in range(5):
-        law.command(random_jacobian(k), observe(spec), hold([1.0, k, -0.3]))
+        law.command(Estimate(random_jacobian(k)), observe(spec), hold([1.0, k, -0.3]))
     law.reset(observe(spec))
     assert law.diagnostics() == {}
     for k in range(5):
-        arguments = (random_jacobian(k + 9), observe(spec), hold([0.2, -0.1, 0.3 * k]))
+        arguments = (Estimate(random_jacobian(k + 9)), observe(spec), hold([0.2, -0.1, 0.3 * k]))
         np.testing.assert_array_equal(law.command(*arguments), fresh.command(*arguments))
 
 
@@ -337,7 +338,7 @@ def test_commands_are_finite_and_within_the_limits_for_any_size(n, m, mode, seed
     scale = 10.0 ** rng.uniform(-6, 3)
     for _ in range(3):
         observation = observe(spec, rng.uniform(-7.0, 7.0, n), scale * rng.normal(size=m))
-        velocity = law.command(rng.normal(size=(m, n)), observation, scale * rng.normal(size=(21, m)))
+        velocity = law.command(Estimate(rng.normal(size=(m, n))), observation, scale * rng.normal(size=(21, m)))
         assert np.isfinite(velocity).all()
         assert (np.abs(velocity) <= spec.joint_velocity_limit).all()
 
@@ -346,14 +347,14 @@ def test_a_jacobian_of_zeros_asks_for_nothing():
     spec = make_spec()
     for mode in ("moves", "constant"):
         np.testing.assert_allclose(
-            make_law(spec, mode=mode).command(np.zeros((3, 6)), observe(spec), hold([1, 2, 3])), 0
+            make_law(spec, mode=mode).command(Estimate(np.zeros((3, 6))), observe(spec), hold([1, 2, 3])), 0
         )
 
 
 def test_diagnostics_tell_the_predicted_error_of_the_plan():
     spec = make_spec(1, 1, speed=100.0)
     law = make_law(spec, horizon=3, rho=0.4, move_weight=1e-10)
-    law.command(np.array([[1.0]]), observe(spec), hold([0.5]))
+    law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.5]))
     diagnostics = law.diagnostics()
     assert diagnostics["predicted_terminal_error"] == pytest.approx(np.exp(-1.2) * 0.5, rel=1e-6)
     assert diagnostics["objective"] == pytest.approx(0.0, abs=1e-9)

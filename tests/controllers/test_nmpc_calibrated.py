@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.nmpc_calibrated import ENTRY, NmpcCalibrated, NmpcCalibratedConfig
 from servobench.plant.faults import SolverFailed
@@ -61,7 +62,7 @@ def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
     for k in range(10):
         reference = offset + rng.normal(scale=0.02, size=(13, 2)) + [0.3, -0.2]
         observation = Observation(0.05 * k, q, J @ q + offset)
-        linear = law.command(J, observation, reference)
+        linear = law.command(Estimate(J), observation, reference)
         np.testing.assert_allclose(controller.step(observation, reference).joint_velocity, linear, atol=1e-7)
         q = q + 0.05 * linear
 

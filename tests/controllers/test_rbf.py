@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kit.toy import KNOWLEDGE, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.rbf import (
     RbfConfig,
@@ -14,6 +15,10 @@ from servobench.controllers.estimators.rbf import (
     window_step,
 )
 from servobench.controllers.networks.rbf import JacobianNetwork, jacobian_features
+
+
+def started(config, net):
+    return RbfEstimator(config, KNOWLEDGE, only_jacobian(net))
 
 
 def network(n=3, m=2, units=4, seed=0):
@@ -86,7 +91,7 @@ def test_matrices_and_plain_loops_give_the_same_update():
 
 def test_the_first_update_equals_the_one_computed_by_hand():
     net = JacobianNetwork(np.zeros((1, 1, 1)), np.ones((1, 1)), np.full((1, 1, 1), 2.0))
-    estimator = RbfEstimator(RbfConfig(window=4, k2=0.5, epsilon=0.01), net)
+    estimator = started(RbfConfig(window=4, k2=0.5, epsilon=0.01), net)
     # θ(0) = 1, Ĵ = 2, error 0.5 − 2 · 0.1 = 0.3, α₂ = 0.5 / (0.01 + 0.01) = 25, W = 2 + 25 · 0.3 · 0.1
     estimator.update(motion([0.0], [0.1], [0.5]))
     np.testing.assert_allclose(estimator.weights, [[[2.75]]], atol=1e-14)
@@ -99,7 +104,7 @@ def test_the_first_update_equals_the_one_computed_by_hand():
 def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
     true, rng = network(seed=5), np.random.default_rng(6)
     start = JacobianNetwork(true.centres, true.widths, true.weights + rng.normal(size=true.weights.shape))
-    estimator = RbfEstimator(RbfConfig(window=1, k2=k2, epsilon=0.0), start)
+    estimator = started(RbfConfig(window=1, k2=k2, epsilon=0.0), start)
     V = np.sum((estimator.weights - true.weights) ** 2)
     first = V
     for _ in range(200):
@@ -124,7 +129,7 @@ def test_beyond_a_step_size_of_two_the_weights_do_move_away():
 def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
     moved = []
     for epsilon in (0.0, 1e-3):
-        estimator = RbfEstimator(RbfConfig(epsilon=epsilon), network())
+        estimator = started(RbfConfig(epsilon=epsilon), network())
         rng = np.random.default_rng(8)
         for _ in range(30):
             estimator.update(motion(np.zeros(3), 1e-5 * rng.normal(size=3), 1e-3 * rng.normal(size=2)))
@@ -133,7 +138,7 @@ def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
 
 
 def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
-    estimator = RbfEstimator(RbfConfig(epsilon=0.0), network())
+    estimator = started(RbfConfig(epsilon=0.0), network())
     estimator.update(motion(np.zeros(3), np.zeros(3), [1e-3, 0.0]))
     np.testing.assert_array_equal(estimator.weights, network().weights)
 
@@ -141,7 +146,7 @@ def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
 def test_only_the_last_motions_of_the_window_count():
     net, rng = network(), np.random.default_rng(9)
     motions = [motion(rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)) for _ in range(5)]
-    estimator = RbfEstimator(RbfConfig(window=2), net)
+    estimator = started(RbfConfig(window=2), net)
     for each in motions[:-1]:
         estimator.update(each)
     weights = estimator.weights
@@ -156,7 +161,7 @@ def test_only_the_last_motions_of_the_window_count():
 
 def test_reset_restores_the_offline_network_whatever_the_initial_jacobian():
     net = network()
-    estimator = RbfEstimator(RbfConfig(), net)
+    estimator = started(RbfConfig(), net)
     estimator.update(motion(np.zeros(3), np.ones(3), np.ones(2)))
     estimator.reset(np.full((2, 3), 7.0))
     np.testing.assert_array_equal(estimator.weights, net.weights)
@@ -166,7 +171,10 @@ def test_reset_restores_the_offline_network_whatever_the_initial_jacobian():
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 10**6), exponent=st.integers(-6, 3))
 def test_the_jacobian_stays_finite_for_any_sizes_and_motions(n, m, seed, exponent):
-    estimator, rng = RbfEstimator(RbfConfig(), network(n, m, seed=seed)), np.random.default_rng(seed)
+    estimator, rng = (
+        started(RbfConfig(), network(n, m, seed=seed)),
+        np.random.default_rng(seed),
+    )
     scale = 10.0**exponent
     for _ in range(12):
         estimator.update(motion(rng.normal(size=n), scale * rng.normal(size=n), rng.normal(size=m)))
@@ -184,4 +192,4 @@ def test_bad_settings_and_sizes_are_refused():
     with pytest.raises(ValueError, match="epsilon must be at least 0"):
         RbfConfig(epsilon=-1e-9)
     with pytest.raises(ValueError, match=r"jacobian must have shape \(2, 3\), got \(3, 6\)"):
-        RbfEstimator(RbfConfig(), network()).reset(np.zeros((3, 6)))
+        started(RbfConfig(), network()).reset(np.zeros((3, 6)))

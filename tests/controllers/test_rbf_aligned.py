@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kit.toy import KNOWLEDGE, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
@@ -21,7 +22,7 @@ def network(seed=0, units=6):
 
 
 def estimator(net=None, **config):
-    made = RbfAlignedEstimator(RbfAlignedConfig(**config), network() if net is None else net, PERIOD)
+    made = RbfAlignedEstimator(RbfAlignedConfig(**config), KNOWLEDGE, only_jacobian(network() if net is None else net))
     made.reset(np.zeros((M, N)))
     return made
 
@@ -52,7 +53,7 @@ def test_the_delay_and_the_map_of_clean_data_are_found(delay, turn):
     net, q = network(), path(60)
     made = estimator(net)
     feed(made, q, features(net, q, turn, delay))
-    assert made.delay() == delay
+    assert made.estimate(np.zeros(N)).delay == delay
     np.testing.assert_allclose(made.map, turn, atol=0.02)
     np.testing.assert_allclose(made.jacobian(q[-1]), turn @ net.jacobian(q[-1]), atol=0.02)
 
@@ -62,7 +63,7 @@ def test_the_delay_is_found_within_a_few_motions_and_in_noise():
     for seed in range(20):
         made, noise = estimator(net), np.random.default_rng(seed).normal(scale=0.001, size=(13, M))
         feed(made, q, features(net, q, TURN, 2) + noise)
-        found.append(made.delay())
+        found.append(made.estimate(np.zeros(N)).delay)
     assert found.count(2) >= 19
 
 
@@ -77,7 +78,7 @@ def test_on_a_steady_circle_the_delay_is_kept_as_its_beginning_told_it(forgettin
     made, delays = estimator(net, forgetting=forgetting, learn=False), []
     for k in range(400):
         feed(made, q[k : k + 2], y[k : k + 2])
-        delays.append(made.delay())
+        delays.append(made.estimate(np.zeros(N)).delay)
     assert (set(delays[30:]) == {1}) == kept
 
 
@@ -85,7 +86,7 @@ def test_lost_frames_do_not_mislead_map_and_delay():
     net, q = network(), path(120)
     made = estimator(net)
     feed(made, q, features(net, q, TURN, 2), every=2)
-    assert made.delay() == 2
+    assert made.estimate(np.zeros(N)).delay == 2
     np.testing.assert_allclose(made.map, TURN, atol=0.05)
 
 
@@ -142,7 +143,7 @@ def test_with_all_additions_off_it_is_the_estimator_of_the_paper():
     net, q = network(), path(50)
     y = features(net, q, TURN, 0)
     off = estimator(net, window=8, epsilon=1e-3, align=False, find_delay=False, detect_moves=False, find_noise=False)
-    plain = RbfEstimator(RbfConfig(), net)
+    plain = RbfEstimator(RbfConfig(), KNOWLEDGE, only_jacobian(net))
     plain.reset(np.zeros((M, N)))
     feed(off, q, y)
     feed(plain, q, y)
@@ -154,7 +155,7 @@ def test_without_the_map_the_delay_is_still_found():
     net, q = network(), path(40)
     made = estimator(net, align=False)
     feed(made, q, features(net, q, np.eye(M), 3))
-    assert made.delay() == 3
+    assert made.estimate(np.zeros(N)).delay == 3
     np.testing.assert_array_equal(made.map, np.eye(M))
 
 

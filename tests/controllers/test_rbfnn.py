@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kit.toy import only_controller
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import scale_to_limit
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.laws.roll_out import (
@@ -19,6 +21,8 @@ from servobench.controllers.networks.rbf import ControllerNetwork, controller_ou
 from servobench.plant.signals import Observation, PlantSpec
 
 PREVIEW, PERIOD = 10, 0.05
+
+ONES = Estimate(np.ones((2, 3)))
 
 
 def network(n=3, m=2, hidden=4, error_history=1, position_history=1, seed=0):
@@ -37,7 +41,7 @@ def knowledge(n=3, m=2, limit=1e6, preview=PREVIEW):
 
 
 def law(net, limit=1e6, preview=PREVIEW, **config):
-    made = RbfnnLaw(RbfnnConfig(**config), net, knowledge(net.n, net.m, limit, preview))
+    made = RbfnnLaw(RbfnnConfig(**config), knowledge(net.n, net.m, limit, preview), only_controller(net))
     made.reset(seen(np.zeros(net.n), np.zeros(net.m)))
     return made
 
@@ -125,7 +129,7 @@ def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself(k, row_
     made = law(net, horizon=1, k=k, epsilon=0.0, row_space_only=row_space_only)
     xi = information_vector((ref - y)[None], q[None])
     before = ref - y - J @ (net.command(xi) - q)
-    u = made.command(J, seen(q, y), np.tile(ref, (PREVIEW + 1, 1)))
+    u = made.command(Estimate(J), seen(q, y), np.tile(ref, (PREVIEW + 1, 1)))
     after = ref - y - J @ u * PERIOD
     assert after @ before / (before @ before) == pytest.approx(1.0 - k, abs=1e-10)
     assert made.diagnostics()["predicted_error"] == pytest.approx(np.linalg.norm(before))
@@ -135,12 +139,12 @@ def test_the_first_step_equals_the_one_computed_by_hand():
     # ξ = [e, q] = [0.4, 1], h = exp(−0) = 1 with the centre on ξ; ψ = [0.5, 1]: q_cmd = 1.2, e(k+1) = 0.4 − 2 · 0.2 = 0
     net = ControllerNetwork(np.array([[0.4, 1.0]]), np.ones(1), np.array([[[0.5], [1.0]]]), 1, 1)
     u = law(net, horizon=1, k=0.5, epsilon=0.0).command(
-        np.array([[2.0]]), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
+        Estimate(np.array([[2.0]])), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
     )
     np.testing.assert_allclose(u, [0.2 / PERIOD], rtol=1e-12)
     # with Ĵ = 1: e(k+1) = 0.2, G = 0.2 · [0.4, 1], α = 0.5 · 0.04 / 0.0464, dq = 0.2 + α · 0.2 · 1.16 = 0.3
     u = law(net, horizon=1, k=0.5, epsilon=0.0).command(
-        np.array([[1.0]]), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
+        Estimate(np.array([[1.0]])), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4)
     )
     np.testing.assert_allclose(u, [0.3 / PERIOD], rtol=1e-12)
 
@@ -150,9 +154,9 @@ def null_motion(row_space_only):
     made, rng = law(network(), row_space_only=row_space_only), np.random.default_rng(6)
     J, J_later = rng.normal(size=(2, 2, 3))
     for _ in range(20):
-        made.command(J, seen(np.zeros(3) + 0.5, np.zeros(2)), np.ones((PREVIEW + 1, 2)))
-    before = law(network()).command(J_later, seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2)))
-    u = made.command(J_later, seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))) - before
+        made.command(Estimate(J), seen(np.zeros(3) + 0.5, np.zeros(2)), np.ones((PREVIEW + 1, 2)))
+    before = law(network()).command(Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2)))
+    u = made.command(Estimate(J_later), seen(np.zeros(3) + 0.5, np.ones(2)), np.ones((PREVIEW + 1, 2))) - before
     return np.linalg.norm(u - np.linalg.pinv(J_later) @ J_later @ u)
 
 
@@ -164,7 +168,7 @@ def test_without_the_projection_what_was_learned_leaks_into_the_null_space():
 def run_affine(made, J, y_ref, steps, limit=np.inf):
     q, y, worst = np.zeros(J.shape[1]), np.zeros(J.shape[0]), 0.0
     for _ in range(steps):
-        u = made.command(J, seen(q, y), np.tile(y_ref, (PREVIEW + 1, 1)))
+        u = made.command(Estimate(J), seen(q, y), np.tile(y_ref, (PREVIEW + 1, 1)))
         assert np.isfinite(u).all()
         assert (np.abs(u) <= limit * (1 + 1e-12)).all()
         q, y = q + u * PERIOD, y + J @ u * PERIOD
@@ -191,7 +195,7 @@ def test_anti_windup_lessens_the_overshoot_of_a_limited_loop():
 
 def test_a_lost_feature_teaches_nothing():
     made = law(network())
-    u = made.command(np.ones((2, 3)), seen(np.zeros(3), np.zeros(2), valid=False), np.ones((PREVIEW + 1, 2)))
+    u = made.command(ONES, seen(np.zeros(3), np.zeros(2), valid=False), np.ones((PREVIEW + 1, 2)))
     np.testing.assert_array_equal(made.weights, network().weights)
     assert made.diagnostics()["step_size"] == 0.0
     assert np.isfinite(u).all()
@@ -199,7 +203,7 @@ def test_a_lost_feature_teaches_nothing():
 
 def without_preview():
     net = network()
-    made = RbfnnLaw(RbfnnConfig(preview=False), net, knowledge(preview=0))
+    made = RbfnnLaw(RbfnnConfig(preview=False), knowledge(preview=0), only_controller(net))
     made.reset(seen(np.zeros(3), np.zeros(2)))
     return made
 
@@ -208,8 +212,8 @@ def test_the_preview_is_used_only_where_it_is_switched_on():
     ramp = np.linspace(0.1, 1.0, PREVIEW + 1)[:, None] * np.ones(2)
     flat = np.tile(ramp[0], (PREVIEW + 1, 1))
     J, look = np.ones((2, 3)) + np.eye(2, 3), seen(np.zeros(3), np.zeros(2))
-    on = [law(network()).command(J, look, reference) for reference in (ramp, flat)]
-    off = [without_preview().command(J, look, reference) for reference in (ramp, flat[:1])]
+    on = [law(network()).command(Estimate(J), look, reference) for reference in (ramp, flat)]
+    off = [without_preview().command(Estimate(J), look, reference) for reference in (ramp, flat[:1])]
     assert not np.allclose(on[0], on[1])
     np.testing.assert_array_equal(off[0], off[1])
     np.testing.assert_array_equal(off[0], on[1])
@@ -224,16 +228,16 @@ def test_the_commanded_position_may_stand_in_for_the_measured_one():
 
 def test_reset_forgets_what_was_learned():
     made, reference = law(network()), np.ones((PREVIEW + 1, 2))
-    first = [made.command(np.ones((2, 3)), seen(np.full(3, 0.1 * k), np.zeros(2)), reference) for k in range(5)]
+    first = [made.command(ONES, seen(np.full(3, 0.1 * k), np.zeros(2)), reference) for k in range(5)]
     made.reset(seen(np.zeros(3), np.zeros(2)))
     np.testing.assert_array_equal(made.weights, network().weights)
-    again = [made.command(np.ones((2, 3)), seen(np.full(3, 0.1 * k), np.zeros(2)), reference) for k in range(5)]
+    again = [made.command(ONES, seen(np.full(3, 0.1 * k), np.zeros(2)), reference) for k in range(5)]
     np.testing.assert_array_equal(first, again)
 
 
 def test_saturation_and_weight_norms_are_told():
     made = law(network(), limit=1e-3)
-    made.command(np.ones((2, 3)), seen(np.ones(3), np.zeros(2)), np.full((PREVIEW + 1, 2), 5.0))
+    made.command(ONES, seen(np.ones(3), np.zeros(2)), np.full((PREVIEW + 1, 2), 5.0))
     told = made.diagnostics()
     assert told["saturated"] == 1.0
     assert told["controller_weight_norm"] == pytest.approx(np.linalg.norm(made.weights))
@@ -254,7 +258,7 @@ def test_commands_are_finite_and_limited_for_any_sizes(n, m, error_history, posi
     made = law(network(n, m, 5, error_history, position_history, seed), limit=1.5)
     for _ in range(8):
         y, reference = 10.0**exponent * rng.normal(size=m), rng.normal(size=(PREVIEW + 1, m))
-        u = made.command(rng.normal(size=(m, n)), seen(rng.normal(size=n), y), reference)
+        u = made.command(Estimate(rng.normal(size=(m, n))), seen(rng.normal(size=n), y), reference)
         assert u.shape == (n,)
         assert np.isfinite(u).all()
         assert (np.abs(u) <= 1.5 * (1 + 1e-12)).all()
@@ -280,6 +284,6 @@ def test_bad_settings_are_refused():
 
 def test_a_network_of_another_robot_and_a_short_preview_are_refused():
     with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
-        RbfnnLaw(RbfnnConfig(), network(), knowledge(6, 3))
+        RbfnnLaw(RbfnnConfig(), knowledge(6, 3), only_controller(network()))
     with pytest.raises(ValueError, match="preview must be at least the horizon of 8 rows, got 7"):
-        RbfnnLaw(RbfnnConfig(horizon=8), network(), knowledge(preview=7))
+        RbfnnLaw(RbfnnConfig(horizon=8), knowledge(preview=7), only_controller(network()))

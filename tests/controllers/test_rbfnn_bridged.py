@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from kit.toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, SPEC, A, M, N, ToyArm, networks
-from servobench.controllers.estimators.estimator import LONGEST_DELAY
+from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.damped_inverse import damped_inverse
@@ -22,7 +22,7 @@ TURN = Rotation.from_rotvec(np.radians(100.0) * np.array([0.0, 0.6, 0.8])).as_ma
 
 
 def law(**config):
-    made = RbfnnBridgedLaw(RbfnnBridgedConfig(**config), networks(), KNOWLEDGE)
+    made = RbfnnBridgedLaw(RbfnnBridgedConfig(**config), KNOWLEDGE, networks())
     made.reset(seen(np.zeros(N), np.zeros(M)))
     return made
 
@@ -43,20 +43,22 @@ def test_the_first_step_by_hand():
     pinv = np.linalg.pinv(A)
     posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (np.zeros(N) - q)
     expected = (1.0 - np.exp(-14.0 * PERIOD)) * pinv @ e + pinv @ r + posture
-    np.testing.assert_allclose(made.command(A, seen(q, np.zeros(M)), reference), expected / PERIOD, atol=1e-7)
+    np.testing.assert_allclose(made.command(Estimate(A), seen(q, np.zeros(M)), reference), expected / PERIOD, atol=1e-7)
 
 
 def test_a_delay_beyond_what_is_kept_of_the_past_is_refused():
     made = law()
-    made.expect_delay(LONGEST_DELAY)
-    with pytest.raises(ValueError, match="delay must be at least 0 and at most 14, got 15"):
-        made.expect_delay(LONGEST_DELAY + 1)
+    look = seen(np.zeros(N), np.zeros(M)), still(np.zeros(M))
+    made.command(Estimate(A, delay=MAX_DELAY), *look)
+    with pytest.raises(ValueError, match="delay must be from 0 to 14 periods, got 15"):
+        made.command(Estimate(A, delay=MAX_DELAY + 1), *look)
 
 
 def test_without_redistribution_a_command_that_exceeds_the_limit_is_scaled_as_a_whole():
     e = np.array([0.5, 0.4, -0.5])
     plain, shared = (
-        law(k=0.0, redistribute=on).command(A, seen(np.zeros(N), np.zeros(M)), still(e)) for on in (False, True)
+        law(k=0.0, redistribute=on).command(Estimate(A), seen(np.zeros(N), np.zeros(M)), still(e))
+        for on in (False, True)
     )
     wanted = damped_inverse(A, 0.02) @ e
     np.testing.assert_allclose(plain, LIMIT * wanted / np.abs(wanted).max())
@@ -140,8 +142,8 @@ def test_what_is_learned_stays_within_the_bound_of_the_leak():
 
 def controller(estimator=None, **config):
     parts = networks()
-    made = RbfnnBridgedLaw(RbfnnBridgedConfig(**config), parts, KNOWLEDGE)
-    aligned = RbfAlignedEstimator(RbfAlignedConfig() if estimator is None else estimator, parts.jacobian, PERIOD)
+    made = RbfnnBridgedLaw(RbfnnBridgedConfig(**config), KNOWLEDGE, parts)
+    aligned = RbfAlignedEstimator(RbfAlignedConfig() if estimator is None else estimator, KNOWLEDGE, parts)
     return ServoController(aligned, made, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE)
 
 
@@ -171,7 +173,7 @@ def test_the_error_of_what_the_arm_is_bound_for_contracts_as_promised():
     for k, (J, e, dq, after) in enumerate(closed_loop(servo, arm, target, 60)):
         if k < 12 or np.linalg.norm(e) < 1e-6:
             continue
-        assert servo.estimator.delay() == 2
+        assert servo.estimator.estimate(arm.q).delay == 2
         delta = np.linalg.norm(np.eye(M) - TURN @ A @ damped_inverse(J, 1e-6), 2)
         f = min(1.0, float(np.linalg.norm(J @ dq) / (gamma * np.linalg.norm(e))))
         limited += f < 0.99
@@ -223,7 +225,7 @@ def test_the_law_of_the_paper_runs_in_the_frame_of_its_model():
     """base 'network': turning the camera changes nothing in the joint steps once the Jacobian is known."""
     e, q = np.array([0.02, -0.01, 0.03]), np.full(N, 0.1)
     steps = [
-        law(base="network", horizon=8, frame=frame).command(turn @ A, seen(q, np.zeros(M)), still(turn @ e))
+        law(base="network", horizon=8, frame=frame).command(Estimate(turn @ A), seen(q, np.zeros(M)), still(turn @ e))
         for turn, frame in ((np.eye(M), True), (TURN, True), (TURN, False))
     ]
     np.testing.assert_allclose(steps[1], steps[0], atol=1e-9)
@@ -254,7 +256,7 @@ def test_settings_out_of_bounds_are_refused(changes, match):
 
 def test_what_does_not_fit_together_is_refused():
     with pytest.raises(ValueError, match="preview must be at least 1 for feedforward, got 0"):
-        RbfnnBridgedLaw(RbfnnBridgedConfig(), networks(), dataclasses.replace(KNOWLEDGE, preview=0))
+        RbfnnBridgedLaw(RbfnnBridgedConfig(), dataclasses.replace(KNOWLEDGE, preview=0), networks())
     fewer = dataclasses.replace(
         SPEC,
         joint_names=("a", "b"),
@@ -263,7 +265,7 @@ def test_what_does_not_fit_together_is_refused():
         joint_upper=np.ones(2),
     )
     with pytest.raises(ValueError, match="network must be of 2 joints and 3 features, got 5 and 3"):
-        RbfnnBridgedLaw(RbfnnBridgedConfig(), networks(), dataclasses.replace(KNOWLEDGE, spec=fewer))
+        RbfnnBridgedLaw(RbfnnBridgedConfig(), dataclasses.replace(KNOWLEDGE, spec=fewer), networks())
     rng = np.random.default_rng(0)
     longer = ControllerNetwork(rng.normal(size=(4, 2 * M + N)), np.ones(4), rng.normal(size=(N, 2 * M + N, 4)), 2, 1)
     with pytest.raises(

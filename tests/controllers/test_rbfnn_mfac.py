@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from servobench.controllers import rbf_pid, rbfnn_mfac
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.fit import train
 from servobench.harness.config.defaults import default_config
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
@@ -50,14 +50,14 @@ def true_errors(controller, plant, desired, steps, seed):
 
 
 @pytest.mark.parametrize("latency", [0, 1])
-@pytest.mark.parametrize("preset", [rbfnn_mfac, rbf_pid], ids=lambda preset: preset.ENTRY.name)
-def test_moderately_wrong_robots_settle_within_5_mm(preset, latency, knowledge):
+@pytest.mark.parametrize("name", ["rbfnn_mfac", "rbf_pid"])
+def test_moderately_wrong_robots_settle_within_5_mm(name, latency, knowledge):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         robot, _ = sample_mismatch(Mismatch("moderate"), MODEL, seed)
         start, goal = rng.uniform(LOWER, UPPER), robot.feature(rng.uniform(LOWER, UPPER))
         plant = KinematicPlant(KinematicConfig(latency_periods=latency), PlantSetup(robot, start, PERIOD))
-        controller = preset.ENTRY.build(default_config(preset.ENTRY), knowledge)
+        controller = METHODS[name].build(default_config(METHODS[name]), knowledge)
         errors = true_errors(controller, plant, lambda _, goal=goal: goal, 160, seed)
         assert errors[-20:].max() < 0.005
         assert controller.estimated_jacobian().shape == (3, 6)
@@ -72,12 +72,12 @@ def circle_error(config, knowledge):
         return centre + 0.3 * np.array([np.cos(2 * np.pi * k / 200), np.sin(2 * np.pi * k / 200), 0.0])
 
     plant = KinematicPlant(KinematicConfig(), PlantSetup(robot, np.array(HOME), PERIOD))
-    errors = true_errors(rbfnn_mfac.ENTRY.build(config, knowledge), plant, circle, 400, 1)
+    errors = true_errors(METHODS["rbfnn_mfac"].build(config, knowledge), plant, circle, 400, 1)
     return np.sqrt(np.mean(errors[200:] ** 2))
 
 
 def test_the_proposed_method_tracks_the_second_lap_of_a_circle_within_10_mm_and_worse_without_the_row_space(knowledge):
-    config = rbfnn_mfac.RbfnnMfacConfig()
+    config = METHODS["rbfnn_mfac"].config()
     law = dataclasses.replace(config.law, row_space_only=False)
     kept = circle_error(config, knowledge)
     assert kept < 0.010

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from servobench.controllers import rbfnn_mfac, rbfnn_mfac_plus
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig
 from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig
+from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.fit import train
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.episode import run_experiment
@@ -20,10 +20,11 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 
 PERIOD, PREVIEW = 0.05, 10
-PLUS, PAPER = rbfnn_mfac_plus.ENTRY.name, rbfnn_mfac.ENTRY.name
+PLUS, PAPER = "rbfnn_mfac_plus", "rbfnn_mfac"
 MODEL = nominal_ur5()
 SPEC = hand_eye_spec(MODEL, PERIOD, KinematicConfig().max_joint_speed, KinematicConfig().joint_range)
-ALL_OFF = rbfnn_mfac_plus.RbfnnMfacPlusConfig(
+ALL_OFF = dataclasses.replace(
+    METHODS[PLUS].config(),
     estimator=RbfAlignedConfig(
         window=8, epsilon=1e-3, align=False, find_delay=False, detect_moves=False, find_noise=False
     ),
@@ -103,13 +104,13 @@ def commands(controller, steps=60):
 
 
 def test_with_all_additions_off_it_is_the_method_of_the_paper(knowledge):
-    paper = commands(rbfnn_mfac.ENTRY.build(rbfnn_mfac.RbfnnMfacConfig(), knowledge))
-    np.testing.assert_allclose(commands(rbfnn_mfac_plus.ENTRY.build(ALL_OFF, knowledge)), paper, atol=1e-7)
-    on = commands(rbfnn_mfac_plus.ENTRY.build(rbfnn_mfac_plus.RbfnnMfacPlusConfig(), knowledge))
+    paper = commands(METHODS[PAPER].build(METHODS[PAPER].config(), knowledge))
+    np.testing.assert_allclose(commands(METHODS[PLUS].build(ALL_OFF, knowledge)), paper, atol=1e-7)
+    on = commands(METHODS[PLUS].build(METHODS[PLUS].config(), knowledge))
     assert np.abs(on - paper).max() > 0.1
 
 
 def test_without_a_nominal_model_it_is_refused_in_one_line(knowledge):
     without = dataclasses.replace(knowledge, nominal_jacobian=None, train=None)
     with pytest.raises(ValueError, match="training needs a nominal model"):
-        rbfnn_mfac_plus.ENTRY.build(rbfnn_mfac_plus.RbfnnMfacPlusConfig(), without)
+        METHODS[PLUS].build(METHODS[PLUS].config(), without)

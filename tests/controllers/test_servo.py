@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
@@ -39,7 +40,7 @@ class Broken(Law):
     def reset(self, observation):
         pass
 
-    def command(self, jacobian, observation, reference):
+    def command(self, estimate, observation, reference):
         return np.array([0.0, np.nan, 0.0])
 
     def diagnostics(self):
@@ -91,7 +92,7 @@ def test_the_first_step_equals_the_law_at_the_first_jacobian():
     controller, law = servo(ConstantEstimator()), MfacLaw(MfacConfig(), KNOWLEDGE)
     first, reference = seen(0, np.zeros(3), [0.1, 0.0]), np.full((2, 2), 0.12)
     controller.reset(first, 0)
-    expected = law.command(J0, first, reference)
+    expected = law.command(Estimate(J0), first, reference)
     np.testing.assert_array_equal(controller.step(first, reference).joint_velocity, expected)
     assert controller.diagnostics()["probing"] == 0.0
 

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from servobench.controllers import rbf_pid, rbfnn_mfac, rbfnn_mfac_plus
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import (
     FORMAT,
@@ -37,6 +37,7 @@ from servobench.controllers.networks.samples import (
 )
 from servobench.plant.signals import PlantSpec
 
+TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac_plus", "rbf_pid")]
 N, M, PERIOD = 3, 2, 0.05
 SPEC = PlantSpec(("a", "b", "c"), ("x", "y"), np.ones(N), np.full(N, -6.0), np.full(N, 6.0), PERIOD)
 JACOBIAN = JacobianTraining(centres=40, samples=400)
@@ -278,8 +279,8 @@ def test_all_presets_take_their_networks_from_the_harness(networks):
         asked.append(config)
         return networks
 
-    for preset in (rbfnn_mfac, rbfnn_mfac_plus, rbf_pid):
-        preset.ENTRY.build(preset.ENTRY.config(), knowledge(train=source))
+    for entry in TRAINED:
+        entry.build(entry.config(), knowledge(train=source))
     assert asked[0] == asked[1] == asked[2]
     assert asked[0].lower == (0.5,) * N
 
@@ -288,9 +289,9 @@ def test_networks_of_another_robot_are_refused_at_construction(networks):
     names = tuple("abcdef"), tuple("xyz")
     other = PlantSpec(*names, np.ones(6), np.full(6, -6.0), np.full(6, 6.0), PERIOD)
     told = knowledge(spec=other, train=lambda config: networks)
-    for preset in (rbfnn_mfac, rbfnn_mfac_plus, rbf_pid):
+    for entry in TRAINED:
         with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
-            preset.ENTRY.build(preset.ENTRY.config(), told)
+            entry.build(entry.config(), told)
 
 
 def test_networks_of_two_robots_do_not_go_together(networks):

@@ -10,9 +10,9 @@ import tomllib
 import pytest
 
 from kit.documents import DOCS, PLACE, find, names, read, section, tables
-from servobench.controllers.composed import ESTIMATORS, LAWS
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment

@@ -118,8 +118,10 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
 
 LETHAL = """
 import os
-from servobench.controllers.constant import ENTRY as CONSTANT
 from servobench.controllers.controller import ControllerEntry
+from servobench.controllers.methods import METHODS
+
+CONSTANT = METHODS["constant"]
 
 def build(config, knowledge):
     made = CONSTANT.build(config, knowledge)

@@ -34,7 +34,6 @@ def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypat
     ("arguments", "message"),
     [
         (("--controllers", "rsl"), "unknown controller 'rsl': did you mean 'rls'?"),
-        (("--controllers", "kalman_mfac"), "controller kalman_mfac takes the values of ukf_mfac; tune that one"),
         (("--controllers", "mfac+rls"), "controller mfac+rls has no search space"),
         (("--controllers", ","), "--controllers is empty"),
         (("--trials", "0"), "trials must be at least 1, got 0"),

@@ -1,6 +1,7 @@
 """A made-up arm whose Jacobian is constant, so that whatever a controller of it promises can be checked exactly."""
 
 from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -31,6 +32,16 @@ def networks():
     weights = 0.02 * rng.normal(size=(N, M + N, 8))
     weights[:, M:] += np.eye(N)[:, :, None] / 8
     return TrainedNetworks(jacobian, ControllerNetwork(centres, np.full(8, 3.0), weights, 1, 1), 0.0, 0.0, "")
+
+
+def only_jacobian(network):
+    """What an estimator takes, of trained networks of which it looks at the Jacobian network alone."""
+    return SimpleNamespace(jacobian=network)
+
+
+def only_controller(network):
+    """What the law `rbfnn` takes, of trained networks of which it looks at the controller network alone."""
+    return SimpleNamespace(controller=network)
 
 
 class ToyArm:

@@ -10,6 +10,7 @@ from typing import Final, Literal, final, get_args
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, scale_to_limit
 from servobench.controllers.laws.mpc.closed_form import (
     constant_step,
@@ -143,13 +144,13 @@ class MpcLaw(Law):
         self._program.reset()
         self._forget()
 
-    def command(self, jacobian: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
+    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return the first step of the best plan as a joint velocity; see `Law.command`.
 
         Raises:
             SolverFailed: no solution, and the fallback is "raise".
         """
-        config, delay = self._config, self._config.delay_periods
+        config, delay, jacobian = self._config, self._config.delay_periods, estimate.jacobian
         feature = observation.feature + jacobian @ sum(self._sent, np.zeros(self._spec.n))
         rows = reference[delay : delay + config.horizon + 1] if config.use_preview else reference[:1]
         error = rows[0] - feature

@@ -147,6 +147,18 @@ class QpProgram:
             self._connect()
             self._evaluate()
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> QpProgram:
+        """Return a program with a solver of its own at the same warm start."""
+        copy = QpProgram.__new__(QpProgram)
+        copy._shape, copy._solver = self._shape, self._solver
+        copy.x, copy.p, copy.objective, copy.rows = self.x, self.p, self.objective, self.rows
+        copy.reset()
+        for name, array in self._arrays.items():
+            copy._arrays[name][:] = array
+        for name, array in self._results.items():
+            copy._results[name][:] = array
+        return copy
+
     def _connect(self) -> None:
         """Give the solver views of our arrays, so that a solve converts nothing; all start at zero."""
         buffer: Any

@@ -7,9 +7,9 @@ construction; the laws `mfac` and `pid` may use its first row, and whether they 
 all of them. Predictive laws must bridge delay and horizon within the preview, so that what is searched is their `reach`
 = horizon + delay_periods.
 
-`kalman_mfac` has no space: it takes the values of `ukf_mfac`, of which it is another form. Neither has
-`nmpc_calibrated`, a bound that never looks at the camera: tuned where its model of the delay is exact it gains nothing
-(0.071 against 0.072) and then cycles around the target on the rendered plant, whose joints answer one period earlier.
+`nmpc_calibrated` has no space. It is a bound that never looks at the camera: tuned where its model of the delay is
+exact it gains nothing (0.071 against 0.072) and then cycles around the target on the rendered plant, whose joints
+answer one period earlier.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, Final, TypeAlias
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.config.defaults import SAME_AS, apply_settings
+from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten, suggest
 
@@ -113,8 +113,6 @@ def find_tunable(name: str) -> ControllerEntry:
         ConfigurationError: an unknown controller, or one without a space.
     """
     entry = find_controller(name)
-    if name in SAME_AS:
-        raise ConfigurationError(f"controller {name} takes the values of {SAME_AS[name]}; tune that one")
     if name not in SPACES:
         raise ConfigurationError(f"controller {name} has no search space: {suggest(name, SPACES)}")
     return entry

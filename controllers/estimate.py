@@ -1,0 +1,24 @@
+"""The message from an estimator to a control law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from servobench.plant.checks import FloatArray
+
+MAX_DELAY = 14  # [periods] the longest delay that an estimator may report, so that a law knows how much past to keep
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Estimate:
+    """What an estimator knows when the law is asked for a command.
+
+    Attributes:
+        jacobian: Ĵ, (m, n), m/rad, at the present joint position.
+        delay: [periods] by which features are late, from 0 to `MAX_DELAY`; 0 where it is not identified.
+        noise: [m] standard deviation of the feature per axis; None where it is not identified.
+    """
+
+    jacobian: FloatArray
+    delay: int = 0
+    noise: float | None = None

@@ -1,0 +1,160 @@
+"""The methods by name, one row each: a control law, an estimator and the defaults that differ from those of the parts.
+
+Any other pair is a method too, called `law+estimator`. Method numbers and equations in the summaries are the paper's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, TypeVar
+
+from servobench.controllers.controller import ControllerEntry, RobotKnowledge
+from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.networks.config import TrainingConfig
+from servobench.controllers.networks.fit import obtain_networks
+from servobench.controllers.parts import ESTIMATORS, LAWS, Part
+from servobench.controllers.servo import ServoController
+
+Kind = TypeVar("Kind")
+
+
+def _find(kind: str, name: str, parts: Mapping[str, Part[Kind]]) -> Part[Kind]:
+    if name not in parts:
+        raise ValueError(f"{kind} must be one of {', '.join(sorted(parts))}, got {name!r}")
+    return parts[name]
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Settings of a composed controller.
+
+    Attributes:
+        estimator: settings of its estimator.
+        law: settings of its control law.
+        initial: where the first Jacobian comes from.
+    """
+
+    estimator: Any
+    law: Any
+    initial: InitialConfig
+
+
+@dataclass(frozen=True)
+class TrainedMethodConfig(MethodConfig):
+    """Settings of a composed controller of which a part starts from networks that are trained offline.
+
+    Attributes:
+        training: the offline fits; methods with equal settings share the networks.
+    """
+
+    training: TrainingConfig
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table of methods.
+
+    Attributes:
+        name: the word on the command line.
+        summary: one line for `servobench controllers`.
+        law: a name in `LAWS`.
+        estimator: a name in `ESTIMATORS`.
+        law_defaults: settings of the law that differ from its own defaults.
+    """
+
+    name: str
+    summary: str
+    law: str
+    estimator: str
+    law_defaults: Mapping[str, object] = field(default_factory=dict)
+
+    def config(self) -> MethodConfig:
+        """Return the default settings."""
+        law, estimator = self._parts()
+        settings = estimator.config(), law.config(**self.law_defaults), InitialConfig()
+        if law.trained or estimator.trained:
+            return TrainedMethodConfig(*settings, TrainingConfig())
+        return MethodConfig(*settings)
+
+    def build(self, config: MethodConfig, knowledge: RobotKnowledge) -> ServoController:
+        """Return the controller for these settings and this robot."""
+        law, estimator = self._parts()
+        networks = [obtain_networks(config.training, knowledge)] if isinstance(config, TrainedMethodConfig) else []
+        return ServoController(
+            estimator.make(config.estimator, knowledge, *(networks if estimator.trained else ())),
+            law.make(config.law, knowledge, *(networks if law.trained else ())),
+            initial_jacobian(config.initial, knowledge),
+            knowledge,
+        )
+
+    def entry(self) -> ControllerEntry:
+        """Return the method as the registry lists it.
+
+        Raises:
+            ValueError: an unknown law or estimator.
+        """
+        needs_truth = any(part.needs_truth for part in self._parts())
+        return ControllerEntry(self.name, self.summary, self.config, self.build, needs_truth)
+
+    def _parts(self) -> tuple[Part[Any], Part[Any]]:
+        return _find("law", self.law, LAWS), _find("estimator", self.estimator, ESTIMATORS)
+
+
+_ROWS = (
+    Method(
+        "rbfnn_mfac",
+        "the proposed method: a controller network and a Jacobian network that learn online (eqs. 7-39)",
+        law="rbfnn",
+        estimator="rbf",
+    ),
+    Method(
+        "rbfnn_mfac_plus",
+        "the proposed method with an estimated camera map and delay, prediction past all delays and a faster law",
+        law="rbfnn_bridged",
+        estimator="rbf_aligned",
+    ),
+    Method(
+        "ukf_mfac", "unscented Kalman filter with model-free adaptive control (eq. 45)", law="mfac", estimator="ukf"
+    ),
+    Method("ukf_mpc", "unscented Kalman filter with model predictive control (eq. 46)", law="mpc", estimator="ukf"),
+    Method(
+        "rbf_pid",
+        "Jacobian network under a Lyapunov update with the pseudo-inverse law (eqs. 40-43)",
+        law="pid",
+        estimator="rbf_lyapunov",
+    ),
+    Method(
+        "constant",
+        "pseudo-inverse of the first Jacobian for ever: the lower bound",
+        law="pid",
+        estimator="constant",
+    ),
+    Method(
+        "calibrated",
+        "pseudo-inverse of the true Jacobian, with feedforward: the upper bound",
+        law="pid",
+        estimator="true",
+        law_defaults={"feedforward": True},
+    ),
+    Method("broyden", "Broyden's rank-one update with the pseudo-inverse law", law="pid", estimator="broyden"),
+    Method("rls", "recursive least squares with forgetting, with the pseudo-inverse law", law="pid", estimator="rls"),
+    Method("cfdl_mfac", "compact-form model-free adaptive control of Hou and Jin", law="mfac", estimator="cfdl"),
+)
+METHODS: Mapping[str, ControllerEntry] = {row.name: row.entry() for row in _ROWS}
+
+
+@cache
+def compose(law: str, estimator: str) -> ControllerEntry:
+    """Return the entry, called `law+estimator`, of any law with any estimator, both with their own defaults.
+
+    Args:
+        law: a name in `LAWS`.
+        estimator: a name in `ESTIMATORS`.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    summary = f"the law {law} with the Jacobian of the estimator {estimator}"
+    return Method(f"{law}+{estimator}", summary, law=law, estimator=estimator).entry()

@@ -1,0 +1,66 @@
+"""Estimators and control laws by name; a new part is one row and then works with every part of the other kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
+from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
+from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator
+from servobench.controllers.estimators.estimator import Estimator
+from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
+from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
+from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
+from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
+from servobench.controllers.estimators.true import TrueConfig, TrueEstimator
+from servobench.controllers.estimators.ukf import UkfConfig, UkfEstimator
+from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.controllers.laws.pid import PidConfig, PidLaw
+from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
+
+Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True)
+class Part(Generic[Kind]):
+    """An estimator or a control law as `ESTIMATORS` and `LAWS` list it.
+
+    Attributes:
+        config: its settings, a frozen dataclass with a default for every field.
+        make: its class, called with settings and `RobotKnowledge`, and with `TrainedNetworks` where `trained`.
+        needs_truth: whether it needs the true Jacobian.
+        trained: whether it starts from networks that are trained offline.
+    """
+
+    config: type[Any]
+    make: Callable[..., Kind]
+    needs_truth: bool = False
+    trained: bool = False
+
+
+ESTIMATORS: dict[str, Part[Estimator]] = {
+    "constant": Part(ConstantConfig, ConstantEstimator),
+    "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
+    "ukf": Part(UkfConfig, UkfEstimator),
+    "kalman": Part(KalmanConfig, KalmanEstimator),
+    "broyden": Part(BroydenConfig, BroydenEstimator),
+    "rls": Part(RlsConfig, RlsEstimator),
+    "rbf": Part(RbfConfig, RbfEstimator, trained=True),
+    "rbf_lyapunov": Part(RbfLyapunovConfig, RbfLyapunovEstimator, trained=True),
+    "rbf_aligned": Part(RbfAlignedConfig, RbfAlignedEstimator, trained=True),
+    "cfdl": Part(CfdlConfig, CfdlEstimator),
+}
+
+LAWS: dict[str, Part[Law]] = {
+    "pid": Part(PidConfig, PidLaw),
+    "mfac": Part(MfacConfig, MfacLaw),
+    "mpc": Part(MpcConfig, MpcLaw),
+    "rbfnn": Part(RbfnnConfig, RbfnnLaw, trained=True),
+    "rbfnn_bridged": Part(RbfnnBridgedConfig, RbfnnBridgedLaw, trained=True),
+}
