@@ -7,6 +7,7 @@ import math
 import re
 import tomllib
 
+import generated_tables
 import pytest
 
 from kit.documents import DOCS, PLACE, find, names, read, section, tables
@@ -56,6 +57,12 @@ def plain(config):
 
 def test_all_settings_have_a_table_and_nothing_else_has():
     assert set(SETTINGS) == config_classes()
+
+
+@pytest.mark.parametrize("page", generated_tables.PAGES, ids=lambda page: page.name)
+def test_the_generated_parts_of_a_page_are_up_to_date(page):
+    text = page.read_text(encoding="utf-8")
+    assert generated_tables.renewed(text) == text, "run make docs"
 
 
 @pytest.mark.parametrize("kind", sorted(SETTINGS, key=lambda kind: kind.__name__), ids=lambda kind: kind.__name__)

@@ -1,0 +1,136 @@
+"""Writes the generated tables of the documentation: settings, and the variables of the exported FMU.
+
+    make docs
+
+A generated part of a page is everything between two comments, of which the first says what belongs there:
+
+    <!-- settings: controllers/laws/mfac.py:MfacConfig -->
+    <!-- variables: ur5_mismatched -->
+    <!-- end -->
+
+The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import json
+import re
+import sys
+import textwrap
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from servobench.fmus.export import arm_layout
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
+PART = re.compile(r"(<!-- (settings|variables): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+
+
+def main() -> None:
+    """Write every generated part of every page anew."""
+    for page in PAGES:
+        page.write_text(renewed(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def renewed(text: str) -> str:
+    """Return the page `text` with its generated parts made anew from the code."""
+    make = {"settings": lambda place: settings_table(find(place)), "variables": lambda _: variables_table()}
+    return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part[3])}\n\n{part[4]}", text)
+
+
+def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
+    """Return the object that `place` names, such as `controllers/laws/mfac.py:MfacConfig`."""
+    path, _, name = place.partition(":")
+    return getattr(importlib.import_module("servobench." + path.removesuffix(".py").replace("/", ".")), name)
+
+
+def settings_table(kind: type[Any]) -> str:
+    """Return the table of the settings of a class; settings of a nested section have its name before theirs.
+
+    Raises:
+        ValueError: a field has no string below it.
+    """
+    rows = [(f"`{name}`", toml(value), wanted, meaning) for name, value, wanted, meaning in settings_rows(kind(), "")]
+    return table(("setting", "default", "allowed", "meaning"), rows)
+
+
+def settings_rows(config: Any, prefix: str) -> Iterator[tuple[str, Any, str, str]]:  # noqa: ANN401 - any settings
+    """Yield name, default, what is allowed, and the meaning of each setting of `config`."""
+    meanings, hints = field_strings(type(config)), get_type_hints(type(config), include_extras=True)
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from settings_rows(value, f"{prefix}{item.name}.")
+        elif item.name not in meanings:
+            raise ValueError(f"{type(config).__name__}.{item.name} has no string below it that says its meaning")
+        else:
+            yield prefix + item.name, value, allowed(hints[item.name]), meanings[item.name]
+
+
+def field_strings(kind: type[Any]) -> dict[str, str]:
+    """Return the strings below the fields of a class as one line each, by field."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
+    return {
+        field.target.id: " ".join(below.value.value.split())
+        for field, below in pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+    }
+
+
+def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
+    """Return what a type allows, in words; nothing for what the default shows already."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        bounds = [
+            f"{sign} {getattr(bound, name):g}"
+            for bound in arguments[1:]
+            for name, sign in SIGNS.items()
+            if hasattr(bound, name)
+        ]
+        return ", ".join(part for part in (allowed(arguments[0]), *bounds) if part)
+    if origin is Literal:
+        return " or ".join(map(toml, arguments))
+    if origin in (Union, UnionType):
+        return " or ".join(filter(None, (allowed(each) for each in arguments if each is not NoneType)))
+    if origin is tuple:
+        each = allowed(arguments[0])
+        size = "" if arguments[-1] is Ellipsis else f"{len(arguments)} "
+        return f"{size}numbers" + (f", each {each}" if each else "")
+    return "whole" if hint is int else ""
+
+
+def variables_table() -> str:
+    """Return the table of the variables of the exported FMU."""
+    rows = [
+        (f"`{group.name}`", " × ".join(map(str, group.shape)), group.role, group.unit, group.description)
+        for group in arm_layout(6).groups
+    ]
+    return table(("variable", "size", "role", "unit", "meaning"), rows)
+
+
+def toml(value: Any) -> str:  # noqa: ANN401 - any setting
+    """Return a value as TOML has it; nothing for a value that is absent."""
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    return (
+        "" if value is None else json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
+    )
+
+
+def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """Return a Markdown table."""
+    lines = [header, ("---",) * len(header), *(tuple(cell.replace("|", "\\|") for cell in row) for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
