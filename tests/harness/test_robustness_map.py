@@ -1,0 +1,70 @@
+"""The robustness map: its cells, its tables, its command."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+from servobench.harness.analysis.statistics import settled_share
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.studies.robustness import (
+    LINES,
+    MOVE,
+    draw_map,
+    map_cells,
+    moved_settings,
+    number_of,
+    settling_median,
+)
+
+
+def test_the_map_has_every_place_for_every_method_and_no_run_twice():
+    usual, moved = map_cells("kinematic", ["constant", "broyden"], [0, 1, 2])
+    cells = [*usual, *moved]
+    assert len({cell.request.run_id for cell in usual}) == len(usual)
+    assert len(cells) == 2 * 3 * sum(len(line.places) for line in LINES)
+    assert {cell.axis for cell in moved} == {MOVE}
+    assert {cell.request.mismatch for cell in moved} >= {"moderate+camera_move=90deg"}
+    assert {cell.request.latency_periods for cell in usual if cell.axis == "latency"} == {0, 1, 2, 3, 4, 5}
+    assert {cell.request.noise_factor for cell in usual if cell.axis == "noise"} == {0.0, 1.0, 2.0, 4.0, 8.0}
+
+
+def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long():
+    assert moved_settings(Settings()).sections["random"]["duration"] == 20.0
+    assert moved_settings(Settings({"random": {"duration": 5.0}})).sections["random"]["duration"] == 5.0
+
+
+def test_settling_counts_from_the_move_of_the_camera():
+    runs = pd.DataFrame({"settling_time_s": [11.0, 12.0, np.nan], "status": "completed", "moved_at_s": 10.0})
+    assert settling_median(runs).value == 2.0
+    assert settling_median(runs.drop(columns="moved_at_s")).value == 12.0
+    assert settled_share(runs).value == pytest.approx(200 / 3)
+    assert math.isinf(settling_median(runs.tail(1)).value)
+
+
+def test_the_number_of_a_magnitude_has_no_unit():
+    assert [number_of(place) for place in ("0deg", "12.5mm", "30%", "4")] == ["0", "12.5", "30", "4"]
+
+
+def test_a_table_that_is_no_map_is_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="holds no axis of the robustness map; make one with"):
+        draw_map(pd.DataFrame({"axis": ["", ""]}), tmp_path)
+
+
+def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "map"
+    arguments = (
+        "robustness", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1",
+        "--set", "random.duration=1", "--out", str(out),
+    )  # fmt: skip
+    assert servobench(monkeypatch, *arguments) == 0
+    assert "the map is in" in capsys.readouterr().out
+    assert len(results.load_runs(out / "moved")) == 5
+    assert {path.name for path in (out / "figures").iterdir()} == {
+        "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
+    }  # fmt: skip
