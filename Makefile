@@ -1,25 +1,41 @@
-# All set-up happens here: `make run` and `make test` need python3 (3.11 or newer), make and a C compiler.
+# All set-up happens here: each target needs python3 (3.11 or newer), make and a C compiler.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+UNIT := tests/plant tests/controllers tests/fmus tests/harness
+NIGHTLY ?= results/nightly
 
-.PHONY: run test lint format figures benchmark lock clean
+.PHONY: run check test nightly lint format docs figures benchmark lock clean
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
 	  --controllers rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
+# For every save: half a minute.
+check: lint
+	$(BIN)/python -m pytest -n auto $(UNIT)
+
+# For every change: the unit folders, statistics over runs (closed_loop), processes, compilers and browsers (end_to_end).
 test: lint
 	$(BIN)/python -m pytest -n auto
+
+# Too long for every change: hours. The same call goes on after an interruption; its last figures are docs/nightly.md.
+nightly: $(VENV)/ready
+	$(BIN)/python tests/nightly.py $(NIGHTLY)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
 
 format: $(VENV)/ready
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+# Write the generated tables of the pages anew from the code.
+docs: $(VENV)/ready
+	$(BIN)/python docs/generated_tables.py
 
 # Draw the README's pictures anew from committed seeds: the map takes six minutes on two processors, more where they are slow.
 figures: $(VENV)/ready
@@ -41,4 +57,4 @@ lock:
 	  --no-emit-index-url --no-header --quiet --output-file requirements.lock
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache build dist
