@@ -15,27 +15,27 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import RunRequest, RunSettings
 
 NEVER = math.nan
-SEEDS = (700, 701)
+SEEDS = (702, 705)  # whose settling times four kinds of processors give alike
 METHODS = ("rbfnn_mfac_plus", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
 # mismatch, latency [periods], duration [s], and for each of METHODS the settling times of SEEDS [s]
 WORLDS = {
-    "severe": ("severe", 0, 10.0, ((1.3, 0.85), (2.65, 1.8), (2.05, 1.65), (2.1, 1.15), (1.75, 1.95))),
+    "severe": ("severe", 0, 10.0, ((0.8, 0.5), (2.0, 1.45), (1.5, 1.2), (1.05, 0.95), (1.0, 1.05))),
     "camera_turned_by_60_degrees": (
         "moderate+camera_rotation=60deg", 0, 10.0,
-        ((1.3, 1.05), (3.2, 3.15), (2.4, 2.4), (2.0, 2.4), (1.75, 1.95)),
+        ((0.8, 0.55), (2.5, 3.35), (1.7, 1.35), (1.3, 1.15), (1.9, 2.8)),
     ),
     "camera_turned_by_120_degrees": (
         "moderate+camera_rotation=120deg", 0, 10.0,
-        ((1.3, 1.35), (NEVER, NEVER), (2.85, 2.7), (2.25, 2.0), (3.45, 7.35)),
+        ((0.9, 0.65), (NEVER, NEVER), (2.1, 1.75), (2.45, 1.85), (2.45, 5.8)),
     ),
     "links_20_percent_tool_60_mm": (
         "moderate+links=20%+tool=60mm", 0, 10.0,
-        ((1.3, 1.0), (2.5, 1.55), (2.35, 1.8), (2.8, 1.25), (1.9, 1.45)),
+        ((0.85, 0.45), (1.4, 1.25), (1.5, 1.05), (1.05, 0.8), (1.0, 0.85)),
     ),
-    "latency_of_one_period": ("moderate", 1, 10.0, ((1.3, 0.95), (3.8, 2.15), (4.3, 3.0), (3.25, 1.6), (2.7, 2.95))),
+    "latency_of_one_period": ("moderate", 1, 10.0, ((0.8, 0.45), (2.6, 1.85), (2.4, 2.1), (1.5, 1.05), (1.85, 2.25))),
     "camera_moved_by_45_degrees": (
         "moderate+camera_move=45deg", 0, 16.0,
-        ((8.45, 8.45), (9.45, 9.55), (9.1, 8.8), (8.9, 8.75), (9.55, 9.2)),
+        ((8.55, 8.55), (10.0, 9.25), (8.9, 9.2), (8.95, 8.65), (9.2, 9.15)),
     ),
 }  # fmt: skip
 
