@@ -10,38 +10,33 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Literal, final
 
 import numpy as np
 
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
 from servobench.plant.faults import ControllerDiverged
+from servobench.plant.settings import Count, Number, Periods, Positive, settings
 from servobench.plant.signals import Observation, PlantSpec
 
-SOURCES = ("nominal", "probe", "given")
 
-
-@dataclass(frozen=True)
+@settings
 class InitialConfig:
-    """Settings of the initial Jacobian; a probe rests for longer than lag, delay and latency last by default."""
+    """Settings of the initial Jacobian; by default a probe rests for longer than lag, delay and latency last."""
 
-    source: Literal["nominal", "probe", "given"] = "nominal"  # where Ĵ₀ comes from
-    probe_step: float = 0.03  # rad, size of a probing move: some 20 mm at the ball, far above 1 mm of noise
-    probe_periods: int = 2  # periods over which a probing move is spread
-    settle_periods: int = 7  # periods of rest before a feature counts
-    average_periods: int = 3  # valid features averaged at each rest
-    given: tuple[tuple[float, ...], ...] = ()  # m/rad, m rows of n entries; only for source "given"
-
-    def __post_init__(self) -> None:
-        """Check the choice and the numbers."""
-        if self.source not in SOURCES:
-            raise ValueError(f"source must be one of {', '.join(SOURCES)}, got {self.source!r}")
-        check_number("probe_step", self.probe_step, above=0.0)
-        check_number("probe_periods", self.probe_periods, at_least=1)
-        check_number("settle_periods", self.settle_periods, at_least=0)
-        check_number("average_periods", self.average_periods, at_least=1)
+    source: Literal["nominal", "probe", "given"] = "nominal"
+    """Where Ĵ₀ comes from: the nominal model, probing moves, or `given`."""
+    probe_step: Positive = 0.03
+    """[rad] size of a probing move: some 20 mm at the ball, far above 1 mm of noise."""
+    probe_periods: Count = 2
+    """[periods] over which a probing move is spread."""
+    settle_periods: Periods = 7
+    """[periods] of rest before a feature counts."""
+    average_periods: Count = 3
+    """[periods] valid features that are averaged at each rest."""
+    given: tuple[tuple[Number, ...], ...] = ()
+    """[m/rad] m rows of n entries; only for source "given"."""
 
 
 class InitialJacobian(ABC):

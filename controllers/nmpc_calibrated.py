@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any, Final, Literal, final, get_args
+from typing import Any, Final, Literal, final
 
 import casadi
 import numpy as np
@@ -14,49 +13,41 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
 from servobench.controllers.laws.mpc.closed_form import decay_targets, move_weights
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
-from servobench.controllers.laws.mpc.qp import SOLVERS, QpShape, QpSolution
-from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.controllers.laws.mpc.qp import QpShape, QpSolution
+from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
+from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, Share, settings
 from servobench.plant.signals import Command, Observation
-
-Fallback = Literal["hold", "raise"]
-Solver = Literal["daqp", "qpoases"]
 
 _CONVERGED: Final = 1e-9  # rad: a smaller change of the plan ends the iterations
 
 
-@dataclass(frozen=True)
+@settings
 class NmpcCalibratedConfig:
     """Settings of `nmpc_calibrated`; "tuned" = on simulated UR5s with joint lag and a command delay of one period."""
 
-    horizon: int = 8  # H, periods; with the delay within the default preview of 10
-    delay_periods: int = 2  # periods until a command moves the joints: one of transport, one of lag; bridged
-    rho: float = 1.0  # ρ, 1/period: the error should decay as exp(−ρ τ); tuned
-    move_weight: float = 0.001  # q of Q = q I, m²/rad²; small, it only settles the free joints
-    terminal_weight: float = 0.0  # extra weight of the error after H periods
-    iterations: int = 2  # Gauss-Newton steps a period at most; 1 is the real-time iteration
-    disturbance_gain: float = (
-        0.0  # share of the model's error on the camera fed back a period; 0 trusts encoders and model
-    )
-    joint_acceleration_limit: float = math.inf  # rad/s², between two commands; inf = none
-    limit_position: bool = True  # keep the predicted joint positions within the plant's limits
-    solver: Solver = "daqp"  # of the quadratic programs; "qpoases" to cross-check
-    fallback: Fallback = "hold"  # no solution: zero velocity | SolverFailed
-
-    def __post_init__(self) -> None:
-        """Check every number and word that needs no knowledge of the plant."""
-        for name, words in (("solver", SOLVERS), ("fallback", get_args(Fallback))):
-            if getattr(self, name) not in words:
-                raise ValueError(f"{name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
-        check_number("horizon", self.horizon, at_least=1)
-        check_number("delay_periods", self.delay_periods, at_least=0)
-        check_number("rho", self.rho, above=0.0)
-        check_number("move_weight", self.move_weight, above=0.0)
-        check_number("terminal_weight", self.terminal_weight, at_least=0.0)
-        check_number("iterations", self.iterations, at_least=1)
-        check_number("disturbance_gain", self.disturbance_gain, at_least=0.0, at_most=1.0)
-        if not self.joint_acceleration_limit > 0.0:
-            raise ValueError(f"joint_acceleration_limit must be above 0, got {self.joint_acceleration_limit}")
+    horizon: Count = 8
+    """[periods] H; with the delay within the default preview of 10."""
+    delay_periods: Periods = 2
+    """[periods] until a command moves the joints: one of transport, one of lag; bridged."""
+    rho: Positive = 1.0
+    """[1/period] ρ; the error should decay as exp(−ρ τ); tuned."""
+    move_weight: Positive = 0.001
+    """[m²/rad²] q of Q = q I; small, it only settles the free joints."""
+    terminal_weight: NonNegative = 0.0
+    """[1] extra weight of the error after H periods."""
+    iterations: Count = 2
+    """[1] Gauss-Newton steps per period at most; 1 is the real-time iteration."""
+    disturbance_gain: Share = 0.0
+    """[1/period] share of the model's error at the camera that is fed back; 0 trusts encoders and model."""
+    joint_acceleration_limit: PositiveOrInfinite = math.inf
+    """[rad/s²] limit of the change between two commands; inf: none."""
+    limit_position: bool = True
+    """Keep the predicted joint positions within the plant's limits."""
+    solver: Literal["daqp", "qpoases"] = "daqp"
+    """Solver of the quadratic programs; "qpoases" for a cross-check."""
+    fallback: Literal["hold", "raise"] = "hold"
+    """Without a solution: zero velocity, or `SolverFailed`."""
 
 
 @final

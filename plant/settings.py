@@ -13,7 +13,7 @@ Rules across fields stand in `__post_init__` and raise `ValueError`. Validation 
 
 from __future__ import annotations
 
-from dataclasses import Field, field
+from dataclasses import Field, field, fields
 from functools import wraps
 from typing import Annotated, Any, TypeAlias, TypeVar, dataclass_transform
 
@@ -65,12 +65,12 @@ def settings(kind: Class) -> Class:
     checked: Any = dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True))(
         kind
     )
-    construct = checked.__init__
+    construct, names = checked.__init__, [item.name for item in fields(checked)]
 
     @wraps(construct)
     def construct_checked(self: Any, *arguments: Any, **values: Any) -> None:  # noqa: ANN401 - any field
         try:
-            construct(self, *arguments, **values)
+            construct(self, **dict(zip(names, arguments, strict=False)), **values)
         except ValidationError as error:
             raise ValueError(describe(error)) from None
 
@@ -96,6 +96,8 @@ def describe(error: ValidationError) -> str:
         wanted = f"{word} {context[key]:g}"
     elif kind == "literal_error":
         wanted = "one of " + context["expected"].replace("'", "").replace(" or ", ", ")
+    elif kind == "too_short":
+        wanted = f"of length {context['min_length']} or more"
     elif kind in {"unexpected_keyword_argument", "missing"}:
         return f"{name}: {first['msg']}"
     else:

@@ -8,27 +8,25 @@ M. Jägersand, O. Fuentes, R. Nelson, 1997. η = 1 satisfies ĴΔq = Δy exactly
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
+from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class BroydenConfig:
     """Settings of Broyden's update."""
 
-    step_factor: float = 0.2  # η; the rule knows no noise, so a part of each motion's misfit is left for the next ones
-    min_joint_step: float = 0.01  # rad, motions below are left out; 1.4 mm of noise in Δy is then at most 0.14 m/rad
-
-    def __post_init__(self) -> None:
-        """Check the numbers; the minimum must be positive, or the division fails at rest."""
-        check_number("step_factor", self.step_factor, above=0.0, at_most=1.0)
-        check_number("min_joint_step", self.min_joint_step, above=0.0)
+    step_factor: Annotated[Positive, Le(1.0)] = 0.2
+    """[1] η; the rule has no model of noise, so a part of each motion's misfit is left for the next ones."""
+    min_joint_step: Positive = 0.01
+    """[rad] smaller motions are left out; 1.4 mm of noise in Δy is then at most 0.14 m/rad."""
 
 
 def projection_update(

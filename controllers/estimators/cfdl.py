@@ -8,33 +8,32 @@ Source: Z. Hou, S. Jin, "Model Free Adaptive Control: Theory and Applications", 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
+from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.broyden import projection_update
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import NonNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class CfdlConfig:
     """Settings of the compact-form estimate."""
 
-    step_factor: float = 0.5  # η, half of the fastest rate
-    regularisation: float = 1e-3  # μ, rad², the square of 0.03 rad: motions below change Φ little
-    min_joint_step: float = 0.005  # rad, motions below are left out: 1 mm of noise hides them
-    reset: bool = True  # return to Φ₀ when Φ loses its sign or vanishes
-    reset_norm: float = 1e-2  # m/rad, ‖Φ‖ below which Φ counts as vanished
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("step_factor", self.step_factor, above=0.0, below=2.0)
-        check_number("regularisation", self.regularisation, above=0.0)
-        check_number("min_joint_step", self.min_joint_step, at_least=0.0)
-        check_number("reset_norm", self.reset_norm, at_least=0.0)
+    step_factor: Annotated[Positive, Lt(2.0)] = 0.5
+    """[1] η; half of the fastest rate."""
+    regularisation: Positive = 1e-3
+    """[rad²] μ, the square of 0.03 rad: smaller motions change Φ little."""
+    min_joint_step: NonNegative = 0.005
+    """[rad] smaller motions are left out: 1 mm of noise hides them."""
+    reset: bool = True
+    """Return to Φ₀ when Φ loses its sign or vanishes."""
+    reset_norm: NonNegative = 1e-2
+    """[m/rad] ‖Φ‖ below which Φ counts as vanished."""
 
 
 @final

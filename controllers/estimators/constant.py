@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import final
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
+from servobench.plant.settings import settings
 
 
-@dataclass(frozen=True)
+@settings
 class ConstantConfig:
     """The constant estimator has no settings; its Ĵ₀ is set under `initial`."""
 

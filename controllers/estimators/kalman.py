@@ -11,48 +11,31 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FilterDiverged
+from servobench.plant.settings import NonNegative, Positive, settings
 
-FORMS = ("split", "full")
 
-
-@dataclass(frozen=True)
+@settings
 class KalmanConfig:
     """Settings of the Kalman filter."""
 
-    initial_deviation: float = 0.05  # m/rad, of an entry of Ĵ₀; tuned: softer lets latency spoil the first motions
-    process_deviation: float = 0.02  # m/rad, of an entry's walk over one motion; tuned on mismatched kinematic plants
-    feature_noise: float = 0.001  # m, standard deviation of the feature an axis; R = 2σ² I
-    min_joint_step: float = 0.002  # rad, motions below, in which 1 mm of noise is all there is, are left out
-    form: Literal["split", "full"] = "split"  # the same numbers; "full" is the readable reference
-
-    def __post_init__(self) -> None:
-        """Check the numbers and the choice."""
-        check_filter_numbers(self.initial_deviation, self.process_deviation, self.feature_noise, self.min_joint_step)
-        if self.form not in FORMS:
-            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {self.form!r}")
-
-
-def check_filter_numbers(
-    initial_deviation: float, process_deviation: float, feature_noise: float, min_joint_step: float
-) -> None:
-    """Check the numbers that all Kalman-like filters share; positive deviations keep every covariance definite.
-
-    Raises:
-        ValueError: one of them is out of its bounds.
-    """
-    check_number("initial_deviation", initial_deviation, above=0.0)
-    check_number("process_deviation", process_deviation, at_least=0.0)
-    check_number("feature_noise", feature_noise, above=0.0)
-    check_number("min_joint_step", min_joint_step, at_least=0.0)
+    initial_deviation: Positive = 0.05
+    """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""
+    process_deviation: NonNegative = 0.02
+    """[m/rad] of an entry's walk over one motion; tuned on mismatched kinematic plants."""
+    feature_noise: Positive = 0.001
+    """[m] standard deviation σ of the feature per axis; R = 2σ² I."""
+    min_joint_step: NonNegative = 0.002
+    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
+    form: Literal["split", "full"] = "split"
+    """Two computations of the same numbers; "full" is the readable reference."""
 
 
 def cholesky_of(P: FloatArray) -> FloatArray:

@@ -4,31 +4,29 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection
-from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
+from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import LatestFeatures, jacobian_output
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Count, NonNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class RbfConfig:
     """Settings of the update."""
 
-    window: int = 8  # T, motions that are learned from at once
-    k2: float = 0.5  # k₂, step size, 0 < k₂ < 2
-    epsilon: float = 1e-3  # ε, rad², joint motion (squared, summed over the window) below which learning fades
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("window", self.window, at_least=1)
-        check_number("k2", self.k2, above=0.0, below=2.0)
-        check_number("epsilon", self.epsilon, at_least=0.0)
+    window: Count = 8
+    """[motions] T, from which is learned at once."""
+    k2: Annotated[Positive, Lt(2.0)] = 0.5
+    """[1] k₂, step size."""
+    epsilon: NonNegative = 1e-3
+    """[rad²] ε, joint motion (squared, summed over the window) below which learning fades."""
 
 
 def window_gradient(weights: FloatArray, moved: FloatArray, feature_steps: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,10 +9,10 @@ map learns from two motions and a network not at all. Not in the paper.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
+from annotated_types import Le, Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import MAX_DELAY, Estimate
@@ -21,7 +21,8 @@ from servobench.controllers.estimators.map_bank import map_update, near_rotation
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.noise_level import NoiseLevel
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
 
 ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
 JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm
@@ -31,38 +32,46 @@ USUAL_SURPRISE = 3.0  # ‖ν‖²/(s m) of a motion up to which nothing is susp
 LARGEST_SUSPICION = 10.0  # of one motion, so that one outlier alone is below the gate
 
 
-@dataclass(frozen=True)
+@settings
 class RbfAlignedConfig:
     """Settings of the network's update, of the map and of the delay."""
 
-    window: int = 1  # T, motions that the network learns from at once
-    k2: float = 0.5  # k₂, step size of the network, 0 < k₂ < 2
-    epsilon: float = 0.03  # ε, rad², as for `rbf`, at the first guess of the noise; it grows with σ²
-    learn: bool = True  # let the network learn online, from what the map's rotation takes into its frame
-    align: bool = True  # estimate the map; False: M = I
-    initial_deviation: float = 1.0  # of an entry of M = I at first: any camera is possible
-    walk: float = 0.3  # w, 1/√m: deviation of an entry of M after the feature has moved by a metre
-    model_error: float = 0.1  # c, share of a step that the model does not explain
-    rotation_deviation: float = 0.2  # ς, of an entry of M from the nearest rotation; 0: M is the rotation
-    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
-    find_noise: bool = True  # estimate σ; False: it is as given
-    confidence: float = 0.5  # deviation of an entry of M below which the network learns
-    find_delay: bool = True  # estimate the delay; False: 0
-    longest_delay: int = 5  # D, periods
-    forgetting: float = 1.0  # γ, of a candidate's score a motion; below 1 for a latency that changes
-    margin: float = 6.0  # by how much a delay must be the better one, in −2 log likelihood
-    detect_moves: bool = True  # forget what is known of the map when the camera seems to have been moved
-    gate: float = 12.0  # sum of surprises (CUSUM) beyond which it does
-
-    def __post_init__(self) -> None:
-        """Check the numbers; the network's are checked by `RbfConfig`."""
-        RbfConfig(self.window, self.k2, self.epsilon)
-        for name in ("initial_deviation", "feature_noise", "confidence", "gate"):
-            check_number(name, getattr(self, name), above=0.0)
-        for name in ("walk", "model_error", "rotation_deviation", "margin"):
-            check_number(name, getattr(self, name), at_least=0.0)
-        check_number("longest_delay", self.longest_delay, at_least=0, at_most=MAX_DELAY)
-        check_number("forgetting", self.forgetting, above=0.0, at_most=1.0)
+    window: Count = 1
+    """[motions] T, from which the network learns at once."""
+    k2: Annotated[Positive, Lt(2.0)] = 0.5
+    """[1] k₂, step size of the network."""
+    epsilon: NonNegative = 0.03
+    """[rad²] ε as for `rbf`, at the initial guess of the noise; it grows with σ²."""
+    learn: bool = True
+    """Let the network learn online, from motions that the map's rotation turns into its frame."""
+    align: bool = True
+    """Estimate the map; false: M = I."""
+    initial_deviation: Positive = 1.0
+    """[1] of an entry of M = I at first: any camera is possible."""
+    walk: NonNegative = 0.3
+    """[1/√m] w, deviation of an entry of M after the feature has moved by a metre."""
+    model_error: NonNegative = 0.1
+    """[1] c, share of a step that the model does not explain."""
+    rotation_deviation: NonNegative = 0.2
+    """[1] ς, of an entry of M from the nearest rotation; 0: M is the rotation."""
+    feature_noise: Positive = 0.001
+    """[m] σ, standard deviation of the feature per axis; the initial guess."""
+    find_noise: bool = True
+    """Estimate σ; false: it is as given."""
+    confidence: Positive = 0.5
+    """[1] deviation of an entry of M below which the network learns."""
+    find_delay: bool = True
+    """Estimate the delay; false: 0."""
+    longest_delay: Annotated[Periods, Le(MAX_DELAY)] = 5
+    """[periods] D, the longest delay that is considered."""
+    forgetting: Annotated[Positive, Le(1.0)] = 1.0
+    """[1] γ, of a candidate's score per motion; below 1 for a latency that changes."""
+    margin: NonNegative = 6.0
+    """[1] by which a delay must be better than the present one, in −2 log likelihood."""
+    detect_moves: bool = True
+    """Forget what is known of the map when the camera seems to have been moved."""
+    gate: Positive = 12.0
+    """[1] sum of innovations (CUSUM) beyond which it seems so."""
 
 
 @final

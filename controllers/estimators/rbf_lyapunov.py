@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -11,20 +10,18 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import LatestFeatures, jacobian_output
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class RbfLyapunovConfig:
-    """Settings of the update; the gains are small as they meet ‖θ‖² of some ten and units that differ."""
+    """Settings of the update; the gains are small because they are multiplied by ‖θ‖² of some ten."""
 
-    n2: float = 0.005  # n₂, weight of the error, 1/(m s)
-    n3: float = 0.05  # n₃, weight of the prediction error, 1/m
-
-    def __post_init__(self) -> None:
-        """Check the gains."""
-        check_number("n2", self.n2, above=0.0)
-        check_number("n3", self.n3, above=0.0)
+    n2: Positive = 0.005
+    """[1/(m s)] n₂, weight of the error."""
+    n3: Positive = 0.05
+    """[1/m] n₃, weight of the prediction error."""
 
 
 def lyapunov_step(

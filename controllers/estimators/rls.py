@@ -8,32 +8,38 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
+from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import NonNegative, Positive, settings
 
 
-@dataclass(frozen=True)
+@settings
 class RlsConfig:
     """Settings of recursive least squares."""
 
-    forgetting: float = 0.95  # λ, remembers some 20 motions
-    initial_covariance: float = 100.0  # 1/rad², P₀ = p₀ I: Ĵ₀ weighs as much as a motion of 0.1 rad of each joint
-    covariance_limit: float = 100.0  # 1/rad², bound on the mean of P's diagonal, or a joint at rest winds P up
-    min_joint_step: float = 0.01  # rad, motions below are left out: 1 mm of noise hides them
+    forgetting: Annotated[Positive, Le(1.0)] = 0.95
+    """[1] λ per motion; remembers some 20 motions."""
+    initial_covariance: Positive = 100.0
+    """[1/rad²] P₀ = p₀ I: Ĵ₀ weighs as much as a motion of 0.1 rad of each joint."""
+    covariance_limit: Positive = 100.0
+    """[1/rad²] bound of the mean of P's diagonal, without which P of a joint at rest grows without bound."""
+    min_joint_step: NonNegative = 0.01
+    """[rad] smaller motions are left out: 1 mm of noise hides them."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("forgetting", self.forgetting, above=0.0, at_most=1.0)
-        check_number("initial_covariance", self.initial_covariance, above=0.0)
-        check_number("covariance_limit", self.covariance_limit, at_least=self.initial_covariance)
-        check_number("min_joint_step", self.min_joint_step, at_least=0.0)
+        """Check across fields."""
+        if self.covariance_limit < self.initial_covariance:
+            raise ValueError(
+                f"covariance_limit must be at least initial_covariance = {self.initial_covariance:g}, "
+                f"got {self.covariance_limit:g}"
+            )
 
 
 def rls_update(

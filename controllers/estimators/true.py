@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -10,9 +9,10 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
+from servobench.plant.settings import settings
 
 
-@dataclass(frozen=True)
+@settings
 class TrueConfig:
     """The true Jacobian has no settings."""
 

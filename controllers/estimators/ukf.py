@@ -22,33 +22,31 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import check_filter_numbers, cholesky_of, split_update
-from servobench.plant.checks import FloatArray, check_number
+from servobench.controllers.estimators.kalman import cholesky_of, split_update
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import NonNegative, Positive, settings
 
-FORMS = ("sigma_points", "split")
 
-
-@dataclass(frozen=True)
+@settings
 class UkfConfig:
     """Settings of the unscented Kalman filter."""
 
-    initial_deviation: float = 0.05  # m/rad, of an entry of Ĵ₀; tuned: softer lets latency spoil the first motions
-    process_deviation: float = 0.02  # m/rad, of an entry's walk over one motion; tuned on mismatched kinematic plants
-    feature_noise: float = 0.001  # m, standard deviation of the feature an axis; R = 2σ² I
-    min_joint_step: float = 0.002  # rad, motions below, in which 1 mm of noise is all there is, are left out
-    alpha: float = 1.0  # spread of the sigma points; 1 keeps all weights from being negative
-    beta: float = 2.0  # prior knowledge of the distribution; 2 suits a Gaussian
-    kappa: float = 0.0  # secondary spread
-    form: Literal["sigma_points", "split"] = "sigma_points"  # the same numbers; "split" is several times faster
-
-    def __post_init__(self) -> None:
-        """Check the numbers and the choice."""
-        check_filter_numbers(self.initial_deviation, self.process_deviation, self.feature_noise, self.min_joint_step)
-        check_number("alpha", self.alpha, above=0.0)
-        check_number("beta", self.beta, at_least=0.0)
-        check_number("kappa", self.kappa, at_least=0.0)
-        if self.form not in FORMS:
-            raise ValueError(f"form must be one of {', '.join(FORMS)}, got {self.form!r}")
+    initial_deviation: Positive = 0.05
+    """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""
+    process_deviation: NonNegative = 0.02
+    """[m/rad] of an entry's walk over one motion; tuned on mismatched kinematic plants."""
+    feature_noise: Positive = 0.001
+    """[m] standard deviation σ of the feature per axis; R = 2σ² I."""
+    min_joint_step: NonNegative = 0.002
+    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
+    alpha: Positive = 1.0
+    """[1] spread of the sigma points; 1 keeps all weights from being negative."""
+    beta: NonNegative = 2.0
+    """[1] prior knowledge of the distribution; 2 suits a Gaussian."""
+    kappa: NonNegative = 0.0
+    """[1] secondary spread."""
+    form: Literal["sigma_points", "split"] = "sigma_points"
+    """Two computations of the same numbers; "split" is several times faster."""
 
 
 @dataclass(frozen=True, eq=False)

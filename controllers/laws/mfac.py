@@ -8,30 +8,29 @@ newest measured error is used. Along a singular value σ of Ĵ the loop gain a p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import final
+from typing import Annotated, final
 
 import numpy as np
+from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, scale_to_limit
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Positive, settings
 from servobench.plant.signals import Observation
 
 
-@dataclass(frozen=True)
+@settings
 class MfacConfig:
     """Settings of the MFAC law."""
 
-    step_factor: float = 0.15  # ρ, not the paper's 1: with three periods of delay a gain of 0.44 a period is unstable
-    step_weight: float = 0.02  # λ, m²/rad², the unit of ‖J‖²: halves the gain where σ = 0.14 m/rad
-    feedforward: bool = False  # aim the reference's next step as well; needs a preview of at least 1, not in the paper
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("step_factor", self.step_factor, above=0.0, at_most=1.0)
-        check_number("step_weight", self.step_weight, above=0.0)
+    step_factor: Annotated[Positive, Le(1.0)] = 0.15
+    """[1] ρ; not the paper's 1: with three periods of delay a gain of 0.44 per period is unstable."""
+    step_weight: Positive = 0.02
+    """[m²/rad²] λ; halves the gain where a singular value is 0.14 m/rad."""
+    feedforward: bool = False
+    """Add the reference's next step; needs a preview of at least 1; not in the paper."""
 
 
 def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: float) -> FloatArray:

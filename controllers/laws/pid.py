@@ -11,7 +11,6 @@ K_i = K_d = 0 and δ = 0 is eq. 43 (and eq. 9), whose minus sign belongs to the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -20,26 +19,27 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.damped_inverse import damped_inverse
 from servobench.controllers.laws.law import Law, scale_to_limit
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import NonNegative, Positive, settings
 from servobench.plant.signals import Observation
 
 
-@dataclass(frozen=True)
+@settings
 class PidConfig:
-    """Settings of the PID law; defaults damp a loop with three periods of delay at 20 Hz well."""
+    """Settings of the PID law; the defaults damp a loop with three periods of delay at 20 Hz well."""
 
-    proportional_gain: float = 2.5  # K_p, 1/s; K_p dt = 0.125 a period, as quick as MFAC's default
-    integral_gain: float = 0.0  # K_i, 1/s²; 0 as in the paper
-    derivative_gain: float = 0.0  # K_d, 1; 0 as in the paper
-    derivative_filter: float = 0.1  # τ, s, two periods at 20 Hz
-    damping: float = 0.02  # δ, m/rad, a tenth of the smallest singular value in a UR5's workspace
-    feedforward: bool = False  # add the reference's own velocity; needs a preview of at least 1
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("proportional_gain", self.proportional_gain, above=0.0)
-        for name in ("integral_gain", "derivative_gain", "derivative_filter", "damping"):
-            check_number(name, getattr(self, name), at_least=0.0)
+    proportional_gain: Positive = 2.5
+    """[1/s] K_p; a share K_p dt = 0.125 of the error per period, as fast as the default of `mfac`."""
+    integral_gain: NonNegative = 0.0
+    """[1/s²] K_i; 0 as in the paper."""
+    derivative_gain: NonNegative = 0.0
+    """[1] K_d; 0 as in the paper."""
+    derivative_filter: NonNegative = 0.1
+    """[s] τ, time constant of the filtered derivative; two periods at 20 Hz."""
+    damping: NonNegative = 0.02
+    """[m/rad] δ, damping of the inverse; a tenth of the smallest singular value in a UR5's workspace."""
+    feedforward: bool = False
+    """Add the reference's own velocity; needs a preview of at least 1."""
 
 
 def reference_velocity(reference: FloatArray, period: float) -> FloatArray:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, final, get_args
+from typing import Annotated, Literal, final
 
 import numpy as np
+from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
@@ -19,32 +19,29 @@ from servobench.controllers.laws.roll_out import (
 from servobench.controllers.laws.row_space import project_to_row_space
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Count, NonNegative, Positive, settings
 from servobench.plant.signals import Observation
 
-Position = Literal["measured", "commanded"]
-POSITIONS: tuple[str, ...] = get_args(Position)
 
-
-@dataclass(frozen=True)
+@settings
 class RbfnnConfig:
     """Settings of the online update; the structure of the network (L_e, L_c, N_h, kernel) belongs to its training."""
 
-    horizon: int = 8  # T, predicted steps
-    k: float = 0.1  # share of the predicted error that one update removes, 0 < k < 2; large k: fast, less damped
-    epsilon: float = 1e-3  # ε, m⁴: updates fade where predicted errors are millimetres
-    preview: bool = True  # predict with the known future of the reference; False: with its present value
-    position: Position = "measured"  # q in ξ: the encoders'; "commanded": the sum of all commands, as in the paper
-    row_space_only: bool = True  # keep what is learned out of the null space of Ĵ; False as in the paper
-    anti_windup: bool = True  # learn nothing that drives a limited command further; False as in the paper
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("horizon", self.horizon, at_least=1)
-        check_number("k", self.k, above=0.0, below=2.0)
-        check_number("epsilon", self.epsilon, at_least=0.0)
-        if self.position not in POSITIONS:
-            raise ValueError(f"position must be one of {', '.join(POSITIONS)}, got {self.position!r}")
+    horizon: Count = 8
+    """[periods] T, predicted steps."""
+    k: Annotated[Positive, Lt(2.0)] = 0.1
+    """[1] share of the predicted error that one update removes; a large one is fast and little damped."""
+    epsilon: NonNegative = 1e-3
+    """[m⁴] ε; updates fade where predicted errors are millimetres."""
+    preview: bool = True
+    """Predict with the known future of the reference; false: with its present value."""
+    position: Literal["measured", "commanded"] = "measured"
+    """The joint position q in ξ: as the encoders report it, or the sum of all commands as in the paper."""
+    row_space_only: bool = True
+    """Keep what is learned out of the null space of Ĵ; false as in the paper."""
+    anti_windup: bool = True
+    """Learn nothing that drives a limited command further; false as in the paper."""
 
 
 @final

@@ -13,10 +13,10 @@ model that its networks were trained on. What exceeds the limits of joint speed 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal, final, get_args
+from typing import Annotated, Literal, final
 
 import numpy as np
+from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import MAX_DELAY, Estimate
@@ -30,53 +30,59 @@ from servobench.controllers.laws.redistribution import redistribute
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.controllers.rotation import nearest_rotation
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Count, NonNegative, Positive, Share, settings
 from servobench.plant.signals import Observation
 
-Base = Literal["jacobian", "network"]
-BASES: tuple[str, ...] = get_args(Base)
 LEARNED = ("criterion", "step_size", "predicted_error", "learned_weight_norm")  # diagnostics that both bases have
 
 
-@dataclass(frozen=True)
+@settings
 class RbfnnBridgedConfig:
     """Settings of the law; each addition to `rbfnn` can be switched off."""
 
-    base: Base = "jacobian"  # what is learned upon: Ĵ⁺ as estimated; "network": the offline network, as in `rbfnn`
-    horizon: int = 8  # T, predicted periods; base "network" only
-    k: float = 0.1  # share of the predicted error that one update removes, 0 ≤ k < 2; 0 learns nothing
-    epsilon: float = 1e-3  # ε, m⁴
-    leak: float = 0.02  # l, share of what was learned that is forgotten a period; base "jacobian" only
-    gain: float = 14.0  # K_p, 1/s: the error shrinks by exp(−K_p dt) a period; base "jacobian" only
-    posture_gain: float = 0.2  # K_n, 1/s, towards the middle of the training region; base "jacobian" only
-    damping: float = 0.02  # δ, m/rad, of every inverse of Ĵ
-    frame: bool = True  # take the law into the frame of the networks' model; base "network" only
-    bridge: bool = True  # predict past the camera's delay and past what was commanded and not yet done
-    response_length: int = 12  # N, periods within which joints answer a command
-    observe: bool = True  # filter the feature by the joints' motion
-    feature_noise: float = 0.001  # σ, m, standard deviation of the feature an axis; the first guess
-    find_noise: bool = True  # estimate σ; False: it is as given
-    model_error: float = 0.2  # c, error of Ĵ as a share of its size
-    feedforward: bool = True  # add the reference's own motion; needs a preview of at least 1
-    redistribute: bool = True  # let joints with room make up for those at their limit
+    base: Literal["jacobian", "network"] = "jacobian"
+    """To what the learned part is added: Ĵ⁺ as estimated, or the offline network as in `rbfnn`."""
+    horizon: Count = 8
+    """[periods] T, predicted steps; base "network" only."""
+    k: Annotated[NonNegative, Lt(2.0)] = 0.1
+    """[1] share of the predicted error that one update removes; 0 learns nothing."""
+    epsilon: NonNegative = 1e-3
+    """[m⁴] ε; updates fade where predicted errors are millimetres."""
+    leak: Share = 0.02
+    """[1/period] l, share of what was learned that is forgotten; base "jacobian" only."""
+    gain: Positive = 14.0
+    """[1/s] K_p; the error shrinks by exp(−K_p dt) per period; base "jacobian" only."""
+    posture_gain: NonNegative = 0.2
+    """[1/s] K_n, towards the middle of the training region; base "jacobian" only."""
+    damping: Positive = 0.02
+    """[m/rad] δ, damping of every inverse of Ĵ."""
+    frame: bool = True
+    """Apply the law in the frame of the networks' model; base "network" only."""
+    bridge: bool = True
+    """Predict past the camera's delay and past the part of the commands that is still to come."""
+    response_length: Count = 12
+    """[periods] N, within which joints respond to a command."""
+    observe: bool = True
+    """Filter the feature with the motion of the joints."""
+    feature_noise: Positive = 0.001
+    """[m] σ, standard deviation of the feature per axis; the initial guess."""
+    find_noise: bool = True
+    """Estimate σ; false: it is as given."""
+    model_error: NonNegative = 0.2
+    """[1] c, error of Ĵ as a share of its size."""
+    feedforward: bool = True
+    """Add the reference's own motion; needs a preview of at least 1."""
+    redistribute: bool = True
+    """Let joints with room make up for those at their limit."""
 
     def __post_init__(self) -> None:
-        """Check the numbers and the choice."""
-        check_number("horizon", self.horizon, at_least=1)
-        check_number("k", self.k, at_least=0.0, below=2.0)
-        check_number("response_length", self.response_length, at_least=1)
-        check_number("leak", self.leak, at_least=0.0, at_most=1.0)
-        for name in ("gain", "damping", "feature_noise"):
-            check_number(name, getattr(self, name), above=0.0)
-        for name in ("epsilon", "posture_gain", "model_error"):
-            check_number(name, getattr(self, name), at_least=0.0)
-        if self.base not in BASES:
-            raise ValueError(f"base must be one of {', '.join(BASES)}, got {self.base!r}")
+        """Check across fields."""
         if self.base == "network" and self.k == 0.0:
             raise ValueError("k must be above 0 for base 'network', got 0")
 
     def gains(self, period: float) -> CorrectionGains:
-        """Return what the base "jacobian" needs, for a control period, s."""
+        """Return what the base "jacobian" needs, for a control period [s]."""
         return CorrectionGains(
             self.k,
             self.epsilon,

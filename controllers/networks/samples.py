@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -13,7 +13,6 @@ from servobench.controllers.networks.rbf import information_vector
 from servobench.plant.checks import FloatArray
 
 Placement = Literal["halton", "sobol", "kmeans"]
-PLACEMENTS: tuple[str, ...] = get_args(Placement)
 CLUSTERING_POOL = 20  # samples a centre when centres come from k-means
 
 

@@ -129,7 +129,7 @@ def test_a_given_jacobian_of_the_wrong_shape_is_refused(given):
 
 
 def test_a_given_jacobian_must_be_finite():
-    with pytest.raises(ValueError, match="given must be finite"):
+    with pytest.raises(ValueError, match="given.0.1 must be finite"):
         initial_jacobian(InitialConfig("given", given=((1.0, float("inf")),)), RobotKnowledge(spec(), 0))
 
 

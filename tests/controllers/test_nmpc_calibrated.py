@@ -182,7 +182,7 @@ def test_its_entry_asks_for_the_truth():
         ({"move_weight": 0.0}, "move_weight must be above 0, got 0.0"),
         ({"terminal_weight": -1.0}, "terminal_weight must be at least 0, got -1.0"),
         ({"iterations": 0}, "iterations must be at least 1, got 0"),
-        ({"disturbance_gain": 1.5}, "disturbance_gain must be at least 0 and at most 1, got 1.5"),
+        ({"disturbance_gain": 1.5}, "disturbance_gain must be at most 1, got 1.5"),
         ({"joint_acceleration_limit": -1.0}, "joint_acceleration_limit must be above 0, got -1.0"),
         ({"solver": "ipopt"}, "solver must be one of daqp, qpoases, got 'ipopt'"),
         ({"fallback": "closed_form"}, "fallback must be one of hold, raise, got 'closed_form'"),

@@ -271,8 +271,8 @@ def test_nothing_to_descend_gives_no_step():
 
 
 def test_bad_settings_are_refused():
-    for k in (0.0, 2.0, -0.1):
-        with pytest.raises(ValueError, match="k must be above 0 and below 2"):
+    for k, wanted in ((0.0, "above 0"), (2.0, "below 2"), (-0.1, "above 0")):
+        with pytest.raises(ValueError, match=f"k must be {wanted}"):
             RbfnnConfig(k=k)
     with pytest.raises(ValueError, match="horizon must be at least 1, got 0"):
         RbfnnConfig(horizon=0)

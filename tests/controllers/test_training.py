@@ -324,17 +324,21 @@ def test_bad_settings_are_refused():
         ("error_range", 0.0, "error_range must be above 0"),
         ("kernel", "cubic", "kernel must be one of exponential, gaussian, got 'cubic'"),
         ("fit", "both", "fit must be one of output, entries, got 'both'"),
-        ("placement", "grid", "controller.placement must be one of halton, sobol, kmeans"),
-        ("samples", 5, "controller.samples must be at least"),
-        ("width_scales", (), "controller.width_scales must hold at least one number"),
-        ("regularisations", (0.0,), "controller.regularisations must be above 0"),
+        ("placement", "grid", "placement must be one of halton, sobol, kmeans"),
+        ("samples", 5, "samples must be at least 10, got 5"),
+        ("width_scales", (), "width_scales must be of length 1 or more"),
+        ("regularisations", (0.0,), "regularisations.0 must be above 0"),
     ):
         with pytest.raises(ValueError, match=message):
             ControllerTraining(**{name: value})
-    with pytest.raises(ValueError, match=r"jacobian.centres must be at least 1"):
+    with pytest.raises(ValueError, match=r"centres must be at least 1"):
         JacobianTraining(centres=0)
-    with pytest.raises(ValueError, match="held_out must be above 0 and below 1"):
+    with pytest.raises(ValueError, match="held_out must be below 1"):
         TrainingConfig(held_out=1.0)
+    with pytest.raises(ValueError, match="samples must be at least the 60 hidden units, got 59"):
+        ControllerTraining(samples=59)
+    with pytest.raises(ValueError, match="samples must be at least the 60 centres, got 59"):
+        JacobianTraining(centres=60, samples=59)
     with pytest.raises(ValueError, match="seed must be at least 0"):
         TrainingConfig(seed=-1)
 
@@ -344,7 +348,7 @@ def test_a_region_that_is_no_box_or_of_another_robot_is_refused():
         TrainingConfig((0.0,), (1.0, 1.0))
     with pytest.raises(ValueError, match="lower must be below upper"):
         TrainingConfig((1.0,), (1.0,))
-    with pytest.raises(ValueError, match="lower must be finite"):
+    with pytest.raises(ValueError, match="lower.0 must be finite"):
         TrainingConfig((float("nan"),), (1.0,))
     with pytest.raises(ValueError, match="lower and upper must name 3 joints, got 2"):
         train(TrainingConfig((0.0, 0.0), (1.0, 1.0)), planar_jacobian, SPEC)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from typing import Final, Literal, final, get_args
+from typing import Annotated, Final, Literal, final
 
 import numpy as np
+from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
@@ -22,64 +22,55 @@ from servobench.controllers.laws.mpc.closed_form import (
 )
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
 from servobench.controllers.laws.mpc.qp import (
-    SOLVERS,
     QpBounds,
     QpShape,
     QpSolution,
 )
-from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
+from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, settings
 from servobench.plant.signals import Observation
-
-Mode = Literal["moves", "constant"]
-Solver = Literal["daqp", "qpoases"]
-Fallback = Literal["hold", "closed_form", "raise"]
 
 _ACTIVE: Final = 1e-10  # a multiplier above this counts as an active limit
 
 
-@dataclass(frozen=True)
+@settings
 class MpcConfig:
     """Settings of the predictive law; "tuned" = on UR5s with ±15° camera, ±5 % links and 3 periods of delay."""
 
-    horizon: int = 10  # H, periods; tuned
-    mode: Mode = "moves"  # "moves": H free moves; "constant": one constant step, the paper's
-    alpha: float = 1.0  # α in (0, 1], weight of an error against the one a period earlier; the plain mean
-    rho: float = 0.25  # ρ, 1/period: the error should decay as exp(−ρ τ); tuned
-    move_weight: float = 0.15  # q of Q = q I, m²/rad²; tuned
-    joint_weight: tuple[float, ...] = ()  # relative weight of each joint, Q = q diag(…); empty = all 1
-    terminal_weight: float = 0.0  # extra weight of the error after H periods; 0 is the paper's criterion
-    use_preview: bool = True  # follow the previewed reference; false holds the present one, as the paper does
-    delay_periods: int = 0  # periods until a command shows in the feature, bridged by the commands already sent
-    joint_acceleration_limit: float = math.inf  # rad/s², between two commands; inf = none
-    limit_position: bool = True  # keep the predicted joint positions within the plant's limits
-    view_tangent: tuple[
-        float, ...
-    ] = ()  # (horizontal, vertical): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty = off
-    solver: Solver = "daqp"  # the fastest of CasADi's here; "qpoases" to cross-check
-    fallback: Fallback = (
-        "hold"  # no solution: zero velocity | the law without limits, scaled to the speed limit | SolverFailed
-    )
+    horizon: Count = 10
+    """[periods] H; tuned."""
+    mode: Literal["moves", "constant"] = "moves"
+    """H free moves, or one constant step as in the paper."""
+    alpha: Annotated[Positive, Le(1.0)] = 1.0
+    """[1] α, weight of an error against the one a period earlier; 1 is the plain mean."""
+    rho: Positive = 0.25
+    """[1/period] ρ; the error should decay as exp(−ρ τ); tuned."""
+    move_weight: Positive = 0.15
+    """[m²/rad²] q of Q = q I; tuned."""
+    joint_weight: tuple[Positive, ...] = ()
+    """[1] relative weight of each joint, Q = q diag(…); empty: all 1."""
+    terminal_weight: NonNegative = 0.0
+    """[1] extra weight of the error after H periods; 0 is the paper's criterion."""
+    use_preview: bool = True
+    """Follow the previewed reference; false: hold the present one, as in the paper."""
+    delay_periods: Periods = 0
+    """[periods] until a command shows in the feature; bridged by the commands already sent."""
+    joint_acceleration_limit: PositiveOrInfinite = math.inf
+    """[rad/s²] limit of the change between two commands; inf: none."""
+    limit_position: bool = True
+    """Keep the predicted joint positions within the plant's limits."""
+    view_tangent: tuple[Positive, ...] = ()
+    """[1] (horizontal, vertical): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty: no limit."""
+    solver: Literal["daqp", "qpoases"] = "daqp"
+    """Solver of the quadratic programs: the fastest of CasADi's here, or another for a cross-check."""
+    fallback: Literal["hold", "closed_form", "raise"] = "hold"
+    """Without a solution: zero velocity, the law without limits scaled to the speed limit, or `SolverFailed`."""
 
     def __post_init__(self) -> None:
-        """Check every number and word that needs no knowledge of the plant."""
-        for name, words in (("mode", get_args(Mode)), ("solver", SOLVERS), ("fallback", get_args(Fallback))):
-            if getattr(self, name) not in words:
-                raise ValueError(f"{name} must be one of {', '.join(words)}, got {getattr(self, name)!r}")
-        check_number("horizon", self.horizon, at_least=1)
-        check_number("delay_periods", self.delay_periods, at_least=0)
-        check_number("alpha", self.alpha, above=0.0, at_most=1.0)
-        check_number("rho", self.rho, above=0.0)
-        check_number("move_weight", self.move_weight, above=0.0)
-        check_number("terminal_weight", self.terminal_weight, at_least=0.0)
-        if not self.joint_acceleration_limit > 0.0:
-            raise ValueError(f"joint_acceleration_limit must be above 0, got {self.joint_acceleration_limit}")
-        for weight in self.joint_weight:
-            check_number("joint_weight", weight, above=0.0)
+        """Check across fields."""
         if len(self.view_tangent) not in (0, 2):
             raise ValueError(f"view_tangent must be empty or (horizontal, vertical), got {self.view_tangent}")
-        for tangent in self.view_tangent:
-            check_number("view_tangent", tangent, above=0.0)
 
 
 @final
