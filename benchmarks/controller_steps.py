@@ -19,7 +19,8 @@ from threadpoolctl import threadpool_limits
 
 from servobench.harness.config.registry import CONTROLLERS
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import RunRequest, build_experiment
+from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.request import RunRequest
 from servobench.plant.seeds import named_seed
 
 PROPOSED, BETTER, OPTIMISING = "rbfnn_mfac", "rbfnn_mfac_plus", "ukf_mpc"

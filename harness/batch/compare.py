@@ -17,7 +17,8 @@ from servobench.harness.batch.seed_ranges import refuse_tuning_seeds
 from servobench.harness.batch.workers import leave_interrupts_to_parent
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest, build_experiment, known_sections
+from servobench.harness.run.experiment import build_experiment, known_sections
+from servobench.harness.run.request import RunRequest, read_mismatch
 
 PICTURES = "pictures"
 
@@ -35,14 +36,15 @@ class Batch:
     @classmethod
     def around(cls, requests: Sequence[RunRequest]) -> Batch:
         """Return the smallest batch that holds all of `requests`."""
-        names = ("plant", "controller", "task", "mismatch", "seed")
-        return cls(*(tuple(dict.fromkeys(getattr(request, name) for request in requests)) for name in names))
+        places = [(each.plant, each.controller, each.task, str(each.mismatch), each.seed) for each in requests]
+        return cls(*(tuple(dict.fromkeys(values)) for values in zip(*places, strict=True)))
 
     def requests(self) -> list[RunRequest]:
         """Return the runs, seeds varying fastest."""
         order = product(self.plants, self.tasks, self.mismatches, self.controllers, self.seeds)
         return [
-            RunRequest(plant, controller, task, mismatch, seed) for plant, task, mismatch, controller, seed in order
+            RunRequest(plant, controller, task, read_mismatch(mismatch), seed)
+            for plant, task, mismatch, controller, seed in order
         ]
 
 
@@ -92,11 +94,12 @@ def check_batch(
     """
     refuse_tuning_seeds(batch.seeds)
     settings.check_sections([*known_sections(), *batch.plants, *batch.controllers])
-    names = (batch.plants[0], batch.controllers[0], batch.tasks[0], batch.mismatches[0])
-    first = RunRequest(*names, batch.seeds[0], noise_factor, latency_periods)
+    mismatches = [read_mismatch(text) for text in batch.mismatches]
+    names = (batch.plants[0], batch.controllers[0], batch.tasks[0])
+    first = RunRequest(*names, mismatches[0], batch.seeds[0], noise_factor, latency_periods)
     requests = dict.fromkeys(
         [
-            *(replace(first, plant=plant, mismatch=name) for plant, name in product(batch.plants, batch.mismatches)),
+            *(replace(first, plant=plant, mismatch=name) for plant, name in product(batch.plants, mismatches)),
             *(replace(first, plant=plant, controller=name) for plant, name in product(batch.plants, batch.controllers)),
             *(replace(first, task=name) for name in batch.tasks),
         ]

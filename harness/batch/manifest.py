@@ -14,7 +14,7 @@ from typing import Any
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.run.experiment import RunRequest, RunSettings
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import find_task
 
 PACKAGES = (
@@ -51,7 +51,7 @@ def describe_batch(requests: list[RunRequest], settings: Settings) -> dict[str, 
         "plants": _unique(request.plant for request in requests),
         "controllers": _unique(request.controller for request in requests),
         "tasks": _unique(request.task for request in requests),
-        "mismatches": _unique(request.mismatch for request in requests),
+        "mismatches": _unique(str(request.mismatch) for request in requests),
         "seeds": sorted({request.seed for request in requests}),
         "configuration": configuration,
         "packages": {name: _version(name) for name in PACKAGES},

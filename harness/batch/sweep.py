@@ -27,7 +27,7 @@ from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.workers import leave_interrupts_to_parent
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import crashed_row, run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
 
 CHUNK = 8  # runs; small enough to lose little, large enough that files and messages cost nothing
@@ -82,9 +82,9 @@ class SweepPlan:
         ]  # fmt: skip
 
 
-def vary(mismatch: str, axis: str, magnitude: str) -> str:
+def vary(mismatch: Mismatch, axis: str, magnitude: str) -> Mismatch:
     """Return `mismatch` with one axis put on top of it; unchanged where `axis` is ""."""
-    return str(Mismatch.parse(mismatch).with_axis(axis, Magnitude.parse(axis, magnitude))) if axis else mismatch
+    return mismatch.with_axis(axis, Magnitude.parse(axis, magnitude)) if axis else mismatch
 
 
 def parse_variation(text: str) -> tuple[str, tuple[str, ...]]:

@@ -19,10 +19,12 @@ from servobench.harness.config.settings import (
 )
 from servobench.harness.pictures.replay import LoggedRun, logged_run
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest, known_sections
+from servobench.harness.run.experiment import known_sections
+from servobench.harness.run.request import RunRequest
 from servobench.plant.bullet.bullet_plant import BulletConfig
+from servobench.plant.robot.mismatch import Mismatch
 
-DEFAULTS = RunRequest("bullet", "rbfnn_mfac", "circle", "moderate", 0)
+DEFAULTS = RunRequest("bullet", "rbfnn_mfac", "circle", Mismatch("moderate"), 0)
 FOLDER = "recordings"
 
 console = Console()

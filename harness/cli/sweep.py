@@ -41,7 +41,7 @@ from servobench.harness.config.registry import (
     plant_names,
 )
 from servobench.harness.config.settings import ConfigurationError, Settings, read_settings
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.tasks import find_task, task_names
 
 console = Console()

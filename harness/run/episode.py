@@ -12,10 +12,11 @@ import pandas as pd
 from threadpoolctl import threadpool_limits
 
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import RunRequest, build_experiment
+from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import judge_run
+from servobench.harness.run.request import RunRequest
 from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
 
@@ -71,9 +72,11 @@ def run_experiment(
         plant.close()
     metrics = {}
     if len(logged):
-        metrics = judge_run(logged, point_to_point=scenario.point_to_point, evaluate_from=scenario.evaluate_from)
+        metrics = judge_run(logged, scenario.kind, scenario.evaluate_from)
     row: dict[str, Any] = {
         **request.as_row(),
+        "task_kind": scenario.kind,
+        "feature_unit": plant.spec.feature_unit,
         "status": status,
         **metrics,
         "periods": len(logged),

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,13 +22,13 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.network_cache import network_source
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import (
     Scenario,
     TaskSetting,
     find_task,
     task_names,
 )
-from servobench.plant.checks import check_number
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import (
@@ -46,60 +43,6 @@ from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import PlantSpec
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """The section `run`: what is common to all plants, controllers and tasks."""
-
-    period: float = 0.05  # s, control period
-    preview: int = 10  # future rows of the reference that every controller is offered
-    lost_after_periods: int = 20  # so many periods in a row without a valid feature end a run
-    camera_moves_at: float = 0.5  # share of the run after which a mismatch's `camera_move` happens
-    full_jacobian: bool = False  # log every entry of the estimated and the true Jacobian
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("period", self.period, above=0.0)
-        check_number("preview", self.preview, at_least=0)
-        check_number("lost_after_periods", self.lost_after_periods, at_least=1)
-        check_number("camera_moves_at", self.camera_moves_at, at_least=0.0, below=1.0)
-
-
-@dataclass(frozen=True)
-class RunRequest:
-    """What is asked for: one cell of a comparison.
-
-    Attributes:
-        plant: its name.
-        controller: its name.
-        task: its name.
-        mismatch: as `servobench.plant.robot.mismatch` reads it.
-        seed: of everything random in the run.
-        noise_factor: on the sensor noise that the plant is configured with.
-        latency_periods: of the camera; None for what the plant is configured with.
-    """
-
-    plant: str
-    controller: str
-    task: str
-    mismatch: str
-    seed: int
-    noise_factor: float = 1.0
-    latency_periods: int | None = None
-
-    @property
-    def run_id(self) -> str:
-        """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        mismatch = re.sub(r"[^A-Za-z0-9.=+_-]", "_", self.mismatch)
-        plant = re.sub(r"[^A-Za-z0-9.=+_-]", "_", self.plant)
-        noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
-        latency = "" if self.latency_periods is None else f"-latency{self.latency_periods}"
-        return f"{plant}-{self.controller}-{self.task}-{mismatch}{noise}{latency}-{self.seed}"
-
-    def as_row(self) -> dict[str, Any]:
-        """Return the columns by which a run is found in the table of runs."""
-        return {"run_id": self.run_id, **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -124,7 +67,7 @@ class Experiment:
     @property
     def periods(self) -> int:
         """Number of control periods."""
-        return max(1, math.ceil(self.scenario.duration / self.run.period - 1e-9))
+        return self.run.periods(self.scenario.duration)
 
 
 def known_sections() -> list[str]:
@@ -152,8 +95,7 @@ def build_experiment(
         return _build_with_own_robot(request, settings, run, entry, keep, progress)
     nominal = nominal_ur5()
     try:
-        mismatch = Mismatch.parse(request.mismatch)
-        true, sample = sample_mismatch(mismatch, nominal, named_seed(request.seed, "mismatch"))
+        true, sample = sample_mismatch(request.mismatch, nominal, named_seed(request.seed, "mismatch"))
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     moved = sample.moved(true)
@@ -187,9 +129,8 @@ def train_networks(controller: str, settings: Settings, progress: Progress) -> T
         trained.append(source(config))
         return trained[-1]
 
-    _build_controller(
-        RunRequest("", controller, "", "", 0), settings, replace(knowledge, train=obtain), lambda: _equations(nominal)
-    )
+    request = RunRequest("", controller, "", Mismatch(), 0)
+    _build_controller(request, settings, replace(knowledge, train=obtain), lambda: _equations(nominal))
     if not trained:
         raise ConfigurationError(f"controller {controller} has no networks to train")
     return trained[-1]
@@ -214,7 +155,7 @@ def _build_with_own_robot(
     progress: Progress | None,
 ) -> Experiment:
     """Make a run ready on a plant of whose robot only the plant itself knows anything."""
-    if request.mismatch != "none":
+    if request.mismatch != Mismatch():
         raise ConfigurationError(
             f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
         )

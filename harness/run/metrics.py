@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 
 from servobench.harness.run.log import Steps
+from servobench.harness.run.references import TaskKind
 from servobench.plant.checks import FloatArray
 
 SETTLING_BAND = 0.005  # [m]
@@ -64,30 +65,30 @@ def path_length(points: FloatArray) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def judge_run(steps: Steps, *, point_to_point: bool, evaluate_from: float) -> dict[str, float]:
+def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, float]:
     """Return the metrics of one run.
 
     Args:
         steps: its rows, at least one.
-        point_to_point: the reference is a fixed target.
+        kind: of the task; "point_to_point" has a fixed target.
         evaluate_from: where the evaluated part begins [s].
 
     Returns:
         Metric name -> value; NaN where a metric does not apply.
     """
-    spec, error = steps.spec, steps.error_norm()
+    spec, error, fixed = steps.spec, steps.error_norm(), kind == "point_to_point"
     # Column after column: the order of a sum decides its last bits, and stored tables are compared bit for bit.
     feature, reference, command = map(np.asfortranarray, (steps.true_feature, steps.reference, steps.command))
     evaluated = error[steps.time >= evaluate_from - 1e-9]
     final = error[-max(1, round(FINAL_SPAN / spec.period)) :]
-    way = float(np.linalg.norm(reference[0] - feature[0])) if point_to_point else path_length(reference)
+    way = float(np.linalg.norm(reference[0] - feature[0])) if fixed else path_length(reference)
     saturated = np.any(np.abs(command) >= spec.joint_velocity_limit * (1 - 1e-9), axis=1)
     jacobian_error, condition = (values[~np.isnan(values)] for values in (
         steps.jacobian_error(), steps.jacobian_condition()))  # fmt: skip
     return {
         "settling_time_s": settling_time(error, SETTLING_BAND, spec.period),
         "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[0], spec.period),
-        "overshoot": overshoot(feature, reference[0]) if point_to_point else np.nan,
+        "overshoot": overshoot(feature, reference[0]) if fixed else np.nan,
         "steady_state_error": float(np.mean(final)),
         "rms_error": _rms(error),
         "max_error": float(np.max(error)),

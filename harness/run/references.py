@@ -6,11 +6,15 @@ import csv
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray, check_number
+
+TaskKind: TypeAlias = Literal["point_to_point", "curve"]
+"""Whether a task's reference is a fixed target or moves."""
 
 
 class Reference(ABC):

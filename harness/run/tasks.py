@@ -20,6 +20,7 @@ from servobench.harness.run.references import (
     FixedPoint,
     Lemniscate,
     Reference,
+    TaskKind,
     line,
     read_waypoints,
 )
@@ -48,14 +49,14 @@ class Scenario:
         reference: the desired feature over time.
         duration: s.
         evaluate_from: s, where the evaluated part begins.
-        point_to_point: the reference is a fixed target.
+        kind: whether the reference is a fixed target or moves.
     """
 
     start: FloatArray | None
     reference: Reference
     duration: float
     evaluate_from: float
-    point_to_point: bool = False
+    kind: TaskKind = "curve"
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,7 @@ def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
 
 def _move(start: Vector, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
     check_number("duration", duration, above=0.0)
-    return Scenario(setting.start(start), reference, duration, 0.75 * duration, point_to_point=True)
+    return Scenario(setting.start(start), reference, duration, 0.75 * duration, "point_to_point")
 
 
 def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:

@@ -28,7 +28,7 @@ from servobench.harness.batch.sweep import Cell, vary
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.places import draw_places
 from servobench.harness.pictures.style import method_styles
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 from servobench.plant.robot.mismatch import parse_magnitudes
 
 BASE: Final = "moderate"

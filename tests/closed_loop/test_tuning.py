@@ -16,7 +16,7 @@ from servobench.harness.batch.seed_ranges import TUNING
 from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
-from servobench.harness.run.experiment import RunSettings
+from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective, study
 from servobench.harness.studies.tuning.files import read_tuned, write_tuned
 from servobench.harness.studies.tuning.objective import (

@@ -12,7 +12,7 @@ from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.fit import train
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 from servobench.plant.kinematic import KinematicConfig, KinematicPlant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec

@@ -18,7 +18,7 @@ from servobench.harness.cli.main import app
 from servobench.harness.config import registry
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 from servobench.harness.run.tasks import TASKS
 
 PLACES = sorted({match.groups() for page in DOCS for match in PLACE.finditer(page.read_text(encoding="utf-8"))})

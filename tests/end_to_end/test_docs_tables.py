@@ -17,7 +17,7 @@ from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 from servobench.plant.faults import RunFault
 from servobench.plant.fmu.config import FmuConfig
 from servobench.plant.fmu.mapping import _KEYS

@@ -12,7 +12,7 @@ from kit.command import servobench
 from kit.foreign_fmu import build_crane, describe
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 
 JOINTS = 'joints = ["wheel.slew", "wheel.luff"]'
 MAPPING = {

@@ -12,7 +12,8 @@ from servobench.fmus.information import read_information
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.experiment import RunRequest, build_experiment
+from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.request import RunRequest
 
 
 def invoke(*arguments: object):

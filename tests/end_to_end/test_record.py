@@ -19,7 +19,7 @@ from servobench.harness.pictures import film as record
 from servobench.harness.pictures.replay import Replay, Trail, logged_run
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 
 REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)
 

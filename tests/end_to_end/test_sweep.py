@@ -205,7 +205,7 @@ def test_variations_are_put_on_top_of_the_mismatch_one_by_one():
     plan = SweepPlan(batch, (parse_variation("links=10/20%"), parse_variation("tool=5mm")), (1.0,), (None, 2))
     cells = plan.cells()
     assert len(cells) == 3 * 2 * 2 * 2
-    assert {cell.request.mismatch for cell in cells} == {
+    assert {str(cell.request.mismatch) for cell in cells} == {
         "links=10%", "moderate+links=10%", "links=20%", "moderate+links=20%", "tool=5mm", "moderate+tool=5mm",
     }  # fmt: skip
     assert vary("moderate", "", "") == "moderate"

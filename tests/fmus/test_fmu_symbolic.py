@@ -17,7 +17,8 @@ from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest, build_experiment
+from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.request import RunRequest
 from servobench.plant.fmu.archive import PREFIX
 from servobench.plant.fmu.entry import mapped_entry
 from servobench.plant.fmu.model_exchange import FmuModel

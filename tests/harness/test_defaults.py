@@ -12,7 +12,7 @@ from servobench.harness.config import defaults
 from servobench.harness.config.defaults import default_config, tuned_file
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest
 
 
 @pytest.fixture

@@ -50,7 +50,7 @@ def test_the_path_length_of_a_square_is_its_circumference():
 
 
 def test_a_run_is_judged_by_hand_computed_figures():
-    got = judge_run(straight_move().steps(), point_to_point=True, evaluate_from=1.0)
+    got = judge_run(straight_move().steps(), "point_to_point", evaluate_from=1.0)
     assert got["settling_time_s"] == 2.0
     assert got["rms_error"] == pytest.approx(np.sqrt(1.25 / 4))
     assert got["rms_error_evaluated"] == pytest.approx(np.sqrt(0.25 / 3))
@@ -67,4 +67,4 @@ def test_a_run_is_judged_by_hand_computed_figures():
 
 
 def test_a_moving_reference_has_no_overshoot():
-    assert np.isnan(judge_run(straight_move().steps(), point_to_point=False, evaluate_from=0.0)["overshoot"])
+    assert np.isnan(judge_run(straight_move().steps(), "curve", evaluate_from=0.0)["overshoot"])

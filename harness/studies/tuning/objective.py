@@ -28,7 +28,7 @@ from servobench.harness.batch.workers import leave_interrupts_to_parent
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import COMPLETED, run_experiment
-from servobench.harness.run.experiment import RunRequest
+from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.tasks import find_task
 
 MOVE: Final = "random"
@@ -145,7 +145,7 @@ def carry_out(trial: Trial, run: TuningRun) -> float:
         ConfigurationError: settings that the controller or the plant refuses.
     """
     settings = Settings({trial.controller: trial.settings, run.plant: {"latency_periods": run.latency_periods}})
-    request = RunRequest(run.plant, trial.controller, run.task, MISMATCH, run.seed)
+    request = RunRequest(run.plant, trial.controller, run.task, read_mismatch(MISMATCH), run.seed)
     return run_cost(run.task, run_experiment(request, settings).row)
 
 

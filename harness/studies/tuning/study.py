@@ -27,7 +27,8 @@ from optuna.storages.journal import JournalFileBackend, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten
-from servobench.harness.run.experiment import RunRequest, RunSettings, build_experiment
+from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.files import TunedValues, write_tuned
 from servobench.harness.studies.tuning.objective import (
@@ -281,5 +282,5 @@ def write_outcomes(folder: Path, studies: Sequence[MethodStudy]) -> Mapping[str,
 
 def _train(trial: Trial, plant: str) -> None:
     """Build the controller once, so that networks which it needs are in the cache before the workers ask for them."""
-    request = RunRequest(plant, trial.controller, objective.MOVE, objective.MISMATCH, 0)
+    request = RunRequest(plant, trial.controller, objective.MOVE, read_mismatch(objective.MISMATCH), 0)
     build_experiment(request, Settings({trial.controller: trial.settings})).plant.close()

@@ -1,0 +1,90 @@
+"""What a run is asked for: one cell of a comparison, and the settings that are common to all cells."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.robot.mismatch import Mismatch
+from servobench.plant.settings import Count, Periods, Positive, ShareBelowOne, settings
+
+UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
+
+
+@settings
+class RunSettings:
+    """The section `run`: what is common to all plants, controllers and tasks."""
+
+    period: Positive = 0.05
+    """[s] control period"""
+    preview: Periods = 10
+    """future rows of the reference that every controller gets"""
+    lost_after_periods: Count = 20
+    """a run ends after so many periods in a row without a valid feature"""
+    camera_moves_at: ShareBelowOne = 0.5
+    """share of the run after which a mismatch's `camera_move` happens"""
+    full_jacobian: bool = False
+    """log every entry of the estimated and the true Jacobian"""
+
+    def periods(self, duration: float) -> int:
+        """Return how many control periods a run of `duration` [s] has."""
+        return max(1, math.ceil(duration / self.period - 1e-9))
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """One cell of a comparison.
+
+    Attributes:
+        plant: its name.
+        controller: its name.
+        task: its name.
+        mismatch: how far the true robot may be from the nominal one; its text is read, too.
+        seed: of everything random in the run.
+        noise_factor: multiplies the sensor noise that the plant is configured with.
+        latency_periods: of the camera; None for what the plant is configured with.
+
+    Raises:
+        ConfigurationError: a text that is no mismatch.
+    """
+
+    plant: str
+    controller: str
+    task: str
+    mismatch: Mismatch
+    seed: int
+    noise_factor: float = 1.0
+    latency_periods: int | None = None
+
+    def __post_init__(self) -> None:
+        """Read a mismatch that came as text."""
+        given: object = self.mismatch
+        if isinstance(given, str):
+            object.__setattr__(self, "mismatch", read_mismatch(given))
+
+    @property
+    def run_id(self) -> str:
+        """Return a name for the run that is the same wherever it is made, and fit for a file."""
+        mismatch, plant = (UNFIT_FOR_FILES.sub("_", str(name)) for name in (self.mismatch, self.plant))
+        noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
+        latency = "" if self.latency_periods is None else f"-latency{self.latency_periods}"
+        return f"{plant}-{self.controller}-{self.task}-{mismatch}{noise}{latency}-{self.seed}"
+
+    def as_row(self) -> dict[str, Any]:
+        """Return the columns by which a run is found in the table of runs."""
+        return {"run_id": self.run_id, **asdict(self), "mismatch": str(self.mismatch)}
+
+
+def read_mismatch(text: str) -> Mismatch:
+    """Return the mismatch that a user wrote.
+
+    Raises:
+        ConfigurationError: it cannot be read.
+    """
+    try:
+        return Mismatch.parse(text)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
