@@ -1,83 +1,60 @@
-"""One self-contained page about a results folder: the analysis notebook, run on it and turned into HTML.
+"""One self-contained page about a results folder: tables that sort, figures, and paths in space to turn.
 
-The notebook lies in `notebooks/` of the source tree and in `harness/notebooks/` of an installed package. Its results
-folder is given by the environment variable SERVOBENCH_RESULTS. The page holds its pictures, tables and scripts itself;
-it needs no network.
+The page holds its pictures, tables and scripts itself; it needs no network. `notebooks/analysis.ipynb` shows the same
+tables and figures in a notebook.
 """
 
 from __future__ import annotations
 
-import html
-import os
-import re
-import sys
-import tempfile
+import base64
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-import nbformat
-from jupyter_client.kernelspec import KernelSpec, KernelSpecManager
-from jupyter_client.manager import AsyncKernelManager
-from nbclient import NotebookClient
-from nbclient.exceptions import CellControlSignal, DeadKernelError
-from nbconvert.exporters import HTMLExporter
+import pandas as pd
+from itables import options, to_html_datatable
+from itables.javascript import generate_init_offline_itables_html
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
+from servobench.harness.analysis.comparison import split_tasks
+from servobench.harness.analysis.folder import describe_folder, other_tables
+from servobench.harness.analysis.tables import (
+    cost_table,
+    failure_table,
+    runs_table,
+    settling_table,
+    tracking_table,
+)
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.pictures.conditions import draw_conditions
+from servobench.harness.pictures.draw import folder_figures, picture_of
+from servobench.harness.pictures.interactive import interactive_paths, plotly_script
+from servobench.harness.pictures.style import figure_style, method_styles
 
-NAME = "report.html"
-NOTEBOOK = "analysis.ipynb"
-FOLDER_VARIABLE = "SERVOBENCH_RESULTS"
-NOT_IN_PAGE = "notebook-only"  # tag of cells that say how to use the notebook
-CELL_TIMEOUT = 600  # s
-SLOW = 20.0  # s beyond which a report counts as slow
-
-PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<link rel="icon" href="data:,">
-<style>
-body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 0 auto; padding: 1.5rem; }}
-h1 {{ font-size: 1.8rem; }}
-h2 {{ margin-top: 2.8rem; border-bottom: 1px solid #ddd; padding-bottom: .2rem; }}
-nav a {{ margin-right: 1rem; white-space: nowrap; }}
-a {{ color: #0060a8; }}
-img {{ max-width: 100%; height: auto; }}
-table {{ border-collapse: collapse; font-size: 13px; }}
-th, td {{ padding: .25rem .6rem; }}
-.output_png {{ margin: 1.2rem 0; }}
-.anchor-link {{ display: none; }}
-pre {{ white-space: pre-wrap; }}
-footer {{ margin-top: 3rem; font-size: 13px; color: #666; }}
-</style>
-</head>
-<body>
-<nav>{contents}</nav>
-{body}
-<footer>Made by <code>servobench report</code> from the tables in <code>{folder}</code>.</footer>
-</body>
-</html>
-"""
+NAME: Final = "report.html"
+TEMPLATE: Final = "report.html.j2"
+MAX_PICTURES: Final = 24  # a page stays under 10 MB; all figures are in the folder itself
+ROWS_AT_ONCE: Final = 15  # a longer table gets a search field and pages
 
 
-class ReportFailed(ConfigurationError):
-    """The notebook could not be run; the message says which cell and why."""
+@dataclass(frozen=True)
+class Picture:
+    """A figure as it stands in the page.
 
-
-def notebook_path() -> Path:
-    """Return where the analysis notebook lies.
-
-    Raises:
-        ConfigurationError: it is in neither place.
+    Attributes:
+        kind: what it shows; see `harness.pictures.draw`.
+        title: alternative text.
+        data: the PNG file, base64.
+        width: at which it is shown [px].
     """
-    package = Path(__file__).resolve().parents[1]
-    for path in (package.parent / "notebooks" / NOTEBOOK, package / "notebooks" / NOTEBOOK):
-        if path.is_file():
-            return path
-    raise ConfigurationError(f"the notebook {NOTEBOOK} is not beside the package; install servobench again")
+
+    kind: str
+    title: str
+    data: str
+    width: int
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
@@ -91,12 +68,13 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         The page's path.
 
     Raises:
-        ConfigurationError: not a results folder, no run in it, or the notebook fails.
+        ConfigurationError: not a results folder, no run in it, or the page cannot be written.
     """
-    if results.load_runs(folder).empty:
+    runs = results.load_runs(folder)
+    if runs.empty:
         raise ConfigurationError(f"{folder} holds no finished run")
     target = path or folder / NAME
-    page = _page(execute_notebook(folder), folder)
+    page = _page(folder, runs)
     partial = target.with_name(f".{target.name}")
     try:
         partial.write_text(page, encoding="utf-8")
@@ -106,65 +84,62 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
     return target
 
 
-class _ThisPython(KernelSpecManager):
-    """Starts kernels with the interpreter of this process, whatever kernels a user has registered."""
-
-    def get_kernel_spec(self, kernel_name: str) -> KernelSpec:
-        """Return how to start a kernel, whatever its name."""
-        argv = [sys.executable, "-m", "ipykernel_launcher", "--log-level=ERROR", "-f", "{connection_file}"]
-        return KernelSpec(argv=argv, display_name=kernel_name, language="python")
-
-
-def _kernel_class(connection: Path) -> type[AsyncKernelManager]:
-    """Return a manager of a kernel of this interpreter that talks over files beside `connection`."""
-
-    class ThisKernel(AsyncKernelManager):
-        def __init__(self, **settings: Any) -> None:  # noqa: ANN401 - handed on to traitlets
-            super().__init__(
-                kernel_spec_manager=_ThisPython(),
-                connection_file=str(connection),
-                transport="ipc" if os.name == "posix" else "tcp",  # such sockets are open to nobody else
-                **settings,
-            )
-
-    return ThisKernel
+def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
+    """Return the figure of the conditions that a results folder varies, and its first figures of steps."""
+    pictures: list[Picture] = []
+    with figure_style():
+        overview = draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
+    if overview is not None:
+        pictures.append(_picture("conditions", "share of settled runs over what was varied", overview))
+    for named in folder_figures(folder):
+        if named.kind != "joint_speeds" and len(pictures) < MAX_PICTURES:
+            pictures.append(_picture(named.kind, named.title, named.figure))
+    return pictures
 
 
-def execute_notebook(folder: Path) -> Any:  # noqa: ANN401 - a notebook as nbformat has it, untyped
-    """Return the analysis notebook with its outputs for a results folder.
-
-    Raises:
-        ReportFailed: a cell fails, or the kernel does not start.
-    """
-    text = notebook_path().read_text(encoding="utf-8")
-    notebook: Any = nbformat.reads(text, as_version=4)  # type: ignore[no-untyped-call]
-    # The kernel finds the packages that this process has found, wherever they are.
-    paths = [str(Path(__file__).parents[3]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {
-        FOLDER_VARIABLE: str(folder.resolve()),
-        "PYTHONPATH": os.pathsep.join(paths),
-        "PYDEVD_DISABLE_FILE_VALIDATION": "1",
+def table_options(table: pd.DataFrame) -> dict[str, Any]:
+    """Return how itables shows a table: columns sort by a click, a long table has a search field and pages."""
+    long = len(table) > ROWS_AT_ONCE
+    parts = {"topStart": "search", "topEnd": "pageLength", "bottomStart": "info", "bottomEnd": "paging"}
+    return {
+        "connected": False,
+        "showIndex": False,
+        "layout": {place: part if long else None for place, part in parts.items()},
+        "lengthMenu": [ROWS_AT_ONCE, 60, 250],
+        "maxBytes": "4MB",
+        "scrollX": True,
+        "classes": "display nowrap compact",
+        "text_in_header_can_be_selected": False,
     }
-    try:
-        with tempfile.TemporaryDirectory(prefix="servobench-") as scratch:
-            kernel = _kernel_class(Path(scratch) / "kernel.json")
-            NotebookClient(notebook, timeout=CELL_TIMEOUT, kernel_manager_class=kernel).execute(env=environment)
-    except (CellControlSignal, DeadKernelError, RuntimeError, OSError) as error:
-        reason = re.sub(r"\x1b\[[0-9;]*m", "", str(error)).strip().splitlines() or [type(error).__name__]
-        raise ReportFailed(f"report on {folder}: the notebook failed: {reason[-1]}") from error
-    return notebook
 
 
-def _page(notebook: Any, folder: Path) -> str:  # noqa: ANN401
-    exporter: Any = HTMLExporter(  # type: ignore[no-untyped-call] # nbconvert leaves its constructors untyped
-        template_name="basic",
-        exclude_input=True,
-        exclude_input_prompt=True,
-        exclude_output_prompt=True,
+def _page(folder: Path, runs: pd.DataFrame) -> str:
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    notebook.cells = [cell for cell in notebook.cells if NOT_IN_PAGE not in cell.metadata.get("tags", [])]
-    body, _ = exporter.from_notebook_node(notebook)
-    headings = re.findall(r'<h2 id="([^"]+)">(.*?)<', body)
-    contents = " ".join(f'<a href="#{anchor}">{text}</a>' for anchor, text in headings)
-    name = html.escape(folder.resolve().name)
-    return PAGE.format(title=f"servobench: {name}", contents=contents, body=body, folder=name)
+    paths = interactive_paths(folder)
+    scripts = generate_init_offline_itables_html(options.dt_bundle) + (plotly_script() if paths else "")
+    return environment.get_template(TEMPLATE).render(
+        folder=folder.resolve().name,
+        scripts=Markup(scripts),
+        table=lambda rows: Markup(to_html_datatable(rows, **table_options(rows))),
+        facts=describe_folder(folder, runs),
+        others=list(other_tables(folder)),
+        pictures=report_pictures(folder, runs),
+        max_pictures=MAX_PICTURES,
+        paths=Markup(paths),
+        settling=settling_table(runs),
+        tracking=tracking_table(runs),
+        costs=cost_table(runs),
+        failures=failure_table(runs),
+        runs=runs_table(runs),
+    )
+
+
+def _picture(kind: str, title: str, figure: Figure) -> Picture:
+    content, width = picture_of(figure)
+    return Picture(kind, title, base64.b64encode(content).decode("ascii"), width)
