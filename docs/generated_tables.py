@@ -32,6 +32,7 @@ from servobench.fmus.export import arm_layout
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
 PART = re.compile(r"(<!-- (settings|variables): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+UNIT = re.compile(r"(?:\[(.+?)\] )?(.*)")  # what a string below a field begins with
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
@@ -59,8 +60,11 @@ def settings_table(kind: type[Any]) -> str:
     Raises:
         ValueError: a field has no string below it.
     """
-    rows = [(f"`{name}`", toml(value), wanted, meaning) for name, value, wanted, meaning in settings_rows(kind(), "")]
-    return table(("setting", "default", "allowed", "meaning"), rows)
+    rows = []
+    for name, value, wanted, string in settings_rows(kind(), ""):
+        unit, meaning = UNIT.fullmatch(string).groups(default="")  # type: ignore[union-attr]
+        rows.append((f"`{name}`", toml(value), unit, wanted, meaning))
+    return table(("setting", "default", "unit", "allowed", "meaning"), rows)
 
 
 def settings_rows(config: Any, prefix: str) -> Iterator[tuple[str, Any, str, str]]:  # noqa: ANN401 - any settings
@@ -98,13 +102,13 @@ def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
         ]
         return ", ".join(part for part in (allowed(arguments[0]), *bounds) if part)
     if origin is Literal:
-        return " or ".join(map(toml, arguments))
+        return ", ".join(map(toml, arguments))
     if origin in (Union, UnionType):
         return " or ".join(filter(None, (allowed(each) for each in arguments if each is not NoneType)))
     if origin is tuple:
         each = allowed(arguments[0])
-        size = "" if arguments[-1] is Ellipsis else f"{len(arguments)} "
-        return f"{size}numbers" + (f", each {each}" if each else "")
+        size = "list" if arguments[-1] is Ellipsis else f"{len(arguments)} numbers"
+        return size + (f", each {each}" if each else "")
     return "whole" if hint is int else ""
 
 
