@@ -17,7 +17,8 @@ import pandas as pd
 
 from kit.documents import names, read, section, tables
 from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.analysis.statistics import settled_share, success_rate
+from servobench.harness.analysis.comparison import settled_share
+from servobench.harness.analysis.statistics import success_rate
 from servobench.harness.batch.results import load_runs
 
 CONFIDENCE = 0.99

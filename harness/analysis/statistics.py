@@ -1,15 +1,7 @@
-"""How sure a comparison is: rates, medians and paired differences with intervals, tails, and kinds of failure.
+"""How sure a number is: rates, medians and tails with intervals, and tests of paired differences.
 
-All functions are pure, and seeded where they draw. What a run that never settled counts as is said with each function:
-
-| function | a run that never settled (settling time NaN) |
-|---|---|
-| `success_rate` | is no success |
-| `median_with_interval`, `tail_mean` | counts as +∞: so does a median where half of the runs or more never settle |
-| `compare_pairs` | counts as `never`, the duration of the run: a bound from below, as ranks need finite numbers |
-| `outcomes` | is `not_settled` if it completed, else the fault |
-
-A run that did not complete never settled, whatever its error was before: `settling_times` says so.
+All functions are pure, and seeded where they draw. In `median_with_interval` and `tail_mean` a missing value counts as
++∞ unless it is left out: so does a median where half of the values or more are missing.
 """
 
 from __future__ import annotations
@@ -19,28 +11,24 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike
 
-from servobench.harness.run.episode import COMPLETED
 from servobench.plant.checks import FloatArray
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 2000
-SETTLED: Final = "settled"
-NOT_SETTLED: Final = "not_settled"
-KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
+MISSING: Final = "–"  # text for a number that there is not
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its interval.
+    """A number with its interval; `f"{estimate:.2f}"` is `0.75 [0.70, 0.80]`.
 
     Attributes:
         value: the estimate.
-        low: lower end; NaN where the sample is too small to tell.
+        low: lower end; NaN where the sample is too small for an interval.
         high: upper end, likewise.
-        count: size of the sample.
+        count: size of the sample; 0 where there is no number.
     """
 
     value: float
@@ -48,24 +36,16 @@ class Estimate:
     high: float
     count: int
 
+    def __format__(self, spec: str) -> str:
+        """Return value and interval, each formatted with `spec`."""
+        return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]" if self.count else MISSING
 
-@dataclass(frozen=True)
-class Comparison:
-    """Two controllers on the same plants, tasks and seeds.
+    def scaled(self, factor: float) -> Estimate:
+        """Return the estimate in another unit."""
+        return Estimate(factor * self.value, factor * self.low, factor * self.high, self.count)
 
-    Attributes:
-        first: name of a controller.
-        second: name of the other.
-        difference: median of first − second over pairs; below 0 the first one is better.
-        p_value: two-sided, of the Wilcoxon signed-rank test.
-        corrected_p_value: after Holm, over all comparisons made together.
-    """
 
-    first: str
-    second: str
-    difference: Estimate
-    p_value: float
-    corrected_p_value: float
+NO_ESTIMATE: Final = Estimate(np.nan, np.nan, np.nan, 0)
 
 
 def success_rate(successes: int, runs: int, confidence: float = CONFIDENCE) -> Estimate:
@@ -149,46 +129,6 @@ def tail_mean(
     return float(weight @ sample / weight.sum())
 
 
-def compare_pairs(
-    runs: pd.DataFrame,
-    pairs: Sequence[tuple[str, str]],
-    *,
-    never: float,
-    metric: str = "settling_time_s",
-    keys: Sequence[str] = KEYS,
-    seed: int = 0,
-    confidence: float = CONFIDENCE,
-) -> list[Comparison]:
-    """Compare controllers on the runs that they share, and correct for the number of comparisons.
-
-    Wilcoxon's signed-rank test, two-sided, and Holm's correction over all `pairs`; see `signed_rank_p_value`. Settling
-    times are whole periods, so equal ones are frequent.
-
-    Args:
-        runs: the table of runs.
-        pairs: names of controllers, two and two.
-        never: what a run counts as that has no value or did not complete; for settling times the duration, s.
-        metric: the column compared, less is better.
-        keys: columns that two runs of a pair share.
-        seed: of the bootstrap interval of the median difference.
-        confidence: of that interval.
-
-    Raises:
-        ValueError: no pair, two controllers without a common run, or two runs of a controller with the same keys.
-    """
-    if not pairs:
-        raise ValueError("pairs must hold at least one pair of controllers")
-    differences = [_differences(runs, pair, never, metric, keys) for pair in pairs]
-    p_values = [signed_rank_p_value(difference) for difference in differences]
-    corrected = holm(p_values)
-    return [
-        Comparison(
-            *pair, median_with_interval(difference, seed=seed, confidence=confidence), p_value, float(corrected_p_value)
-        )
-        for pair, difference, p_value, corrected_p_value in zip(pairs, differences, p_values, corrected, strict=True)
-    ]
-
-
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values after Holm's correction for their number."""
     order = np.argsort(p_values)
@@ -212,28 +152,6 @@ def signed_rank_p_value(differences: ArrayLike) -> float:
     return float(stats.wilcoxon(np.round(difference / largest, 9), zero_method="pratt").pvalue)
 
 
-def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
-    """Return a column of the table of runs, NaN throughout where the table has none of this name."""
-    return runs.reindex(columns=[name])[name].astype(float)
-
-
-def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
-    """Return the settling time of each run, s; NaN where it never settled or did not complete."""
-    return column_of(runs, "settling_time_s").where(runs["status"] == COMPLETED)
-
-
-def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
-    """Return how many of `runs` settled, in percent, with the Wilson interval."""
-    rate = success_rate(int(settling_times(runs).notna().sum()), len(runs), confidence)
-    return Estimate(100.0 * rate.value, 100.0 * rate.low, 100.0 * rate.high, rate.count)
-
-
-def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
-    """Return for each run `settled`, `not_settled` (it completed, outside the band) or the fault that ended it."""
-    settled = pd.Series(np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED), index=runs.index)
-    return settled.where(runs["status"] == COMPLETED, runs["status"]).rename("outcome").astype(str)
-
-
 def _sample(values: ArrayLike, missing: Literal["infinite", "left_out"]) -> FloatArray:
     sample = np.array(values, dtype=np.float64).ravel()
     if np.isneginf(sample).any():
@@ -245,18 +163,3 @@ def _sample(values: ArrayLike, missing: Literal["infinite", "left_out"]) -> Floa
 def _restored(values: FloatArray, largest: float) -> FloatArray:
     """Return `values` with +∞ for all that lie above the largest finite one of the sample."""
     return np.where(values > largest, np.inf, values)
-
-
-def _differences(
-    runs: pd.DataFrame, pair: tuple[str, str], never: float, metric: str, keys: Sequence[str]
-) -> FloatArray:
-    values = column_of(runs, metric).where(runs["status"] == COMPLETED).fillna(never)
-    indexed = pd.Series(values.to_numpy(), index=pd.MultiIndex.from_frame(runs[list(keys)]))
-    first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
-    for name, series in zip(pair, (first, second), strict=True):
-        if series.index.has_duplicates:
-            raise ValueError(f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous")
-    first, second = first.align(second, join="inner")
-    if len(first) == 0:
-        raise ValueError(f"{pair[0]} and {pair[1]} have no run in common: nothing to compare")
-    return np.asarray(first - second, dtype=np.float64)

@@ -10,11 +10,10 @@ from typing import Annotated, Any
 
 import pandas as pd
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.analysis.summary import summary_tables
+from servobench.harness.analysis.tables import SUMMARY_LEGEND, summary_tables
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import (
     Batch,
@@ -34,11 +33,10 @@ from servobench.harness.cli.options import (
     split_words,
 )
 from servobench.harness.cli.progress import run_progress
-from servobench.harness.cli.record import record
-from servobench.harness.cli.report import make_report, report
 from servobench.harness.cli.robustness import robustness
-from servobench.harness.cli.statistics import statistics
+from servobench.harness.cli.show import make_report, record, report, statistics
 from servobench.harness.cli.sweep import sweep
+from servobench.harness.cli.terminal import console, print_tables
 from servobench.harness.cli.tune import tune
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import (
@@ -63,7 +61,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console()
 
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
 ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
@@ -210,7 +207,7 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None,
             interrupted = True
     results.collect(folder)
     runs = results.load_runs(folder)
-    console.print(summary_tables(runs))
+    print_tables(summary_tables(runs), SUMMARY_LEGEND)
     _print_faults(runs)
     with console.status("drawing the figures"):
         from servobench.harness.pictures.draw import draw_figures  # noqa: PLC0415 - matplotlib takes a third of a second to import

@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.analysis.sweep_summary import sweep_tables
+from servobench.harness.analysis.tables import SWEEP_LEGEND, sweep_tables
 from servobench.harness.batch import results
 from servobench.harness.batch.cluster import Backend, open_backend
 from servobench.harness.batch.compare import Batch, check_batch, parse_seeds
@@ -34,6 +34,7 @@ from servobench.harness.cli.options import (
     split_words,
 )
 from servobench.harness.cli.progress import sweep_progress
+from servobench.harness.cli.terminal import print_tables
 from servobench.harness.config.registry import (
     controller_names,
     find_controller,
@@ -80,7 +81,7 @@ def sweep(
         tuple(_numbers("latency", latency, int)) if latency.strip() else (None,),
     )
     carry_out_sweep(plan.cells(), read_settings(config, set_ or []), out, workers, scheduler, resume=resume)
-    console.print(sweep_tables(results.load_runs(out)))
+    print_tables(sweep_tables(results.load_runs(out)), SWEEP_LEGEND)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.statistics import Estimate, settled_share
+from servobench.harness.analysis.comparison import settled_share
+from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
 from servobench.harness.pictures.panels import (
     Styles,
     add_legend,
@@ -44,7 +44,7 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
 
 
 def _share(runs: pd.DataFrame | None) -> Estimate:
-    return Estimate(np.nan, np.nan, np.nan, 0) if runs is None else settled_share(runs)
+    return NO_ESTIMATE if runs is None else settled_share(runs)
 
 
 def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:

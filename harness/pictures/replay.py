@@ -78,12 +78,12 @@ class LoggedRun:
     reference: FloatArray
 
 
-def logged_run(row: dict[str, Any], steps: pd.DataFrame, settings: dict[str, Any]) -> LoggedRun:
+def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[str, Any]) -> LoggedRun:
     """Return a run made ready to be shown.
 
     Args:
         row: its row in the table of runs.
-        steps: its rows in the table of steps.
+        steps: its rows in the table of steps, if any.
         settings: the rendered plant's settings by name, as a manifest has them; empty for the defaults.
 
     Raises:
@@ -94,7 +94,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame, settings: dict[str, Any
         raise ConfigurationError(
             f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own, no UR5"
         )
-    if steps.empty:
+    if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
     track = Track(run_id, row["status"], steps.reset_index(drop=True))
     names = [f"joint_position_{name}_rad" for name in ur5.JOINT_NAMES]

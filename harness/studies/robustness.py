@@ -16,12 +16,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.statistics import (
-    Estimate,
-    median_with_interval,
-    settled_share,
-    settling_times,
-)
+from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.sweep import Cell, vary

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
-from servobench.harness.analysis.report_tables import split_tasks
+from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures.conditions import draw_conditions

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
-from servobench.harness.analysis.statistics import settled_share
+from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.studies.robustness import (

@@ -11,13 +11,12 @@ from scipy import optimize, stats
 from statsmodels.stats.multitest import multipletests
 from statsmodels.stats.proportion import proportion_confint
 
+from servobench.harness.analysis.comparison import Comparison, compare_pairs, outcomes, settling_times
 from servobench.harness.analysis.statistics import (
-    Comparison,
-    compare_pairs,
+    NO_ESTIMATE,
+    Estimate,
     holm,
     median_with_interval,
-    outcomes,
-    settling_times,
     signed_rank_p_value,
     success_rate,
     tail_mean,
@@ -60,6 +59,12 @@ def test_the_wilson_interval_is_that_of_statsmodels(runs, share):
     found = success_rate(successes, runs)
     wanted = proportion_confint(successes, runs, method="wilson")
     assert (found.low, found.high) == pytest.approx(wanted, abs=1e-14)
+
+
+def test_an_estimate_is_printed_with_its_interval_and_a_missing_one_as_a_dash():
+    assert f"{Estimate(0.754, 0.5, np.inf, 3):.2f}" == "0.75 [0.50, inf]"
+    assert f"{Estimate(0.002, 0.001, 0.003, 3).scaled(1000.0):.0f}" == "2 [1, 3]"
+    assert f"{NO_ESTIMATE:.1f}" == "–"
 
 
 @given(p_values=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=15))

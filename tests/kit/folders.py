@@ -42,6 +42,7 @@ def made_up_row(run_id: str, **values: object) -> dict[str, object]:
         "steady_state_error": 0.001, "rms_error_evaluated": 0.002, "max_error": 0.5, "control_effort_rad": 3.0,
         "saturation_fraction": 0.1, "jacobian_error_mean": 0.3, "controller_time_median_us": 130.0,
         "controller_time_p99_us": 159.0, "periods": 60, "reason": "", "mismatch_values": "{}",
+        "task_kind": "point_to_point", "feature_unit": "m",
     }  # fmt: skip
     return row | values
 
@@ -62,7 +63,7 @@ def comparison(folder: Path, controllers=CONTROLLERS, tasks=("exp1", "exp2", "ci
         for controller in controllers:
             run_id = f"kinematic-{controller}-{task}-moderate-0"
             curve = task == "circle"
-            judged = {"overshoot": np.nan, "settling_time_s": np.nan} if curve else {}
+            judged = {"overshoot": np.nan, "settling_time_s": np.nan, "task_kind": "curve"} if curve else {}
             rows.append(made_up_row(run_id, controller=controller, task=task, **judged))
             steps.append(made_up_steps(run_id, curve=curve))
     return write_folder(folder, rows, steps)

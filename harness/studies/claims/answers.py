@@ -24,11 +24,10 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from servobench.harness.analysis.comparison import compare_pairs, settling_times
 from servobench.harness.analysis.statistics import (
-    compare_pairs,
     holm,
     median_with_interval,
-    settling_times,
     signed_rank_p_value,
     success_rate,
 )
@@ -43,7 +42,6 @@ from servobench.harness.studies.claims.measurements import (
     held,
     listed,
     medians,
-    number,
     pairings,
 )
 from servobench.harness.studies.claims.studies import (
@@ -119,8 +117,8 @@ def _alike(tables: Tables, plant: str) -> Answer:
         Measurement("circle, RMS of the second lap, mm", CIRCLE, name, circle_error(tables[MAIN], name))
         for name in ("ukf_mfac", "ukf_mpc")
     ]
-    differences = ", ".join(f"{m.place} {number(m.estimate, 2)} s" for m in measured)
-    circle = " against ".join(f"{number(m.estimate, 1)} mm ({m.label})" for m in laps)
+    differences = ", ".join(f"{m.place} {m.estimate:.2f} s" for m in measured)
+    circle = " against ".join(f"{m.estimate:.1f} mm ({m.label})" for m in laps)
     return answer("3", "UKF+MPC and UKF+MFAC behave alike", plant, measured, f"{differences}; circle {circle}", laps)
 
 
@@ -136,7 +134,7 @@ def _leaving(tables: Tables, plant: str) -> Answer:
     for (label, difference), p_value in zip(pairs.items(), corrected, strict=True):
         middle = median_with_interval(difference)
         measured.append(Measurement(panel, "exp1, exp4", label, middle, p_value < LEVEL and middle.value > 0.0))
-    evidence = "; ".join(f"{m.label} {number(m.estimate, 2)} s" for m in measured)
+    evidence = "; ".join(f"{m.label} {m.estimate:.2f} s" for m in measured)
     return answer("4", "outside the region both RBF methods suffer, the proposed more", plant, measured, evidence)
 
 
@@ -158,7 +156,7 @@ def _circle(tables: Tables, plant: str) -> Answer:
     rate = success_rate(good, len(own))
     share = Measurement("within 10 mm RMS, share", CIRCLE, PROPOSED, rate, rate.low > MOST)
     evidence = f"within 10 mm in {good} of {len(own)}; medians " + ", ".join(
-        f"{m.label} {number(m.estimate, 1)} mm" for m in measured
+        f"{m.label} {m.estimate:.1f} mm" for m in measured
     )
     return answer("5", "tracks a circle of 0.3 m radius", plant, [share], evidence, measured)
 
@@ -230,8 +228,8 @@ def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) 
             Measurement("circle, RMS of the second lap, mm", CIRCLE, kind, circle_error(table, PROPOSED)),
         ]
     texts = [
-        f"{kind}: settled {100 * share.estimate.value:.0f} %, median {number(time.estimate, 2)} s, circle "
-        f"{number(lap.estimate, 1)} mm"
+        f"{kind}: settled {100 * share.estimate.value:.0f} %, median {time.estimate:.2f} s, circle "
+        f"{lap.estimate:.1f} mm"
         for kind, (share, time, lap) in zip(("default", label), (measured[:3], measured[3:]), strict=True)
     ]
     keys = ["task", "seed"]

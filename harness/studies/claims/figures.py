@@ -9,12 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.statistics import Estimate
+from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.pictures.places import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.studies.claims.measurements import Answer, Measurement
-
-NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
 
 
 def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
@@ -60,7 +58,7 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
     places = list(dict.fromkeys(m.place for m in measured))
     labels = list(dict.fromkeys(m.label for m in measured))
     known = {(m.label, m.place): m.estimate for m in measured}
-    values = {label: [known.get((label, place), NOTHING) for place in places] for label in labels}
+    values = {label: [known.get((label, place), NO_ESTIMATE) for place in places] for label in labels}
     draw_places(axes, range(len(places)), values, method_styles(labels), joined=False)
     axes.set_xticks(range(len(places)), places)
     axes.set_xlim(-0.6, len(places) - 0.4)

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
 import pandas as pd
 
+from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import (
+    NO_ESTIMATE,
     Estimate,
     holm,
     median_with_interval,
-    settling_times,
     signed_rank_p_value,
 )
 from servobench.harness.run.episode import COMPLETED
@@ -95,7 +95,7 @@ def pairings(
                       for _, _, difference in found])  # fmt: skip
     measured = []
     for (task, rival, difference), p_value in zip(found, corrected, strict=True):
-        middle = median_with_interval(difference) if len(difference) else Estimate(np.nan, np.nan, np.nan, 0)
+        middle = median_with_interval(difference) if len(difference) else NO_ESTIMATE
         measured.append(Measurement(panel, task, rival, middle, p_value < LEVEL and sign * difference.mean() > 0.0))
     return measured
 
@@ -163,8 +163,3 @@ def answer(
     else:
         verdict = f"{DEPENDS}: holds in {count} of {len(judged)}" if count else NOT_REPRODUCED
     return Answer(claim, statement, plant, verdict, evidence, (*judged, *beside))
-
-
-def number(estimate: Estimate, digits: int) -> str:
-    """Return an estimate with its interval as text."""
-    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"

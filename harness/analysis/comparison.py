@@ -1,0 +1,160 @@
+"""The table of runs read: how runs ended, which of them are compared, and paired differences between controllers.
+
+What a run without a settling time counts as:
+
+| function | a run that never settled |
+|---|---|
+| `settled_share` | is not settled |
+| `compare_pairs` | counts as `never`, the duration of the run: a bound from below, as ranks need finite numbers |
+| `outcomes` | is `not_settled` if it completed, else the fault |
+
+A run that did not complete never settled, whatever its error was before: see `settling_times`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.analysis.statistics import (
+    CONFIDENCE,
+    Estimate,
+    holm,
+    median_with_interval,
+    signed_rank_p_value,
+    success_rate,
+)
+from servobench.harness.run.episode import COMPLETED
+from servobench.plant.checks import FloatArray
+
+SETTLED: Final = "settled"
+NOT_SETTLED: Final = "not_settled"
+KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
+CONDITION: Final = ("plant", "task", "mismatch", "noise_factor", "latency_periods")
+POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two controllers on the same plants, tasks and seeds.
+
+    Attributes:
+        first: name of a controller.
+        second: name of the other.
+        difference: median of first − second over pairs; below 0 the first one is better.
+        p_value: two-sided, of the Wilcoxon signed-rank test.
+        corrected_p_value: after Holm, over all comparisons made together.
+    """
+
+    first: str
+    second: str
+    difference: Estimate
+    p_value: float
+    corrected_p_value: float
+
+
+def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Return the runs of each plant, task and condition, with words for it, in order of appearance."""
+    known = [name for name in CONDITION if name in runs]
+    found = []
+    for key, group in runs.groupby(known, sort=False, dropna=False):
+        values: dict[str, Any] = dict(zip(known, key, strict=True))
+        words = f"{values['task']} on {values['plant']}, {values['mismatch']}"
+        if values.get("noise_factor", 1.0) != 1.0:
+            words += f", noise × {values['noise_factor']:g}"
+        latency = float(values.get("latency_periods", float("nan")))
+        if math.isfinite(latency):
+            words += f", latency {latency:g} periods"
+        found.append((words, group))
+    return found
+
+
+def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the runs of the moves and those of the tracked curves.
+
+    A task of which no run could be built has no kind and is in neither.
+    """
+    kinds = runs.reindex(columns=["task_kind"])["task_kind"]
+    moves, curves = (runs[runs["task"].isin(runs.loc[kinds == kind, "task"])] for kind in TASK_KINDS)
+    return moves, curves
+
+
+def column_of(runs: pd.DataFrame, name: str) -> pd.Series[float]:
+    """Return a column of the table of runs, NaN throughout where the table has none of this name."""
+    return runs.reindex(columns=[name])[name].astype(float)
+
+
+def settling_times(runs: pd.DataFrame) -> pd.Series[float]:
+    """Return the settling time of each run, s; NaN where it never settled or did not complete."""
+    return column_of(runs, "settling_time_s").where(runs["status"] == COMPLETED)
+
+
+def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+    """Return how many of `runs` settled, in percent, with the Wilson interval."""
+    return success_rate(int(settling_times(runs).notna().sum()), len(runs), confidence).scaled(100.0)
+
+
+def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
+    """Return for each run `settled`, `not_settled` (it completed, outside the band) or the fault that ended it."""
+    settled = pd.Series(np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED), index=runs.index)
+    return settled.where(runs["status"] == COMPLETED, runs["status"]).rename("outcome").astype(str)
+
+
+def compare_pairs(
+    runs: pd.DataFrame,
+    pairs: Sequence[tuple[str, str]],
+    *,
+    never: float,
+    metric: str = "settling_time_s",
+    keys: Sequence[str] = KEYS,
+    seed: int = 0,
+    confidence: float = CONFIDENCE,
+) -> list[Comparison]:
+    """Compare controllers on the runs that they share, and correct for the number of comparisons.
+
+    Wilcoxon's signed-rank test, two-sided, and Holm's correction over all `pairs`; see `signed_rank_p_value`. Settling
+    times are whole periods, so equal ones are frequent.
+
+    Args:
+        runs: the table of runs.
+        pairs: names of controllers, two and two.
+        never: what a run counts as that has no value or did not complete; for settling times the duration, s.
+        metric: the column compared, less is better.
+        keys: columns that two runs of a pair share.
+        seed: of the bootstrap interval of the median difference.
+        confidence: of that interval.
+
+    Raises:
+        ValueError: no pair, two controllers without a common run, or two runs of a controller with the same keys.
+    """
+    if not pairs:
+        raise ValueError("pairs must hold at least one pair of controllers")
+    differences = [_differences(runs, pair, never, metric, keys) for pair in pairs]
+    p_values = [signed_rank_p_value(difference) for difference in differences]
+    corrected = holm(p_values)
+    return [
+        Comparison(
+            *pair, median_with_interval(difference, seed=seed, confidence=confidence), p_value, float(corrected_p_value)
+        )
+        for pair, difference, p_value, corrected_p_value in zip(pairs, differences, p_values, corrected, strict=True)
+    ]
+
+
+def _differences(
+    runs: pd.DataFrame, pair: tuple[str, str], never: float, metric: str, keys: Sequence[str]
+) -> FloatArray:
+    values = column_of(runs, metric).where(runs["status"] == COMPLETED).fillna(never)
+    indexed = pd.Series(values.to_numpy(), index=pd.MultiIndex.from_frame(runs[list(keys)]))
+    first, second = (indexed[(runs["controller"] == name).to_numpy()] for name in pair)
+    for name, series in zip(pair, (first, second), strict=True):
+        if series.index.has_duplicates:
+            raise ValueError(f"{name} has several runs of the same {', '.join(keys)}: pairs are ambiguous")
+    first, second = first.align(second, join="inner")
+    if len(first) == 0:
+        raise ValueError(f"{pair[0]} and {pair[1]} have no run in common: nothing to compare")
+    return np.asarray(first - second, dtype=np.float64)

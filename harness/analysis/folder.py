@@ -1,0 +1,57 @@
+"""What a results folder holds, in words, and the tables that it has beside its runs and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from servobench.harness.batch import results
+from servobench.harness.run.episode import COMPLETED
+
+DESCRIBED: Final = ("plant", "controller", "task", "mismatch", "noise_factor", "latency_periods")
+MAX_LISTED: Final = 15  # values of a column
+
+
+def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
+    """Return what was run and with what, as names and texts.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    manifest = results.read_manifest(folder)
+    completed = int((runs["status"] == COMPLETED).sum())
+    facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
+    facts |= {name.replace("_", " "): _listed(runs[name].unique().tolist()) for name in DESCRIBED if name in runs}
+    packages = manifest.get("packages") or {}
+    made = f"{manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
+    commit = manifest.get("git_commit")
+    return facts | {
+        "seeds": _seeds(runs["seed"].tolist()),
+        "made": f"{made}{f', commit {commit}' if commit else ''}, Python {manifest.get('python', 'unknown')}",
+    }
+
+
+def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield name and content of each table beside the runs and steps of a folder, such as answered claims."""
+    for path in sorted(folder.iterdir()):
+        if path.name in (results.RUNS, results.STEPS) or path.name.startswith("."):
+            continue
+        if path.suffix == ".parquet":
+            yield path.stem, pd.read_parquet(path)
+        elif path.suffix == ".csv":
+            yield path.stem, pd.read_csv(path)
+
+
+def _listed(values: list[Any]) -> str:
+    words = [str(value) for value in values[:MAX_LISTED]]
+    return ", ".join(words) + (f" and {len(values) - MAX_LISTED} more" if len(values) > MAX_LISTED else "")
+
+
+def _seeds(seeds: list[int]) -> str:
+    unique = sorted(set(seeds))
+    if len(unique) > 2 and unique == list(range(unique[0], unique[-1] + 1)):
+        return f"{unique[0]} to {unique[-1]} ({len(unique)})"
+    return _listed(unique)

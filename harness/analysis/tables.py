@@ -1,0 +1,276 @@
+"""Tables of runs for a reader: in the terminal, on a page, in the report. Numbers are in handy units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.analysis.comparison import (
+    SETTLED,
+    column_of,
+    compare_pairs,
+    outcomes,
+    settled_share,
+    settling_times,
+    split_conditions,
+    split_tasks,
+)
+from servobench.harness.analysis.measures import MEASURES, Measure
+from servobench.harness.analysis.statistics import (
+    MISSING,
+    NO_ESTIMATE,
+    Estimate,
+    median_with_interval,
+    tail_mean,
+)
+from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.run.episode import COMPLETED
+
+Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
+
+
+SWEPT: Final = ("noise_factor", "latency_periods")  # shown where they vary
+CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
+TAIL: Final = 0.95
+MAX_REASON: Final = 60  # characters of a reason that are shown in a table
+SUMMARY_LEGEND: Final = (
+    "done: reached the last period; settled: came within 5 mm and stayed; the rest are medians over runs"
+)
+SWEEP_LEGEND: Final = "settled: came within 5 mm and stayed; noise: factor; latency: periods, – as configured"
+
+
+def summary_tables(runs: pd.DataFrame) -> Tables:
+    """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
+    for (plant, mismatch, task), place in runs.groupby(["plant", "mismatch", "task"], sort=False):
+        rows = []
+        for name, own in place.groupby("controller", sort=False):
+            completed, settled = int((own["status"] == COMPLETED).sum()), int(settling_times(own).notna().sum())
+            unit, factor = MEASURES["rms_error_evaluated"].scale(place)
+            rows.append(
+                {
+                    "controller": str(name),
+                    "done": f"{completed}/{len(own)}",
+                    "settled": f"{settled}/{len(own)}",
+                    "after\ns": _middle(own, "settling_time_s", 1.0, 2),
+                    "overshoot\n%": _middle(own, "overshoot", 100.0, 0),
+                    f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
+                    "path\nratio": _middle(own, "path_length_ratio", 1.0, 2),
+                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0),
+                }
+            )
+        yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
+
+
+def sweep_tables(runs: pd.DataFrame) -> Tables:
+    """Yield what a sweep ends with: for each plant and task the share of settled runs, a row for each condition."""
+    runs = runs.assign(
+        settled=settling_times(runs).notna(),
+        noise=runs["noise_factor"].map("{:g}".format),
+        latency=[MISSING if pd.isna(value) else f"{value:g}" for value in runs["latency_periods"]],
+    )
+    for (plant, task), place in runs.groupby(["plant", "task"], sort=False):
+        by = ["mismatch", "noise", "latency"]
+        grouped = place.groupby([*by, "controller"], sort=False)["settled"]
+        share, count = (100.0 * grouped.mean()).unstack(sort=False), grouped.size().unstack(sort=False)
+        table = share.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
+        table["runs"] = count.max(axis=1).map("{:.0f}".format)
+        yield f"{task} on {plant}: settled, %", table.rename_axis(columns=None).reset_index()
+
+
+def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
+    """Yield for each plant, task and condition how each controller does, and how each pair of them differs."""
+    for words, place in split_conditions(runs):
+        yield words, judge_controllers(place)
+        pairs = compare_controllers(place, metric, never)
+        if len(pairs):
+            yield "pairs", pairs
+
+
+def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each controller: how often and when it settled, its worst runs, and how runs failed.
+
+    Args:
+        runs: of one plant, task and condition.
+
+    Returns:
+        Text; medians and rates have 95 % intervals. Errors are in the unit of the plant's feature or a handier one.
+    """
+    unit, factor = MEASURES["steady_state_error"].scale(runs)
+    rows = []
+    for name, own in runs.groupby("controller", sort=False):
+        ended = outcomes(own)
+        failed = ended[ended != SETTLED].value_counts()
+        final = column_of(own, "steady_state_error").where(own["status"] == COMPLETED)
+        rows.append(
+            {
+                "controller": str(name),
+                "runs": str(len(own)),
+                "settled, %": f"{settled_share(own):.1f}",
+                "settling time, s": f"{_median(settling_times(own)):.2f}",
+                "overshoot, %": f"{_median(100.0 * column_of(own, 'overshoot')):.1f}",
+                f"RMS end, {unit}": f"{_median(factor * column_of(own, 'rms_error_evaluated')):.1f}",
+                f"worst 5 %, {unit}": f"{factor * tail_mean(final, TAIL):.1f}",
+                "failures": ", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none",
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> pd.DataFrame:
+    """Return a row for each pair of controllers: the median of their paired difference and Wilcoxon's p-value.
+
+    Args:
+        runs: of one plant, task and condition.
+        metric: column that is compared; by default the settling time, on a curve the error along it.
+        never: stands for the value of a run without one, or that did not complete; by default twice the largest value.
+
+    Raises:
+        ConfigurationError: no such column of numbers.
+    """
+    pairs = list(combinations(dict.fromkeys(runs["controller"]), 2))
+    if not pairs:
+        return pd.DataFrame()
+    if metric is None:
+        metric = "rms_error_evaluated" if len(split_tasks(runs)[1]) else "settling_time_s"
+    numbers = [str(name) for name in runs.select_dtypes("number").columns]
+    if metric not in numbers:
+        raise ConfigurationError(f"--metric: the table has no column of numbers {metric!r}: {suggest(metric, numbers)}")
+    if never is None:
+        known = runs[metric].dropna()
+        never = 2.0 * float(known.max()) if len(known) else 1.0
+    compared = compare_pairs(runs, pairs, never=never, metric=metric, keys=("seed",))
+    measure = MEASURES.get(metric, Measure(metric.replace("_", " "), "1", 1.0, 2))
+    unit, factor = measure.scale(runs)
+    what = measure.name if unit == "1" else f"{measure.name}, {unit}"
+    return pd.DataFrame(
+        [
+            {
+                "pair": f"{pair.first} − {pair.second}",
+                "pairs": str(pair.difference.count),
+                f"difference in {what}": f"{pair.difference.scaled(factor):.2f}",
+                "p after Holm": f"{pair.corrected_p_value:.2g}",
+            }
+            for pair in compared
+        ]
+    )
+
+
+def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each condition and controller how many moves settled, how fast, and with what error."""
+    moves, _ = split_tasks(runs)
+    rows = []
+    for key, group in _groups(moves):
+        share = settled_share(group)
+        counts = {
+            "moves": len(group),
+            "settled": int(settling_times(group).notna().sum()),
+            "settled [%]": round(share.value),
+            "settled, 95 %": f"{share.low:.0f} – {share.high:.0f}",
+        }
+        rows.append(key | counts | _medians(group, moves, "settling_time_s", "overshoot", "steady_state_error"))
+    return pd.DataFrame(rows)
+
+
+def tracking_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each condition, task and controller the errors along the curve."""
+    _, curves = split_tasks(runs)
+    rows = []
+    for key, group in _groups(curves, "task"):
+        counts = {"runs": len(group), "completed": int((group["status"] == COMPLETED).sum())}
+        rows.append(key | counts | _medians(group, curves, "rms_error_evaluated", "max_error"))
+    return pd.DataFrame(rows)
+
+
+def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each plant and controller what a step costs and how much the joints are used."""
+    rows = []
+    for (plant, controller), group in runs.groupby(["plant", "controller"], sort=False):
+        row: dict[str, Any] = {"plant": plant, "controller": controller}
+        for name in ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
+                     "jacobian_error_mean"):  # fmt: skip
+            heading, factor, digits = _shown(name, runs)
+            row[heading] = _rounded(factor * column_of(group, name).median(), digits)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each way in which runs of a controller ended early, with one of the reasons."""
+    failed = runs[runs["status"] != COMPLETED]
+    rows = []
+    for (controller, plant, status), group in failed.groupby(["controller", "plant", "status"], sort=False):
+        total = len(runs[(runs["controller"] == controller) & (runs["plant"] == plant)])
+        row = {"controller": controller, "plant": plant, "ended by": status, "runs": f"{len(group)} of {total}"}
+        first = group.iloc[0]
+        rows.append(row | {"for example": first["run_id"], "reason": str(first.get("reason", ""))})
+    return pd.DataFrame(rows)
+
+
+def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return every run as a row: conditions, how it ended, and its measures."""
+    names = (*CONDITIONS, "task", "controller", "seed", "status")
+    table = runs[[name for name in names if _is_informative(runs, name)]].copy()
+    for name in MEASURES:
+        if name in runs:
+            heading, factor, digits = _shown(name, runs)
+            table[heading] = (factor * runs[name].astype(float)).round(digits)
+    if "reason" in runs and (runs["reason"].fillna("") != "").any():
+        table["reason"] = [
+            text if len(text) <= MAX_REASON else f"{text[: MAX_REASON - 1]}…" for text in runs["reason"].fillna("")
+        ]
+    return table.reset_index(drop=True)
+
+
+def _groups(runs: pd.DataFrame, *more: str) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+    names = [name for name in (*CONDITIONS, *more, "controller") if _is_informative(runs, name)]
+    grouped = runs.groupby(names, sort=False, dropna=False)
+    return [(dict(zip(names, key, strict=True)), group) for key, group in grouped]
+
+
+def _is_informative(runs: pd.DataFrame, name: str) -> bool:
+    """Return whether there is such a column and, where only a sweep varies it, more than one value in it."""
+    return name in runs and (name not in SWEPT or runs[name].nunique() > 1)
+
+
+def _shown(name: str, runs: pd.DataFrame) -> tuple[str, float, int]:
+    """Return heading, factor and digits of a column of `runs`."""
+    measure = MEASURES[name]
+    unit, factor = measure.scale(runs)
+    return measure.name if unit == "1" else f"{measure.name} [{unit}]", factor, measure.digits
+
+
+def _medians(group: pd.DataFrame, runs: pd.DataFrame, *names: str) -> dict[str, Any]:
+    """Return medians of columns under their headings in `runs`, each with its interval behind it where there is one.
+
+    A move that never settled counts as one that settles after all others, ∞; of other measures a gap is left out.
+    """
+    cells: dict[str, Any] = {}
+    for name in names:
+        heading, factor, digits = _shown(name, runs)
+        if name == "settling_time_s":
+            middle = median_with_interval(factor * settling_times(group))
+        else:
+            values = factor * column_of(group, name)
+            middle = median_with_interval(values, missing="left_out") if values.notna().any() else NO_ESTIMATE
+        interval = "" if np.isnan(middle.low) else f"{middle.low:.{digits}f} – {middle.high:.{digits}f}"
+        cells[heading] = _rounded(middle.value, digits)
+        cells[f"{MEASURES[name].name}, 95 %"] = interval.replace("inf", "∞")
+    return cells
+
+
+def _rounded(value: float, digits: int) -> float:
+    return round(float(value), digits) if digits or np.isnan(value) else float(round(value))
+
+
+def _median(values: pd.Series[float]) -> Estimate:
+    """Return the median of a column, a missing value counting as ∞; no estimate where all are missing."""
+    return median_with_interval(values) if values.notna().any() else NO_ESTIMATE
+
+
+def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:
+    value = column_of(runs, name).median()
+    return MISSING if pd.isna(value) else f"{factor * value:.{digits}f}"

@@ -1,0 +1,144 @@
+"""The commands `servobench statistics | report | record`: what a results folder tells."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servobench.harness.cli.options import split_names
+from servobench.harness.cli.terminal import console, print_markdown, print_tables
+
+if TYPE_CHECKING:
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.pictures.replay import LoggedRun
+
+RECORDED = {"plant": "bullet", "controller": "rbfnn_mfac", "task": "circle", "mismatch": "moderate", "seed": 0}
+RECORDINGS = "recordings"
+SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
+
+
+def statistics(
+    folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
+    metric: Annotated[
+        str | None, typer.Option(help="Column that pairs are compared by; default: settling time, on curves RMS error.")
+    ] = None,
+    never: Annotated[
+        float | None, typer.Option(help="Stands for the value of a run without one; default: twice the largest.")
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
+) -> None:
+    """Judge the controllers of a folder: rates, medians, tails, failures, paired differences, with 95 % intervals."""
+    from servobench.harness.analysis.tables import statistics_tables  # noqa: PLC0415 - help texts do without pandas
+    from servobench.harness.batch import results  # noqa: PLC0415
+
+    tables = statistics_tables(results.load_runs(folder), metric, never)
+    print_markdown(tables) if markdown else print_tables(tables)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
+    out: Annotated[Path | None, typer.Option(help="The page; default report.html in the folder.")] = None,
+) -> None:
+    """Write one page about a results folder: figures, sortable tables and paths to turn; it needs no network."""
+    make_report(folder, out)
+
+
+def make_report(folder: Path, out: Path | None = None) -> None:
+    """Write the report and print its path and, if it took long, the time."""
+    from servobench.harness.pictures.report import write_report  # noqa: PLC0415 - only the extra report brings its needs
+
+    began = time.monotonic()
+    with console.status("making the report"):
+        path = write_report(folder, out)
+    seconds = time.monotonic() - began
+    took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
+    console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})", soft_wrap=True, markup=False)
+
+
+def _new(what: str) -> str:
+    return f"New run: {what}, default {RECORDED[what]}."
+
+
+def record(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
+    ] = None,
+    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+    plant: Annotated[str | None, typer.Option(help=_new("plant"))] = None,
+    controller: Annotated[str | None, typer.Option(help=_new("controller"))] = None,
+    task: Annotated[str | None, typer.Option(help=_new("task"))] = None,
+    mismatch: Annotated[str | None, typer.Option(help=_new("mismatch"))] = None,
+    seed: Annotated[int | None, typer.Option(help=_new("seed"))] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None,
+    kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the films; default recordings below the results folder.")
+    ] = None,
+) -> None:
+    """Show a run: film (MP4, GIF) and snapshots of the rendered arm, its camera's view and the error."""
+    from servobench.harness.config.settings import ConfigurationError, read_settings  # noqa: PLC0415 - see statistics
+    from servobench.harness.pictures.film import KINDS, find_kind, write_recording  # noqa: PLC0415
+
+    wanted = split_names("kinds", kinds, KINDS, find_kind)
+    new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "seed": seed}
+    given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
+    with console.status("reading") as status:
+        if folder is not None:
+            if given:
+                raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+            shown = _run_of(folder, run)
+        else:
+            if run is not None:
+                raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+            status.update("running")
+            chosen = {name: value for name, value in new.items() if value is not None}
+            shown = _new_run(RECORDED | chosen, read_settings(config, set_ or []))
+        paths = write_recording(
+            shown,
+            (out or (folder or Path("results")) / RECORDINGS) / str(shown.row["run_id"]),
+            wanted,
+            lambda share, what: status.update(f"drawing: {100 * share:3.0f} %, {what}"),
+        )
+    for path in paths:
+        console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False)
+
+
+def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
+    """Return a run of a results folder; without a name the only one."""
+    from servobench.harness.batch import results  # noqa: PLC0415 - see statistics
+    from servobench.harness.config.settings import ConfigurationError, suggest  # noqa: PLC0415
+    from servobench.harness.pictures.replay import logged_run  # noqa: PLC0415
+
+    runs = results.load_runs(folder)
+    names = runs["run_id"].tolist()
+    if run_id is None and len(names) > 1:
+        raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")
+    chosen = run_id or names[0]
+    if chosen not in names:
+        raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
+    row = {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
+    configuration = results.read_manifest(folder).get("configuration", {})
+    return logged_run(row, results.load_steps(folder, [chosen]), configuration.get("bullet", {}))
+
+
+def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
+    """Carry out a run to be shown."""
+    from servobench.harness.config.settings import ConfigurationError, flatten  # noqa: PLC0415 - see statistics
+    from servobench.harness.pictures.replay import logged_run  # noqa: PLC0415
+    from servobench.harness.run.episode import run_experiment  # noqa: PLC0415
+    from servobench.harness.run.experiment import known_sections  # noqa: PLC0415
+    from servobench.harness.run.request import RunRequest, read_mismatch  # noqa: PLC0415
+    from servobench.plant.bullet.bullet_plant import BulletConfig  # noqa: PLC0415
+
+    request = RunRequest(**asked | {"mismatch": read_mismatch(asked["mismatch"])})
+    if request.seed < 0:
+        raise ConfigurationError(f"seed must not be negative, got {request.seed}")
+    settings.check_sections([*known_sections(), request.plant, request.controller])
+    result = run_experiment(request, settings)
+    return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", BulletConfig())))

@@ -1,0 +1,199 @@
+"""Tables of runs whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+from kit.folders import comparison, failed_only, made_up_row, sweep
+from servobench.harness.analysis.comparison import split_conditions, split_tasks
+from servobench.harness.analysis.folder import describe_folder, other_tables
+from servobench.harness.analysis.tables import (
+    compare_controllers,
+    cost_table,
+    failure_table,
+    judge_controllers,
+    runs_table,
+    settling_table,
+    summary_tables,
+    sweep_tables,
+    tracking_table,
+)
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError
+
+
+@pytest.fixture
+def runs() -> pd.DataFrame:
+    rows = []
+    for seed in range(20):
+        for name, time in (("quick", 1.0 + 0.01 * seed), ("slow", 2.0 + 0.02 * seed)):
+            lost = name == "slow" and seed == 3
+            rows.append(
+                {
+                    "run_id": f"{name}-{seed}", "plant": "kinematic", "controller": name, "task": "random",
+                    "mismatch": "moderate", "seed": seed, "noise_factor": 1.0, "latency_periods": None,
+                    "status": "feature_lost" if lost else "completed",
+                    "settling_time_s": np.nan if name == "slow" and seed < 4 else time,
+                    "task_kind": "point_to_point", "feature_unit": "m",
+                    "overshoot": 0.1, "rms_error_evaluated": 0.002, "steady_state_error": 0.001 * (1 + seed),
+                }
+            )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def test_each_controller_has_rates_medians_tails_and_failures(runs):
+    quick, slow = judge_controllers(runs).to_dict("records")
+    assert quick["settled, %"] == "100.0 [83.9, 100.0]"  # Wilson: 1/(1 + 1.96²/20)
+    assert quick["settling time, s"].startswith("1.09 [") or quick["settling time, s"].startswith("1.10 [")
+    assert quick["worst 5 %, mm"] == "20.0"
+    assert quick["failures"] == "none"
+    assert slow["settled, %"].startswith("80.0 [")
+    assert slow["worst 5 %, mm"] == "inf"
+    assert slow["failures"] == "3 not_settled, 1 feature_lost"
+
+
+def test_pairs_are_compared_on_common_seeds(runs):
+    (row,) = compare_controllers(runs, never=10.0).to_dict("records")
+    assert row["pair"] == "quick − slow"
+    assert row["pairs"] == "20"
+    assert row["difference in settling time, s"].startswith("-1.1")
+    assert float(row["p after Holm"]) < 0.001
+    assert compare_controllers(runs[runs["controller"] == "quick"], never=10.0).empty
+
+
+def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
+    better = runs["controller"] == "quick"
+    curve = runs.assign(task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
+    (row,) = compare_controllers(curve).to_dict("records")
+    assert row["difference in RMS of the evaluated part, mm"] == "-1.50 [-1.50, -1.50]"
+
+
+def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
+    late = runs.assign(settling_time_s=runs["settling_time_s"] + np.where(runs["controller"] == "quick", 30.0, 0.0))
+    few = late[late["seed"] < 4]  # of which the slow one settles in none
+    (row,) = compare_controllers(few).to_dict("records")
+    assert row["difference in settling time, s"].startswith("-31.0")
+
+
+def test_an_unknown_metric_is_told_in_one_line(runs):
+    with pytest.raises(ConfigurationError, match="no column of numbers 'settling_time': .*settling_time_s"):
+        compare_controllers(runs, "settling_time")
+
+
+def test_conditions_are_told_apart_in_words(runs):
+    loud = runs.assign(noise_factor=2.0, latency_periods=3)
+    assert [words for words, _ in split_conditions(pd.concat([runs, loud]))] == [
+        "random on kinematic, moderate",
+        "random on kinematic, moderate, noise × 2, latency 3 periods",
+    ]
+
+
+@pytest.mark.parametrize(("option", "word"), [((), "quick"), (("--markdown",), "| quick | 20 | 100.0 [83.9, 100.0] |")])
+def test_the_command_prints_the_tables_of_a_folder(runs, tmp_path, monkeypatch, capsys, option, word):
+    folder = tmp_path / "out"
+    results.create_folder(folder, {})
+    results.write_rows(folder, 0, runs.to_dict("records"))
+    results.collect(folder)
+    assert servobench(monkeypatch, "statistics", str(folder), *option) == 0
+    assert word in capsys.readouterr().out
+
+
+def test_errors_are_shown_in_the_unit_of_the_feature(runs):
+    radians = runs.assign(feature_unit="rad")
+    assert judge_controllers(radians)["worst 5 %, rad"].tolist() == ["0.0", "inf"]
+    assert settling_table(radians)["last second [rad]"].tolist() == [0.01, 0.01]
+    both = pd.concat([runs, radians.assign(plant="crane")])
+    assert settling_table(both)["last second [feature unit]"].tolist() == [0.01] * 4
+
+
+def test_a_comparison_ends_with_a_table_for_each_task(tmp_path):
+    runs = results.load_runs(comparison(tmp_path / "out"))
+    titles, tables = zip(*summary_tables(runs), strict=True)
+    assert titles == tuple(f"{task} on kinematic, moderate" for task in ("exp1", "exp2", "circle"))
+    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "1/1", "1.50", "2", "2.0", "–", "130"]
+    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "0/1", "–", "–", "2.0", "–", "130"]
+
+
+def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path):
+    runs = results.load_runs(sweep(tmp_path / "out"))
+    ((title, table),) = sweep_tables(runs[runs["run_id"] != "someone_elses-60-0"].assign(latency_periods=None))
+    assert title == "random on kinematic: settled, %"
+    assert table.values.tolist() == [
+        ["camera_rotation=0deg", "1", "–", "100.0", "100.0", "100.0", "6"],
+        ["camera_rotation=30deg", "1", "–", "66.7", "66.7", "66.7", "6"],
+        ["camera_rotation=60deg", "1", "–", "50.0", "50.0", "60.0", "6"],
+    ]
+
+
+def test_a_move_that_never_settled_counts_as_one_that_settles_after_all_others():
+    runs = pd.DataFrame(
+        [made_up_row(str(seed), seed=seed, settling_time_s=time) for seed, time in enumerate((1.0, 2.0, np.nan))]
+    )
+    assert settling_table(runs)["settling time [s]"].tolist() == [2.0]
+    runs["settling_time_s"] = [1.0, np.nan, np.nan]
+    assert settling_table(runs)["settling time [s]"].tolist() == [np.inf]
+
+
+def test_a_run_that_ended_early_counts_as_not_settled():
+    runs = pd.DataFrame([made_up_row("a"), made_up_row("b", seed=1, status="feature_lost")])
+    table = settling_table(runs)
+    assert table[["moves", "settled", "settled [%]"]].values.tolist() == [[2, 1, 50]]
+
+
+def test_moves_and_curves_are_told_apart_and_tasks_that_nobody_began_are_neither(tmp_path):
+    moves, curves = split_tasks(results.load_runs(comparison(tmp_path / "a")))
+    assert set(moves["task"]) == {"exp1", "exp2"}
+    assert set(curves["task"]) == {"circle"}
+    assert [len(part) for part in split_tasks(results.load_runs(failed_only(tmp_path / "b")))] == [0, 0]
+
+
+def test_a_row_of_the_settling_table_is_in_handy_units():
+    runs = pd.DataFrame([made_up_row(str(seed), seed=seed, settling_time_s=1.0 + seed) for seed in range(3)])
+    row = settling_table(runs).iloc[0]
+    assert row["settling time [s]"] == 2.0
+    assert row["overshoot [%]"] == 2.0
+    assert row["last second [mm]"] == 1.0
+    assert "–" in row["settling time, 95 %"]
+
+
+def test_only_conditions_that_vary_get_a_column(tmp_path):
+    table = settling_table(results.load_runs(sweep(tmp_path / "out")))
+    assert "latency_periods" in table
+    assert "noise_factor" not in table
+    assert len(table) == 3 * 3 * 2
+
+
+def test_curves_are_judged_by_task(tmp_path):
+    table = tracking_table(results.load_runs(comparison(tmp_path / "out")))
+    assert table["task"].unique().tolist() == ["circle"]
+    assert table["RMS of the evaluated part [mm]"].tolist() == [2.0] * 3
+
+
+def test_failures_are_counted_with_a_reason(tmp_path):
+    table = failure_table(results.load_runs(sweep(tmp_path / "out")))
+    assert table["runs"].tolist() == ["5 of 18"] * 3
+    assert table["reason"].tolist() == ["no valid feature for 20 periods"] * 3
+    assert failure_table(pd.DataFrame([made_up_row("a")])).empty
+
+
+@pytest.mark.parametrize("folder", [comparison, sweep, failed_only])
+def test_every_table_can_be_made_of_every_kind_of_folder(tmp_path, folder):
+    path = folder(tmp_path / "out")
+    runs = results.load_runs(path)
+    for table in (cost_table(runs), runs_table(runs)):
+        assert len(table) > 0
+    assert describe_folder(path, runs)["runs"].startswith(f"{len(runs)}, of which ")
+
+
+def test_a_long_reason_is_shortened_in_the_table_of_runs():
+    table = runs_table(pd.DataFrame([made_up_row("a", reason="x" * 200)]))
+    assert table["reason"][0] == "x" * 59 + "…"
+
+
+def test_further_tables_of_a_folder_are_found(tmp_path):
+    folder = comparison(tmp_path / "out")
+    pd.DataFrame({"claim": [1]}).to_csv(folder / "claims.csv", index=False)
+    assert [name for name, _ in other_tables(folder)] == ["claims"]
