@@ -17,7 +17,7 @@ from servobench.controllers.controller import Controller, Diagnostics, RobotKnow
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.initial import InitialJacobian
 from servobench.controllers.laws.law import Law
-from servobench.plant.checks import FloatArray
+from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import ControllerDiverged
 from servobench.plant.signals import Command, Observation
 
@@ -42,8 +42,9 @@ class ServoController(Controller):
         self.law = law
         self._initial = initial
         self._knowledge = knowledge
-        self._spec = knowledge.spec
-        self._preview = knowledge.preview
+        spec = knowledge.spec
+        self._shapes = {"joint_position": (spec.n,), "feature": (spec.m,)}
+        self._reference_shape = (1 + knowledge.preview, spec.m)
         self._forget()
 
     def _shared(self) -> Iterable[object]:
@@ -87,10 +88,10 @@ class ServoController(Controller):
         self._learn(observation, reference)
         estimate = self.estimator.estimate(observation.joint_position)
         J = self._jacobian = estimate.jacobian
-        if not np.isfinite(J).all():
+        if not is_finite(J):
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
         u = self.law.command(estimate, observation, reference)
-        if not np.isfinite(u).all():
+        if not is_finite(u):
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
             )
@@ -125,24 +126,21 @@ class ServoController(Controller):
             duration=observation.time - last.time,
         )
         J = self.estimator.jacobian(motion.joint_position)
-        unexplained = motion.feature_step - J @ motion.joint_step
-        self._prediction_error = math.sqrt(float(unexplained @ unexplained))
+        unexplained = motion.feature_step - J.dot(motion.joint_step)
+        self._prediction_error = math.sqrt(unexplained.dot(unexplained))
         self.estimator.update(motion)
 
     def _check_observation(self, observation: Observation) -> None:
-        sizes = (
-            ("joint_position", observation.joint_position, self._spec.n),
-            ("feature", observation.feature, self._spec.m),
-        )
-        for name, value, size in sizes:
-            if value.shape != (size,):
-                raise ValueError(f"observation.{name} must have shape ({size},), got {value.shape}")
+        for name, wanted in self._shapes.items():
+            shape = getattr(observation, name).shape
+            if shape != wanted:
+                raise ValueError(f"observation.{name} must have shape {wanted}, got {shape}")
 
     def _check_reference(self, reference: FloatArray) -> None:
-        wanted = (1 + self._preview, self._spec.m)
-        if np.shape(reference) != wanted:
+        if np.shape(reference) != self._reference_shape:
             raise ValueError(
-                f"reference must have shape {wanted} for a preview of {self._preview}, got {np.shape(reference)}"
+                f"reference must have shape {self._reference_shape} for a preview of {self._reference_shape[0] - 1}, "
+                f"got {np.shape(reference)}"
             )
-        if not np.isfinite(reference).all():
+        if not is_finite(reference):
             raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")

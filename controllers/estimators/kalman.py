@@ -11,13 +11,14 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
+import math
 from typing import Literal, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray
+from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import FilterDiverged
 from servobench.plant.settings import NonNegative, Positive, settings
 
@@ -49,7 +50,7 @@ def cholesky_of(P: FloatArray) -> FloatArray:
     except np.linalg.LinAlgError as error:
         lowest = float(np.linalg.eigvalsh(P).min())
         raise FilterDiverged(f"covariance is not positive definite: smallest eigenvalue {lowest:.3e}") from error
-    if not np.isfinite(L).all():  # LAPACK lets NaN pass
+    if not is_finite(L):  # LAPACK lets NaN pass
         raise FilterDiverged(f"covariance is not finite: diagonal {np.diag(P).tolist()}")
     return L
 
@@ -138,7 +139,7 @@ class KalmanEstimator(Estimator):
         Raises:
             FilterDiverged: the covariance is no longer positive definite.
         """
-        self._updated = bool(np.linalg.norm(motion.joint_step) >= self._config.min_joint_step)
+        self._updated = math.sqrt(motion.joint_step.dot(motion.joint_step)) >= self._config.min_joint_step
         if not self._updated:
             return
         if self._config.form == "split":
@@ -165,5 +166,5 @@ class KalmanEstimator(Estimator):
 
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
-        deviation = float(np.sqrt(np.trace(self._P) / self._P.shape[0]))
+        deviation = math.sqrt(self._P.trace() / len(self._P))
         return {"estimator_updated": float(self._updated), "jacobian_deviation": deviation}

@@ -15,6 +15,7 @@ multiples of the identity it even splits by rows: the form "split" gives the sam
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -101,21 +102,23 @@ def unscented_update(
     Raises:
         FilterDiverged: P + Q is not positive definite.
     """
-    size = J.size
-    P = P + Q
+    size, P = J.size, P + Q
     offsets = np.zeros((2 * size + 1, size))
-    offsets[1 : size + 1] = weights.reach * cholesky_of(P).T
-    offsets[size + 1 :] = -offsets[1 : size + 1]
+    np.multiply(weights.reach, cholesky_of(P).T, out=offsets[1 : size + 1])
+    np.negative(offsets[1 : size + 1], out=offsets[size + 1 :])
     points = J.ravel() + offsets
-    Z = (points.reshape(-1, joint_step.size) @ joint_step).reshape(points.shape[0], -1)  # every point is m rows of J
-    z = weights.mean @ Z
+    Z = points.reshape(-1, joint_step.size).dot(joint_step).reshape(len(points), -1)  # every point is m rows of J
+    z = weights.mean.dot(Z)
     deviations = Z - z
     weighted = weights.covariance[:, None] * deviations
-    S = deviations.T @ weighted + R
-    C = offsets.T @ weighted
+    S = deviations.T.dot(weighted)
+    S += R
+    C = offsets.T.dot(weighted)
     K = np.linalg.solve(S, C.T).T
-    P = P - K @ C.T  # K S = C
-    return J + (K @ (feature_step - z)).reshape(J.shape), (P + P.T) / 2
+    P -= K.dot(C.T)  # K S = C
+    P = P + P.T
+    P *= 0.5
+    return J + K.dot(feature_step - z).reshape(J.shape), P
 
 
 @final
@@ -149,7 +152,7 @@ class UkfEstimator(Estimator):
             FilterDiverged: the covariance is no longer positive definite.
         """
         dq, dy = motion.joint_step, motion.feature_step
-        self._updated = bool(np.linalg.norm(dq) >= self._config.min_joint_step)
+        self._updated = math.sqrt(dq.dot(dq)) >= self._config.min_joint_step
         if not self._updated:
             return
         if self._config.form == "split":
@@ -171,5 +174,5 @@ class UkfEstimator(Estimator):
 
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
-        deviation = float(np.sqrt(np.trace(self._P) / self._P.shape[0]))
+        deviation = math.sqrt(self._P.trace() / len(self._P))
         return {"estimator_updated": float(self._updated), "jacobian_deviation": deviation}

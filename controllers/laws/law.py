@@ -37,6 +37,11 @@ class Law(ABC):
         """Return named numbers about the last command; for the log only."""
 
 
+def largest_excess(joint_velocity: FloatArray, limit: FloatArray) -> float:
+    """Return the largest |u_i| / limit_i of a joint velocity (n,); above 1 some joint exceeds its limit."""
+    return float(np.maximum.reduce(np.abs(joint_velocity) / limit))
+
+
 def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     """Shrink a joint velocity until every joint keeps its limit; the direction stays, and so does the path.
 

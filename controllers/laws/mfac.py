@@ -15,7 +15,7 @@ from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.laws.law import Law, largest_excess
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Positive, settings
 from servobench.plant.signals import Observation
@@ -45,7 +45,9 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
     Returns:
         The joint step of one period, (n,), rad.
     """
-    return np.asarray(step_factor * (J.T @ np.linalg.solve(J @ J.T + step_weight * np.eye(J.shape[0]), e)))
+    square = J.dot(J.T)
+    square.flat[:: len(J) + 1] += step_weight
+    return np.asarray(step_factor * J.T.dot(np.linalg.solve(square, e)))
 
 
 @final
@@ -80,8 +82,9 @@ class MfacLaw(Law):
         if config.feedforward:
             dq = dq + mfac_step(jacobian, reference[1] - reference[0], 1.0, config.step_weight)
         wanted = dq / self._dt
-        self._saturated = bool((np.abs(wanted) > self._limit).any())
-        return scale_to_limit(wanted, self._limit)
+        excess = largest_excess(wanted, self._limit)
+        self._saturated = excess > 1.0
+        return np.asarray(wanted / max(excess, 1.0))
 
     def diagnostics(self) -> Diagnostics:
         """Return whether the last command was limited."""
