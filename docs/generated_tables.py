@@ -32,7 +32,7 @@ from servobench.fmus.export import arm_layout
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
 PART = re.compile(r"(<!-- (settings|variables): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
-UNIT = re.compile(r"(?:\[(.+?)\] )?(.*)")  # what a string below a field begins with
+UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # what a string below a field begins with
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
@@ -81,13 +81,18 @@ def settings_rows(config: Any, prefix: str) -> Iterator[tuple[str, Any, str, str
 
 
 def field_strings(kind: type[Any]) -> dict[str, str]:
-    """Return the strings below the fields of a class as one line each, by field."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
-    return {
-        field.target.id: " ".join(below.value.value.split())
-        for field, below in pairwise(body)
-        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-    }
+    """Return the strings below the fields of a class and of those that it inherits from, as one line each, by field."""
+    strings = {}
+    for each in reversed(kind.__mro__[:-1]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0].body  # type: ignore[attr-defined]
+        for field, below in pairwise(body):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+            ):
+                strings[field.target.id] = " ".join(below.value.value.split())
+    return strings
 
 
 def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
