@@ -19,7 +19,7 @@ check: lint
 test: lint
 	$(BIN)/python -m pytest -n auto
 
-# Too long for every change: hours. The same call goes on after an interruption; its last figures are docs/nightly.md.
+# Too long for every change: hours. The same call goes on after an interruption; docs/experiments.md names its last figures.
 nightly: $(VENV)/ready
 	$(BIN)/python tests/nightly.py $(NIGHTLY)
 
