@@ -1,6 +1,6 @@
 """What a period of the `bullet` plant costs over the render and physics calls it cannot do without.
 
-Both are measured in the same run, in turns: a whole `BulletPlant.step`, and the same number of motor and physics steps
+Both are measured in the same run, in turns: a whole `Bench.step`, and the same number of motor and physics steps
 plus one `getCameraImage` of the same camera in a world like it.
 Run it from an installed checkout: `python benchmarks/bullet_period.py`.
 """
@@ -16,11 +16,12 @@ import numpy as np
 from servobench.plant.bullet.bullet_plant import (
     PHYSICS_STEP,
     BulletConfig,
-    BulletPlant,
+    build_bullet,
     ur5_body,
 )
 from servobench.plant.bullet.scene import Scene, view_of
-from servobench.plant.plant import PlantSetup, whole_steps
+from servobench.plant.checks import whole_steps
+from servobench.plant.plant import PlantSetup
 from servobench.plant.robot import ur5
 from servobench.plant.robot.ur5 import nominal_ur5
 from servobench.plant.signals import Command
@@ -38,7 +39,7 @@ def milliseconds(call: Callable[[], object]) -> float:
 def measure(config: BulletConfig, period: float, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the times, ms, (repeats,) of whole periods and of bare ones."""
     model = nominal_ur5()
-    plant = BulletPlant(config, PlantSetup(model, HOME, period))
+    plant = build_bullet(config, PlantSetup(model, HOME, period))
     scene = Scene(model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=False)
     view = view_of(config.camera(), model.X_BC)
     plant.reset(0)

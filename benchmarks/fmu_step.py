@@ -1,7 +1,7 @@
 """What a step of the FMU plant costs beside the calls that it cannot do without, all in one run.
 
 bare      set, doStep and get by ctypes with arguments that were built once: the floor
-plant     FmuPlant.step, without noise and delay
+plant     Bench.step, without noise and delay
 fmpy      setReal, doStep and getReal of fmpy's FMU2Slave, with lists
 """
 
@@ -10,12 +10,15 @@ from __future__ import annotations
 import ctypes
 import time
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from servobench.plant.fmu.fmu_plant import FmuPlant
+from servobench.plant.bench import Bench, SensingConfig
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.fmu_plant import FmuWorld
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
@@ -25,17 +28,23 @@ ROUNDS = 400
 PERIOD = 0.05
 
 
-def open_plant() -> FmuPlant:
+def open_plant() -> Bench:
     """Return the exported UR5 without anything around it."""
-    config = Ur5FmuConfig(command_delay_periods=0, feature_noise=0.0)
+    config = Ur5FmuConfig(command_delay_periods=0, sensing=SensingConfig(0.0))
     return build_ur5(config, PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
 
 
-def bare_calls(plant: FmuPlant) -> Callable[[int], None]:
+def fmu_world(plant: Bench) -> FmuWorld:
+    """Return the FMU on the bench."""
+    return cast(FmuWorld, plant.world)
+
+
+def bare_calls(plant: Bench) -> Callable[[int], None]:
     """Return a step by three calls with prebuilt arguments."""
-    library, component = plant._slave._library, plant._slave._component
-    write = (library.fmi2SetReal, plant._command)
-    read = (library.fmi2GetReal, plant._result)
+    world = fmu_world(plant)
+    library, component = world._instance._library, world._instance._component
+    write = (library.fmi2SetReal, world._command)
+    read = (library.fmi2GetReal, world._result)
     (set_real, *inputs), (get_real, *outputs) = (
         (function, port.references, ctypes.c_size_t(port.count), port.pointer) for function, port in (write, read)
     )
@@ -50,20 +59,21 @@ def bare_calls(plant: FmuPlant) -> Callable[[int], None]:
     return call
 
 
-def fmpy_calls(plant: FmuPlant) -> Callable[[int], None]:
+def fmpy_calls(plant: Bench) -> Callable[[int], None]:
     """Return a step by fmpy's own methods."""
-    description = plant.description
+    world = fmu_world(plant)
+    description = world.description
     slave = FMU2Slave(
         guid=description.token,
         modelIdentifier=description.identifier,
-        unzipDirectory=str(plant._folder.root),
+        unzipDirectory=str(extract_fmu(description.path)),
         instanceName="fmpy",
     )
     slave.instantiate()
     slave.setupExperiment(startTime=0.0)
     slave.enterInitializationMode()
     slave.exitInitializationMode()
-    inputs, outputs = list(plant._command.references), list(plant._result.references)
+    inputs, outputs = list(world._command.references), list(world._result.references)
     command = [0.1] * len(inputs)
 
     def call(k: int) -> None:
@@ -74,9 +84,10 @@ def fmpy_calls(plant: FmuPlant) -> Callable[[int], None]:
     return call
 
 
-def plant_steps(plant: FmuPlant) -> Callable[[int], None]:
+def plant_steps(plant: Bench) -> Callable[[int], None]:
     """Return a step of the plant."""
     command = Command(np.full(plant.spec.n, 0.1))
+    plant.reset(0)
 
     def call(_: int) -> None:
         plant.step(command)

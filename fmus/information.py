@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import parse_description
 
 
@@ -58,23 +58,19 @@ def read_information(path: Path) -> FmuInformation:
     Raises:
         ValueError: it is not an FMU.
     """
-    folder = FmuFolder(path)
-    try:
-        root = folder.root
-        description = parse_description(path, root)
-        binaries = root / "binaries"
-        return FmuInformation(
-            fmi_version=str(description.fmiVersion),
-            model_name=str(description.modelName),
-            token=str(description.guid or description.instantiationToken),
-            tool=str(description.generationTool or "unknown"),
-            interfaces=_interfaces(root),
-            platforms=tuple(sorted(item.name for item in binaries.iterdir())) if binaries.is_dir() else (),
-            has_sources=(root / "sources").is_dir(),
-            variables=tuple(_variable(variable) for variable in description.modelVariables),
-        )
-    finally:
-        folder.close()
+    root = extract_fmu(path)
+    description = parse_description(path, root)
+    binaries = root / "binaries"
+    return FmuInformation(
+        fmi_version=str(description.fmiVersion),
+        model_name=str(description.modelName),
+        token=str(description.guid or description.instantiationToken),
+        tool=str(description.generationTool or "unknown"),
+        interfaces=_interfaces(root),
+        platforms=tuple(sorted(item.name for item in binaries.iterdir())) if binaries.is_dir() else (),
+        has_sources=(root / "sources").is_dir(),
+        variables=tuple(_variable(variable) for variable in description.modelVariables),
+    )
 
 
 INTERFACES = {

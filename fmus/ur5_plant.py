@@ -2,52 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 from functools import cache
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import platformdirs
 
 from servobench.fmus.compile import CompilationFailed, CompilerMissing
 from servobench.fmus.export import ExportOptions, export_fmu, fingerprint
 from servobench.fmus.variables import Actuation, parameters_of
-from servobench.plant.checks import as_vector, check_number
-from servobench.plant.fmu.config import FmuConfig
-from servobench.plant.fmu.entry import build_plant
-from servobench.plant.fmu.fmu_plant import FmuPlant
+from servobench.plant.bench import Bench, SensingConfig
+from servobench.plant.checks import as_vector
+from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import FEATURE_NAMES
-from servobench.plant.sensing import vary_sensing
+from servobench.plant.settings import NonNegative, Periods, Positive, nested, settings
 
 
-@dataclass(frozen=True)
+@settings
 class Ur5FmuConfig:
     """Settings of the exported UR5; the same as those of the kinematic plant."""
 
-    fmi_version: Literal[2, 3] = 2  # of FMI
-    max_joint_speed: float = 1.0  # rad/s, a cautious share of the vendor's limit of π
-    joint_range: float = 2 * np.pi  # rad each way, vendor's range
-    lag: float = 0.05  # s, time constant of the joints' velocity loops; 0 = none
-    command_delay_periods: int = 1  # periods between a command and its first effect
-    feature_noise: float = 0.001  # m, standard deviation an axis
-    latency_periods: int = 0  # periods between exposure and delivery of the feature
-    drop_probability: float = 0.0  # chance that a frame is lost
-
-    def __post_init__(self) -> None:
-        """Check the numbers that no part below checks."""
-        if self.fmi_version not in (2, 3):
-            raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
-        check_number("max_joint_speed", self.max_joint_speed, above=0.0)
-        check_number("joint_range", self.joint_range, above=0.0)
-        check_number("lag", self.lag, at_least=0.0)
-        self.around()
-
-    def around(self) -> FmuConfig:
-        """Return the settings of what lies around the FMU."""
-        return FmuConfig(self.command_delay_periods, self.feature_noise, self.latency_periods, self.drop_probability)
+    fmi_version: Literal[2, 3] = 2
+    """Version of FMI."""
+    max_joint_speed: Positive = 1.0
+    """[rad/s] limit of every joint; a cautious share of the vendor's limit of π."""
+    joint_range: Positive = 2 * math.pi
+    """[rad] largest joint position each way; the vendor's range."""
+    lag: NonNegative = 0.05
+    """[s] τ, time constant of the joints' velocity loops; 0 means none."""
+    command_delay_periods: Periods = 1
+    """[periods] between a command and its first effect."""
+    sensing: SensingConfig = nested(SensingConfig)
+    """Noise, latency and lost frames."""
 
 
 @cache
@@ -84,7 +73,6 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         camera=("camera_position", "camera_rpy"),
         parameters=parameters,
         max_joint_speed=config.max_joint_speed,
-        clips_itself=True,
         joint_lower=-config.joint_range,
         joint_upper=config.joint_range,
         joint_names=model.arm.joint_names,
@@ -92,7 +80,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
     )
 
 
-def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> FmuPlant:
+def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
     """Return the exported UR5 as a plant.
 
     Raises:
@@ -103,7 +91,7 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> FmuPlant:
         path = cached_fmu(config.fmi_version)
     except (CompilerMissing, CompilationFailed, OSError) as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
-    return build_plant(config.around(), ur5_mapping(path, config, setup), setup)
+    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay_periods, config.sensing)
 
 
 ENTRY = PlantEntry(
@@ -111,5 +99,4 @@ ENTRY = PlantEntry(
     summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
     config=Ur5FmuConfig,
     build=build_ur5,
-    sense=vary_sensing,
 )

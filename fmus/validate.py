@@ -11,10 +11,10 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description
-from servobench.plant.fmu.fmu_plant import open_slave
-from servobench.plant.fmu.slave import Port
+from servobench.plant.fmu.fmu_plant import open_instance
+from servobench.plant.fmu.instance import Port
 
 TOLERANCE = 1e-9
 
@@ -38,35 +38,32 @@ def validate_fmu(path: Path) -> Validation:
     Raises:
         ValueError: it is not a co-simulation FMU of FMI 2 or 3.
     """
-    folder = FmuFolder(path)
-    try:
-        description = read_description(path, folder.root)
-        problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
-        deviation = None
-        if (folder.root / INPUT_FILE).is_file() and (folder.root / OUTPUT_FILE).is_file():
-            try:
-                deviation = _deviation(description, folder)
-            except (FmuError, ValueError) as error:
-                problems.append(f"the reference run failed: {error}")
-        if deviation is not None and not deviation <= TOLERANCE:
-            problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
-        return Validation(tuple(problems), deviation)
-    finally:
-        folder.close()
+    root = extract_fmu(path)
+    description = read_description(path, root)
+    problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
+    deviation = None
+    if (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file():
+        try:
+            deviation = _deviation(description, root)
+        except (FmuError, ValueError) as error:
+            problems.append(f"the reference run failed: {error}")
+    if deviation is not None and not deviation <= TOLERANCE:
+        problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
+    return Validation(tuple(problems), deviation)
 
 
-def _deviation(description: FmuDescription, folder: FmuFolder) -> float:
+def _deviation(description: FmuDescription, root: Path) -> float:
     """Run the FMU under the reference commands and return the largest difference of its outputs."""
-    header_in, commands = read_table((folder.root / INPUT_FILE).read_text(encoding="utf-8"))
-    header_out, wanted = read_table((folder.root / OUTPUT_FILE).read_text(encoding="utf-8"))
+    header_in, commands = read_table((root / INPUT_FILE).read_text(encoding="utf-8"))
+    header_out, wanted = read_table((root / OUTPUT_FILE).read_text(encoding="utf-8"))
     inputs, outputs = Port(_variables(description, header_in)), Port(_variables(description, header_out))
     if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (len(commands), outputs.values.size + 1):
         raise ValueError("the reference tables do not fit the FMU's variables")
-    slave = open_slave(description, folder)
+    instance = open_instance(description, root)
     try:
-        write, read = slave.writer(inputs), slave.reader(outputs)
+        write, read = instance.writer(inputs), instance.reader(outputs)
         times = commands[:, 0]
-        slave.start(float(times[0]))
+        instance.start(float(times[0]))
         came: FloatArray = np.empty_like(wanted[:, 1:])
         for k, time in enumerate(times):
             read()
@@ -74,9 +71,9 @@ def _deviation(description: FmuDescription, folder: FmuFolder) -> float:
             inputs.values[:] = commands[k, 1:]
             write()
             if k + 1 < len(times):
-                slave.stepper(float(times[k + 1] - time))(float(time))
+                instance.stepper(float(times[k + 1] - time))(float(time))
     finally:
-        slave.close()
+        instance.close()
     return float(np.abs(came - wanted[:, 1:]).max())
 
 

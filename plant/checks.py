@@ -74,3 +74,25 @@ def check_number(
             good = good and holds
     if not good:
         raise ValueError(f"{name} must be {' and '.join(wanted) or 'finite'}, got {value}")
+
+
+def whole_steps(period: float, own_step: float) -> int:
+    """Return how many own steps of a plant make a control period.
+
+    Args:
+        period: control period, s.
+        own_step: the plant's own step, s.
+
+    Returns:
+        The whole number of own steps, at least 1.
+
+    Raises:
+        ValueError: the own step does not divide the period.
+    """
+    count = round(period / own_step) if period > 0.0 else 0
+    if count < 1 or abs(count * own_step - period) > 1e-9:
+        raise ValueError(
+            f"period must be a whole multiple of the plant's own step of {own_step:.9g} s, got {period:.9g} s; "
+            f"the nearest is {max(count, 1) * own_step:.9g} s"
+        )
+    return count

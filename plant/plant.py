@@ -1,11 +1,13 @@
-"""The contract of a plant: a spec, reset, step, close, and the truth for the log.
+"""The contract of a plant: a spec, reset, step, save and restore, close, and the truth for the log.
 
-A plant never sees a target. Adding one: a class below `Plant`, a frozen configuration dataclass beside it, and a
-`PlantEntry` that is named in `harness.config.registry` or published under the entry-point group `servobench.plants`.
+A plant never sees a target. A plant that is added is a `World` on the `Bench` of `servobench.plant.bench`, or a class
+of its own below `Plant`; a settings class beside it; and a `PlantEntry` that is named in `harness.config.registry` or
+published under the entry-point group `servobench.plants`.
 """
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,29 +77,43 @@ class Plant(ABC):
     def truth(self) -> Truth:
         """Return the present true feature and Jacobian; for evaluation only."""
 
+    def save(self) -> Any:  # noqa: ANN401 - each plant has a state of its own
+        """Return the present state as a value; after `restore` the run continues from it with the same bits.
+
+        By default it is a deep copy of the attributes; a plant that holds handles overrides both methods.
+
+        Raises:
+            ValueError: the plant cannot save its state.
+        """
+        return copy.deepcopy(vars(self))
+
+    def restore(self, state: Any) -> None:  # noqa: ANN401 - what `save` returned
+        """Return to a state that `save` of a plant with the same robot and settings returned, as often as wanted."""
+        vars(self).update(copy.deepcopy(state))
+
     def true_model(self) -> TrueModel:
         """Return the kinematics of a robot that the plant brings itself; for upper bounds only.
 
-        It lives as long as the plant.
+        The model lives as long as the plant.
 
         Raises:
-            ValueError: the plant cannot tell; says why.
+            ValueError: the plant does not know them; says why.
         """
         raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
-        """Return what everybody may know of a robot that the plant brings itself, (..., n) -> (..., m, n); or None."""
+        """Return the public nominal Jacobian of a robot that the plant brings, (..., n) -> (..., m, n); or None."""
         return None
 
     def picture(self) -> ImageArray | None:
-        """Return what the camera sees now, (h, w, 3) RGB with the detection drawn in; None without a camera.
+        """Return the present image of the camera, (h, w, 3) RGB with the detection drawn in; None without a camera.
 
         Taking it disturbs neither the run nor its random streams.
         """
         return None
 
     def move_camera(self, X_BC: FloatArray) -> None:
-        """Put the camera elsewhere from the next measurement on, until `reset`: somebody has knocked against it.
+        """Put the camera elsewhere from the next measurement on, until `reset`: a camera displaced during the run.
 
         Args:
             X_BC: (4, 4), the camera's new pose in the base frame.
@@ -109,12 +125,12 @@ class Plant(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free what the plant holds; calling it twice is allowed."""
+        """Free all resources of the plant; calling it twice is allowed."""
 
 
 @dataclass(frozen=True)
 class PlantSetup:
-    """What the harness hands to a plant's builder.
+    """The arguments with which the harness builds a plant.
 
     Attributes:
         model: the true arm and camera, mismatch included; None for a plant that brings a robot of its own.
@@ -144,10 +160,9 @@ class PlantEntry:
     Attributes:
         name: the word on the command line.
         summary: one line for `servobench plants`.
-        config: frozen dataclass with a default for every field.
-        build: makes the plant from its configuration and the setup.
-        sense: returns a configuration with its sensor noise multiplied by a factor and, unless None, its latency set to
-            a number of periods; None for a plant whose sensing cannot be varied.
+        config: settings class with a default for every field; its noise and latency can be varied if it has a field
+            `sensing` of class `servobench.plant.bench.SensingConfig`.
+        build: makes the plant from its settings and the setup.
         own_robot: it brings a robot and a start of its own: tasks taught on the UR5 and mismatches do not apply, and
             no nominal model is known.
     """
@@ -156,37 +171,4 @@ class PlantEntry:
     summary: str
     config: type[Any]
     build: Callable[[Any, PlantSetup], Plant]
-    sense: Callable[[Any, float, int | None], Any] | None = None
     own_robot: bool = False
-
-    def vary_sensing(self, config: Any, noise_factor: float, latency_periods: int | None) -> Any:  # noqa: ANN401
-        """Return `config` with other noise and latency; see `sense`.
-
-        Raises:
-            ValueError: the plant does not offer that, or a number out of its bounds.
-        """
-        if self.sense is None:
-            raise ValueError("its noise and latency cannot be varied")
-        return self.sense(config, noise_factor, latency_periods)
-
-
-def whole_steps(period: float, own_step: float) -> int:
-    """Return how many own steps of a plant make a control period.
-
-    Args:
-        period: control period, s.
-        own_step: the plant's own step, s.
-
-    Returns:
-        The whole number of own steps, at least 1.
-
-    Raises:
-        ValueError: the own step does not divide the period.
-    """
-    count = round(period / own_step) if period > 0.0 else 0
-    if count < 1 or abs(count * own_step - period) > 1e-9:
-        raise ValueError(
-            f"period must be a whole multiple of the plant's own step of {own_step:.9g} s, got {period:.9g} s; "
-            f"the nearest is {max(count, 1) * own_step:.9g} s"
-        )
-    return count

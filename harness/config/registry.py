@@ -14,7 +14,7 @@ from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
 from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError, suggest
-from servobench.plant.fmu.entry import mapped_entry
+from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.plant import PlantEntry
 
 PLANT_GROUP = "servobench.plants"

@@ -29,6 +29,7 @@ from servobench.harness.run.tasks import (
     find_task,
     task_names,
 )
+from servobench.plant.bench import vary_sensing
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import (
@@ -191,7 +192,7 @@ def _build_plant(request: RunRequest, settings: Settings, entry: PlantEntry, set
     config = settings.resolve(request.plant, entry.config())
     try:
         if request.noise_factor != 1.0 or request.latency_periods is not None:
-            config = entry.vary_sensing(config, request.noise_factor, request.latency_periods)
+            config = vary_sensing(config, request.noise_factor, request.latency_periods)
         return entry.build(config, setup)
     except (ValueError, RunFault) as error:
         raise ConfigurationError(f"plant {request.plant}: {error}") from error

@@ -1,25 +1,26 @@
-"""The rendered plant: a UR5 with dynamics in PyBullet, seen by an RGB-D camera in whose image the ball is searched.
+"""The rendered plant: a UR5 with dynamics in PyBullet, seen by an RGB-D camera in whose image the ball is found.
 
 At every physics step h = 1/240 s the joints' velocity motors get the target of a first-order lag, discretised exactly,
 
-    v₊ = v + (1 − exp(−h/τ)) (u(t − d) − v),        θ̇_target = g ⊙ v,
+    v₊ = v + (1 − exp(−h/τ)) (u − v),        θ̇_target = g ⊙ v,
 
 because PyBullet's motors alone reach any target within a step. Controllers see and command reported positions q, which
-are (θ − o)/g of the simulator's angles θ. The feature is the ball's centre as fitted to noisy depths, late by the
-camera's latency; it is missing where the ball is hidden, out of sight or cut by the image's border.
+are (θ − o)/g of the simulator's angles θ. The feature is the ball's centre as fitted to noisy depths; it is missing
+where the ball is hidden, out of sight or cut by the image's border. Delay, latency and lost frames are those of
+`servobench.plant.bench`.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from collections import deque
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from servobench.plant.bench import Bench, SensingConfig, World
 from servobench.plant.bullet.detection import (
     ByteArray,
     Detection,
@@ -27,15 +28,15 @@ from servobench.plant.bullet.detection import (
     find_ball,
 )
 from servobench.plant.bullet.urdf import ArmBody
-from servobench.plant.checks import FloatArray, as_vector, check_number
-from servobench.plant.faults import FeatureLost, PlantDiverged
-from servobench.plant.plant import Plant, PlantEntry, PlantSetup, whole_steps
+from servobench.plant.checks import FloatArray, as_vector, whole_steps
+from servobench.plant.faults import PlantDiverged
+from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot import ur5
-from servobench.plant.robot.camera import DepthNoise, PinholeCamera
+from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.seeds import named_generator
-from servobench.plant.sensing import FeatureChannel, vary_sensing
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
+from servobench.plant.signals import PlantSpec, Truth
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import Scene
@@ -43,37 +44,40 @@ if TYPE_CHECKING:
 PHYSICS_STEP = 1.0 / 240.0  # s
 
 
-@dataclass(frozen=True)
+@settings
 class BulletConfig:
     """Settings of the rendered plant; defaults are those of a UR5 under a stereo depth camera."""
 
-    max_joint_speed: float = 1.0  # rad/s, a cautious share of the vendor's limit of π
-    joint_range: float = 2 * np.pi  # rad each way, vendor's range
-    lag: float = 0.05  # s, time constant of the joints' velocity loops; 0 = none
-    command_delay_periods: int = 0  # periods between a command and its first effect
-    width: int = 320  # px
-    height: int = 240  # px
-    vertical_fov: float = 60.0  # deg, sees the workspace and a margin
-    depth_noise: str = "stereo"  # none, stereo or structured_light
-    depth_subpixel: float = 0.08  # px, RMS disparity error of a stereo match, vendor's white paper
-    depth_baseline: float = 0.05  # m, between the two imagers, RealSense D435
-    native_width: int = 848  # px, width at which the depth sensor matches, RealSense D435's optimum
-    depth_quantisation: float = 0.001  # m, depth unit of the sensor; 0 = none
-    depth_noise_factor: float = 1.0  # on the depth noise, for a study of it
-    latency_periods: int = 1  # periods between exposure and delivery of the feature
-    drop_probability: float = 0.002  # chance that a frame is lost
-    scenery: bool = True  # draw the table and the floor; without them a frame costs a fifth
-    view: bool = False  # open PyBullet's window and run in real time
-
-    def __post_init__(self) -> None:
-        """Check every number; the parts check theirs."""
-        check_number("max_joint_speed", self.max_joint_speed, above=0.0)
-        check_number("joint_range", self.joint_range, above=0.0)
-        check_number("lag", self.lag, at_least=0.0)
-        check_number("command_delay_periods", self.command_delay_periods, at_least=0)
-        FeatureChannel(self.latency_periods, self.drop_probability)
-        self.camera()
-        self.noise()
+    max_joint_speed: Positive = 1.0
+    """[rad/s] limit of every joint; a cautious share of the vendor's limit of π."""
+    joint_range: Positive = 2 * math.pi
+    """[rad] largest joint position each way; the vendor's range."""
+    lag: NonNegative = 0.05
+    """[s] τ, time constant of the joints' velocity loops; 0 means none."""
+    command_delay_periods: Periods = 0
+    """[periods] between a command and its first effect."""
+    sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 1, 0.002))
+    """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""
+    width: Count = 320
+    """[px] width of the image."""
+    height: Count = 240
+    """[px] height of the image."""
+    vertical_fov: FieldOfView = 60.0
+    """[deg] vertical field of view; it covers the workspace and a margin."""
+    depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"
+    """Model of the depth noise."""
+    depth_subpixel: NonNegative = 0.08
+    """[px] RMS disparity error of a stereo match; vendor's white paper."""
+    depth_baseline: Positive = 0.05
+    """[m] between the two imagers; RealSense D435."""
+    native_width: Count = 848
+    """[px] width at which the depth sensor matches; optimum of the RealSense D435."""
+    depth_quantisation: NonNegative = 0.001
+    """[m] depth unit of the sensor; 0 means none."""
+    scenery: bool = True
+    """Draw the table and the floor; without them a frame costs a fifth."""
+    view: bool = False
+    """Open PyBullet's window and run in real time."""
 
     def camera(self) -> PinholeCamera:
         """Return the camera's intrinsics."""
@@ -87,7 +91,7 @@ class BulletConfig:
             self.depth_baseline,
             self.native_width,
             self.depth_quantisation,
-            self.depth_noise_factor,
+            self.sensing.noise_factor,
         )
 
 
@@ -144,7 +148,26 @@ def velocity_targets(
     return np.asarray(targets)
 
 
-class BulletPlant(Plant):
+@dataclass(frozen=True, eq=False)
+class BulletState:
+    """A saved state of the world, without handles: any world with the same robot and settings can restore it.
+
+    Attributes:
+        angles: (n,), rad, of the simulator.
+        speeds: (n,), rad/s, of the simulator.
+        v: (n,), rad/s, present target of the motors.
+        X_BC: (4, 4), pose of the camera.
+        noise: generator of the depth noise.
+    """
+
+    angles: FloatArray
+    speeds: FloatArray
+    v: FloatArray
+    X_BC: FloatArray
+    noise: np.random.Generator
+
+
+class BulletWorld(World):
     """A UR5 in PyBullet under a fixed RGB-D camera: v₊ = v + (1 − e^(−h/τ))(u − v), y = centre of the ball it sees."""
 
     def __init__(self, config: BulletConfig, setup: PlantSetup) -> None:
@@ -164,7 +187,6 @@ class BulletPlant(Plant):
         if not model.arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {model.arm.gear_ratio.tolist()}")
         self._decay = math.exp(-PHYSICS_STEP / config.lag) if config.lag > 0.0 else 0.0
-        self._channel = FeatureChannel(config.latency_periods, config.drop_probability)
         self._camera, self._depth_noise = config.camera(), config.noise()
         self._X_BC, self._view_of = model.X_BC, view_of
         self.move_camera(model.X_BC)
@@ -177,45 +199,59 @@ class BulletPlant(Plant):
         """Sizes, names, limits and period."""
         return self._spec
 
-    def reset(self, seed: int) -> Observation:
-        """Return to the start at rest; depth noise and lost frames get streams of their own. See `Plant.reset`."""
+    def reset(self, seed: int) -> FloatArray:
+        """Go back to the start at rest; the depth noise gets a random stream of its own. See `World.reset`."""
         self._noise = named_generator(seed, "depth_noise")
         self.move_camera(self._X_BC)
         self._v = np.zeros(self._spec.n)
-        self._commands: deque[FloatArray] = deque([np.zeros(self._spec.n)] * self._config.command_delay_periods)
-        self._k = 0
+        self._periods = 0
         self._scene.place(self._model.arm.joint_angle(self._start))
-        first = self._measure()
-        if first is None:
-            true = self._model.to_camera(self._scene.ball_position())
-            raise FeatureLost(
-                f"the ball is not visible at the start {self._start.tolist()}: it is at {true.round(3).tolist()} m in "
-                f"the camera frame, column and row {self._camera.project(true).round(1).tolist()} of an image of "
-                f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight, too small or cut "
-                "by the border"
-            )
-        self._channel.reset(first, named_generator(seed, "dropped_frames"))
         self._started = time.perf_counter()
-        return Observation(0.0, self._joint_position(), first)
+        return self._joint_position()
 
-    def step(self, command: Command) -> Observation:
-        """Apply `command` for one period; see `Plant.step`."""
-        limit = self._spec.joint_velocity_limit
-        wanted = as_vector("joint_velocity", command.joint_velocity, self._spec.n)
-        self._commands.append(np.clip(wanted, -limit, limit))
-        u, q = self._commands.popleft(), self._joint_position()
+    def advance(self, joint_velocity: FloatArray) -> FloatArray:
+        """Hold a command for one period; see `World.advance`."""
+        q = self._joint_position()
         room = np.minimum(self._spec.joint_lower - q, 0.0), np.maximum(self._spec.joint_upper - q, 0.0)
-        targets = velocity_targets(self._v, u, self._decay, self._steps, room)
+        targets = velocity_targets(self._v, joint_velocity, self._decay, self._steps, room)
         self._v = targets[-1]
         self._scene.advance((targets * self._model.arm.gear_ratio).tolist())
         q = self._joint_position()
         if not np.isfinite(q).all():
             raise PlantDiverged(f"joint positions are not finite: {q.tolist()}")
-        self._k += 1
-        feature, valid = self._channel.deliver(self._measure())
+        self._periods += 1
         if self._config.view:
             self._keep_pace()
-        return Observation(self._k * self._spec.period, q, feature, valid)
+        return q
+
+    def see(self) -> FloatArray | None:
+        """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
+        found = find_ball(*self._scene.render(self._view), self._camera, ur5.BALL_RADIUS, self._sense)
+        if found is None:
+            return None
+        found.centre.setflags(write=False)
+        return found.centre
+
+    def why_unseen(self) -> str:
+        """Return where the ball is and would appear."""
+        true = self._model.to_camera(self._scene.ball_position())
+        return (
+            f"the ball is not visible at the start {self._start.tolist()}: it is at {true.round(3).tolist()} m in "
+            f"the camera frame, column and row {self._camera.project(true).round(1).tolist()} of an image of "
+            f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight, too small or cut "
+            "by the border"
+        )
+
+    def save(self) -> BulletState:
+        """See `Plant.save`; measured: joints, detections and images continue with the same bits."""
+        angles, speeds = self._scene.joint_state()
+        return BulletState(angles, speeds, self._v, self._model.X_BC, copy.deepcopy(self._noise))
+
+    def restore(self, state: BulletState) -> None:
+        """See `Plant.restore`."""
+        self._scene.place(state.angles, state.speeds)
+        self.move_camera(state.X_BC)
+        self._v, self._noise = state.v, copy.deepcopy(state.noise)
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -245,25 +281,30 @@ class BulletPlant(Plant):
     def _joint_position(self) -> FloatArray:
         """Return the reported joint positions q = (θ − o)/g, (n,) rad."""
         arm = self._model.arm
-        return (self._scene.joint_angles() - arm.joint_offset) / arm.gear_ratio
-
-    def _measure(self) -> FloatArray | None:
-        """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
-        found = find_ball(*self._scene.render(self._view), self._camera, ur5.BALL_RADIUS, self._sense)
-        return None if found is None else found.centre
+        q: FloatArray = (self._scene.joint_angles() - arm.joint_offset) / arm.gear_ratio
+        q.setflags(write=False)
+        return q
 
     def _sense(self, depth: FloatArray) -> FloatArray:
         return self._depth_noise.apply(depth, self._camera, self._noise)
 
     def _keep_pace(self) -> None:
         """Wait until the wall clock has come as far as the run; only with a window."""
-        time.sleep(max(0.0, self._started + self._k * self._spec.period - time.perf_counter()))
+        time.sleep(max(0.0, self._started + self._periods * self._spec.period - time.perf_counter()))
+
+
+def build_bullet(config: BulletConfig, setup: PlantSetup) -> Bench:
+    """Return the rendered plant.
+
+    Raises:
+        ValueError: see `BulletWorld`.
+    """
+    return Bench(BulletWorld(config, setup), config.command_delay_periods, config.sensing)
 
 
 ENTRY = PlantEntry(
     name="bullet",
     summary="PyBullet arm with dynamics; the ball is found in the rendered images of a depth camera",
     config=BulletConfig,
-    build=BulletPlant,
-    sense=partial(vary_sensing, noise="depth_noise_factor"),
+    build=build_bullet,
 )

@@ -118,10 +118,11 @@ class Scene:
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
         pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
 
-    def place(self, theta: FloatArray) -> None:
-        """Put the arm at rest at joint angles `theta` (n,) rad."""
-        for joint, angle in zip(self._joints, theta.tolist(), strict=True):
-            pybullet.resetJointState(self._arm, joint, angle, 0.0, physicsClientId=self._client)
+    def place(self, theta: FloatArray, speed: FloatArray | None = None) -> None:
+        """Put the arm at joint angles `theta` (n,) rad with `speed` (n,) rad/s, or at rest without it."""
+        speeds = np.zeros(len(theta)) if speed is None else speed
+        for joint, angle, velocity in zip(self._joints, theta.tolist(), speeds.tolist(), strict=True):
+            pybullet.resetJointState(self._arm, joint, angle, velocity, physicsClientId=self._client)
 
     def advance(self, velocities: list[list[float]]) -> None:
         """Take a physics step for each row of target joint velocities, (n,) rad/s, under the motors' torque limits."""
@@ -135,6 +136,11 @@ class Scene:
         """Return the joint angles θ, (n,) rad."""
         states = pybullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
         return np.array([state[0] for state in states])
+
+    def joint_state(self) -> tuple[FloatArray, FloatArray]:
+        """Return the joint angles θ, (n,) rad, and their speeds, (n,) rad/s."""
+        states = pybullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
+        return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 
     def ball_position(self) -> FloatArray:
         """Return the ball's centre in the base frame, (3,) m, from the simulator's own link state."""

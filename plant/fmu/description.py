@@ -11,13 +11,13 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import prod
 from pathlib import Path
 from typing import Any
 
 REAL_TYPES = ("Real", "Float64")
-LISTED = 40  # names in an error message
+MAX_LISTED = 40  # names in an error message
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class FmuDescription:
-    """What is used of a model description.
+    """The part of a model description that is used here.
 
     Attributes:
         path: the .fmu file, for messages.
@@ -105,8 +105,8 @@ class FmuDescription:
         known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
         nearest = difflib.get_close_matches(name, [*known, *self._by_name], n=1)
         hint = f"did you mean {nearest[0]!r}? " if nearest else ""
-        more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
-        listed = ", ".join(sorted(known)[:LISTED])
+        more = f" and {len(known) - MAX_LISTED} more" if len(known) > MAX_LISTED else ""
+        listed = ", ".join(sorted(known)[:MAX_LISTED])
         raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have; {hint}it has: {listed}{more}")
 
     def select(self, names: Iterable[str], role: str) -> tuple[Variable, ...]:
@@ -119,8 +119,9 @@ def total_size(variables: Iterable[Variable]) -> int:
     return sum(variable.size for variable in variables)
 
 
+@lru_cache(maxsize=64)
 def read_description(path: Path, root: Path) -> FmuDescription:
-    """Read the model description below `root` of the FMU at `path`.
+    """Read the model description of the FMU at `path`, extracted to `root`; once a process.
 
     Raises:
         ValueError: broken, of FMI 1, or without co-simulation.
@@ -146,7 +147,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
 
 
 def read_exchange(path: Path, root: Path) -> None:
-    """Check that the FMU at `path`, extracted to `root`, tells its own derivatives in model exchange.
+    """Check that the FMU at `path`, extracted to `root`, offers its own derivatives in model exchange.
 
     Raises:
         ValueError: broken, not of FMI 2, without model exchange or without directional derivatives.

@@ -1,4 +1,4 @@
-"""Tells which variables of an FMU are commands, joints, features and parameters; in Python or in a TOML file.
+"""The roles of an FMU's variables: commands, joints, features and parameters; given in Python or in a TOML file.
 
 file = "crane.fmu"                 # beside the TOML file
 inputs = ["v[1]", "v[2]"]          # joint velocity commands, rad/s
@@ -51,7 +51,7 @@ Names: TypeAlias = tuple[str, ...]
 
 @dataclass(frozen=True)
 class FmuMapping:
-    """Which variables of an FMU are what.
+    """The roles of an FMU's variables.
 
     A name stands for a scalar, an array, or all of `name[1]`, `name[2]`, …
 
@@ -71,7 +71,6 @@ class FmuMapping:
         nominal: the values that controllers believe, where they differ; None: there is no nominal model.
         period: the FMU's step, s; None for the control period.
         max_joint_speed: rad/s; commands are clipped to it.
-        clips_itself: the FMU does the clipping.
         joint_lower: rad, of all joints.
         joint_upper: rad, of all joints.
         joint_names: for the log; None for joint_1, joint_2, …
@@ -93,7 +92,6 @@ class FmuMapping:
     nominal: Mapping[str, FloatArray] | None = None
     period: float | None = None
     max_joint_speed: float = 1.0
-    clips_itself: bool = False
     joint_lower: float = -2 * np.pi
     joint_upper: float = 2 * np.pi
     joint_names: Names | None = None
@@ -106,8 +104,6 @@ class FmuMapping:
             if not getattr(self, name):
                 raise ValueError(f"{name} must name at least one variable of the FMU, got none")
         check_number("max_joint_speed", self.max_joint_speed, above=0.0)
-        if self.clips_itself and not self.joints:
-            raise ValueError("clips_itself needs joints: commands cannot be integrated if the FMU changes them")
         if self.start is not None and self.joints and self.home is None:
             raise ValueError("start needs home, the parameter that takes it: the FMU tells its joints itself")
         if self.period is not None:
@@ -231,14 +227,14 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         came = total_size(description.select(names, name))
         if names and came != size:
             raise ValueError(f"{name} must name {size} numbers for {n} inputs and {m} features, got {came}")
-    return PlantSpec(
-        joint_names=_labels("joint", mapping.joint_names, n),
-        feature_names=_labels("feature", mapping.feature_names, m),
-        joint_velocity_limit=np.full(n, mapping.max_joint_speed),
-        joint_lower=np.full(n, mapping.joint_lower),
-        joint_upper=np.full(n, mapping.joint_upper),
-        period=period,
-        feature_unit=mapping.feature_unit,
+    return PlantSpec.of_joints(
+        _labels("joint", mapping.joint_names, n),
+        _labels("feature", mapping.feature_names, m),
+        np.full(n, mapping.max_joint_speed),
+        np.full(n, mapping.joint_lower),
+        np.full(n, mapping.joint_upper),
+        period,
+        mapping.feature_unit,
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping
 
@@ -25,10 +25,10 @@ from servobench.plant.fmu.mapping import FmuMapping
 class FmuModel:
     """y = h(q) of a model-exchange FMU, J = ∂h/∂q by its directional derivatives; other states rest at their start.
 
-    It has an instance of the FMU and extracted files of its own, so that it disturbs no run of the same FMU.
+    It has an instance of the FMU of its own, so that it disturbs no run of the same FMU.
 
     Attributes:
-        function: (n,) rad -> (m,) and (m, n), a `casadi.Function`; it lives as long as this object.
+        function: (n,) rad -> (m,) and (m, n), a `casadi.Function`.
     """
 
     def __init__(
@@ -49,18 +49,14 @@ class FmuModel:
         Raises:
             ValueError: not such an FMU, or a name that it does not have.
         """
-        self._folder = FmuFolder(path)
-        try:
-            read_exchange(path, self._folder.root)
-            self._feature = _feature_function(path, self._folder.root, joints, features, dict(parameters or {}))
-            q = casadi.MX.sym("joint_position", self._feature.size1_in(0))
-            y = self._feature(q)
-            outputs: list[Any] = [y, casadi.jacobian(y, q)]
-            create: Any = casadi.Function  # its annotations do not know MX
-            self.function = create("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
-        except BaseException:
-            self._folder.close()
-            raise
+        root = extract_fmu(path)
+        read_exchange(path, root)
+        self._feature = _feature_function(path, root, joints, features, dict(parameters or {}))
+        q = casadi.MX.sym("joint_position", self._feature.size1_in(0))
+        y = self._feature(q)
+        outputs: list[Any] = [y, casadi.jacobian(y, q)]
+        create: Any = casadi.Function  # its annotations do not know MX
+        self.function = create("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
 
     def symbolic(self, joint_position: Any) -> Any:  # noqa: ANN401 - CasADi expressions
         """Return the feature, (m, 1), as an expression of `joint_position`, an MX expression of shape (n, 1) in rad."""
@@ -75,10 +71,6 @@ class FmuModel:
         q = np.asarray(joint_position, dtype=np.float64)
         rows = [np.asarray(self.function(row)[1]) for row in q.reshape(-1, q.shape[-1])]
         return np.array(rows, dtype=np.float64).reshape(*q.shape[:-1], *rows[0].shape)
-
-    def close(self) -> None:
-        """Remove the extracted files; the functions must not be used any more. Calling it twice is allowed."""
-        self._folder.close()
 
 
 def mapped_model(

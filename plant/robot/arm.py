@@ -25,6 +25,9 @@ from servobench.plant.checks import FloatArray, as_vector
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 
+TURN_SIGNS = np.array([1.0, -1.0])  # of the sine in the two columns that a turn about z mixes
+
+
 def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
     """Return Rz(yaw) Ry(pitch) Rx(roll), shape (..., 3, 3), for `rpy` of shape (..., 3) in rad."""
     angles = np.asarray(rpy, dtype=np.float64)
@@ -111,18 +114,19 @@ class SerialArm:
             (..., n+1, 4, 4), m: entry i is the frame after joint i+1, the last one is the flange.
         """
         theta = self.joint_angle(joint_position)
-        cos, sin = np.cos(theta), np.sin(theta)
-        poses = np.empty((*theta.shape[:-1], self.n + 1, 4, 4))
-        pose = np.broadcast_to(self._fixed[0], (*theta.shape[:-1], 4, 4))
-        for i in range(self.n):
-            turned = poses[..., i, :, :]
-            c, s = cos[..., i, None], sin[..., i, None]
-            turned[..., :, 0] = pose[..., :, 0] * c + pose[..., :, 1] * s
-            turned[..., :, 1] = pose[..., :, 1] * c - pose[..., :, 0] * s
-            turned[..., :, 2:] = pose[..., :, 2:]
-            pose = turned @ self._fixed[i + 1]
-        poses[..., self.n, :, :] = pose
-        return poses
+        # The joint axis goes first, so that the loop meets one joint after the other.
+        angle = np.moveaxis(theta, -1, 0)[..., None, None]
+        cos, sin = np.cos(angle), np.sin(angle) * TURN_SIGNS
+        poses = np.empty((self.n + 1, *theta.shape[:-1], 4, 4))
+        pose: FloatArray = self._fixed[0]
+        for turned, c, s, fixed in zip(poses, cos, sin, self._fixed[1:], strict=False):
+            # Columns 0 and 1 of a frame turned about z are x c + y s and y c - x s; the others stay.
+            np.multiply(pose[..., :2], c, out=turned[..., :2])
+            turned[..., :2] += pose[..., 1::-1] * s
+            turned[..., 2:] = pose[..., 2:]
+            pose = turned @ fixed
+        poses[self.n] = pose
+        return np.moveaxis(poses, 0, -3)
 
     def flange_pose(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return X_BE, the flange in the base frame, (..., 4, 4), for joint positions (..., n) in rad."""
@@ -134,10 +138,20 @@ class SerialArm:
 
     def ball_jacobian(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂(ball centre)/∂(reported joint position), (..., 3, n) m/rad, for (..., n) in rad."""
+        return self.ball_and_jacobian(joint_position)[1]
+
+    def ball_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return `ball_position` and `ball_jacobian` at the cost of one forward kinematics."""
         frames = self.frames(joint_position)
-        lever = self._ball(frames)[..., None, :] - frames[..., : self.n, :3, 3]
-        columns = np.cross(frames[..., : self.n, :3, 2], lever) * self.gear_ratio[:, None]
-        return np.swapaxes(columns, -1, -2)
+        ball = self._ball(frames)
+        axis = frames[..., : self.n, :3, 2]
+        lever = ball[..., None, :] - frames[..., : self.n, :3, 3]
+        # numpy.cross would cost as much as the forward kinematics.
+        columns = np.empty_like(lever)
+        for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+            columns[..., i] = axis[..., j] * lever[..., k] - axis[..., k] * lever[..., j]
+        columns *= self.gear_ratio[:, None]
+        return ball, np.swapaxes(columns, -1, -2)
 
     def _ball(self, frames: FloatArray) -> FloatArray:
         flange = frames[..., -1, :, :]

@@ -11,34 +11,39 @@ for best performance"); structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import Gt, Lt
 
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
+from servobench.plant.settings import Count, NonNegative, Positive, settings
 
 PIXEL_CENTRE = (0.0, 1.0)  # px, where TinyRenderer samples a pixel, from its upper left corner
-NOISE_MODELS = ("none", "stereo", "structured_light")
+FieldOfView: TypeAlias = Annotated[float, Gt(0.0), Lt(180.0)]
+"""Above 0° and below 180°."""
 
 
-@dataclass(frozen=True)
+@settings
 class PinholeCamera:
     """An ideal camera with square pixels and its principal point in the middle of the image."""
 
-    width: int = 320  # px
-    height: int = 240  # px
-    vertical_fov: float = 60.0  # deg, sees the workspace with a margin from 1.3 m
-    near: float = 0.1  # m, clipping plane
-    far: float = 4.0  # m, clipping plane
+    width: Count = 320
+    """[px]"""
+    height: Count = 240
+    """[px]"""
+    vertical_fov: FieldOfView = 60.0
+    """[deg] it covers the workspace with a margin from 1.3 m."""
+    near: Positive = 0.1
+    """[m] clipping plane."""
+    far: Positive = 4.0
+    """[m] clipping plane."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("width", self.width, at_least=1)
-        check_number("height", self.height, at_least=1)
-        check_number("vertical_fov", self.vertical_fov, above=0.0, below=180.0)
-        check_number("near", self.near, above=0.0)
-        check_number("far", self.far, above=self.near)
+        """Check the order of the clipping planes."""
+        if not self.far > self.near:
+            raise ValueError(f"far must be above near, {self.near:g} m, got {self.far:g} m")
 
     @property
     def focal(self) -> float:
@@ -95,26 +100,22 @@ def view_matrix(X_BC: FloatArray) -> FloatArray:
     return view
 
 
-@dataclass(frozen=True)
+@settings
 class DepthNoise:
-    """What a depth sensor adds to the true depth: z_measured = quantise(z + factor σ(z) N(0, 1))."""
+    """Noise of a depth sensor: z_measured = quantise(z + factor σ(z) N(0, 1))."""
 
-    depth_noise: str = "stereo"  # one of NOISE_MODELS
-    depth_subpixel: float = 0.08  # px, RMS disparity error of a stereo match, vendor's white paper
-    depth_baseline: float = 0.05  # m, between the two imagers, RealSense D435
-    native_width: int = 848  # px, width at which the sensor matches, RealSense D435's optimum
-    depth_quantisation: float = 0.001  # m, depth unit of the sensor; 0 = none
-    depth_noise_factor: float = 1.0  # on σ
-
-    def __post_init__(self) -> None:
-        """Check the name and the numbers."""
-        check_number("depth_noise_factor", self.depth_noise_factor, at_least=0.0)
-        if self.depth_noise not in NOISE_MODELS:
-            raise ValueError(f"depth_noise must be one of {', '.join(NOISE_MODELS)}, got {self.depth_noise!r}")
-        check_number("depth_subpixel", self.depth_subpixel, at_least=0.0)
-        check_number("depth_baseline", self.depth_baseline, above=0.0)
-        check_number("native_width", self.native_width, at_least=1)
-        check_number("depth_quantisation", self.depth_quantisation, at_least=0.0)
+    depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"
+    """Model of σ(z)."""
+    depth_subpixel: NonNegative = 0.08
+    """[px] RMS disparity error of a stereo match; vendor's white paper."""
+    depth_baseline: Positive = 0.05
+    """[m] between the two imagers; RealSense D435."""
+    native_width: Count = 848
+    """[px] width at which the sensor matches; optimum of the RealSense D435."""
+    depth_quantisation: NonNegative = 0.001
+    """[m] depth unit of the sensor; 0 means none."""
+    factor: NonNegative = 1.0
+    """[1] factor on σ."""
 
     def sigma(self, depth: npt.ArrayLike, camera: PinholeCamera) -> FloatArray:
         """Return the standard deviation, m, at true depths of any shape, m."""
@@ -130,7 +131,7 @@ class DepthNoise:
         """Return measured depths, m, for true depths of any shape, m; without noise nothing is drawn."""
         z = np.asarray(depth, dtype=np.float64)
         if self.depth_noise != "none":
-            z = z + self.depth_noise_factor * self.sigma(z, camera) * generator.standard_normal(z.shape)
+            z = z + self.factor * self.sigma(z, camera) * generator.standard_normal(z.shape)
         if self.depth_quantisation > 0.0:
             z = np.round(z / self.depth_quantisation) * self.depth_quantisation
         return z

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.signals import PlantSpec
 
@@ -48,6 +48,14 @@ class HandEyeModel:
         """Return ∂feature/∂(joint position), (..., 3, n) m/rad, for joint positions (..., n) in rad."""
         return np.asarray(self.X_BC[:3, :3].T @ self.arm.ball_jacobian(joint_position))
 
+    def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return `feature` and `jacobian`, both read-only, at the cost of one forward kinematics."""
+        p_B, J_B = self.arm.ball_and_jacobian(joint_position)
+        y, J = self.to_camera(p_B), np.asarray(self.X_BC[:3, :3].T @ J_B)
+        y.setflags(write=False)
+        J.setflags(write=False)
+        return y, J
+
     def to_camera(self, p_B: npt.ArrayLike) -> FloatArray:
         """Return points of the base frame in the camera frame, (..., 3) m."""
         return np.asarray((np.asarray(p_B, dtype=np.float64) - self.X_BC[:3, 3]) @ self.X_BC[:3, :3])
@@ -69,14 +77,5 @@ def hand_eye_spec(model: HandEyeModel, period: float, max_joint_speed: float, jo
     Raises:
         ValueError: a period, speed or range that is not positive.
     """
-    check_number("max_joint_speed", max_joint_speed, above=0.0)
-    check_number("joint_range", joint_range, above=0.0)
-    n = model.arm.n
-    return PlantSpec(
-        joint_names=model.arm.joint_names,
-        feature_names=FEATURE_NAMES,
-        joint_velocity_limit=np.full(n, max_joint_speed),
-        joint_lower=np.full(n, -joint_range),
-        joint_upper=np.full(n, joint_range),
-        period=period,
-    )
+    speed, reach = np.full(model.arm.n, max_joint_speed), np.full(model.arm.n, joint_range)
+    return PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, speed, -reach, reach, period)

@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from kit.plants import configure
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.fit import train
 from servobench.harness.config.defaults import default_config
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -56,7 +57,7 @@ def test_moderately_wrong_robots_settle_within_5_mm(name, latency, knowledge):
         rng = np.random.default_rng(seed)
         robot, _ = sample_mismatch(Mismatch("moderate"), MODEL, seed)
         start, goal = rng.uniform(LOWER, UPPER), robot.feature(rng.uniform(LOWER, UPPER))
-        plant = KinematicPlant(KinematicConfig(latency_periods=latency), PlantSetup(robot, start, PERIOD))
+        plant = build_kinematic(configure(KinematicConfig, latency_periods=latency), PlantSetup(robot, start, PERIOD))
         controller = METHODS[name].build(default_config(METHODS[name]), knowledge)
         errors = true_errors(controller, plant, lambda _, goal=goal: goal, 160, seed)
         assert errors[-20:].max() < 0.005
@@ -71,7 +72,7 @@ def circle_error(config, knowledge):
     def circle(k):
         return centre + 0.3 * np.array([np.cos(2 * np.pi * k / 200), np.sin(2 * np.pi * k / 200), 0.0])
 
-    plant = KinematicPlant(KinematicConfig(), PlantSetup(robot, np.array(HOME), PERIOD))
+    plant = build_kinematic(KinematicConfig(), PlantSetup(robot, np.array(HOME), PERIOD))
     errors = true_errors(METHODS["rbfnn_mfac"].build(config, knowledge), plant, circle, 400, 1)
     return np.sqrt(np.mean(errors[200:] ** 2))
 

@@ -13,7 +13,7 @@ from servobench.controllers.networks.fit import train
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -92,7 +92,7 @@ def commands(controller, steps=60):
     robot, _ = sample_mismatch(Mismatch("moderate"), MODEL, 5)
     rng = np.random.default_rng(0)
     start, goal = (rng.uniform(TRAINING_LOWER, TRAINING_UPPER) for _ in range(2))
-    plant, target = KinematicPlant(KinematicConfig(), PlantSetup(robot, start, PERIOD)), robot.feature(goal)
+    plant, target = build_kinematic(KinematicConfig(), PlantSetup(robot, start, PERIOD)), robot.feature(goal)
     observation, sent = plant.reset(0), []
     controller.reset(observation, 0)
     for k in range(steps):

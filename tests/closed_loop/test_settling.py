@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from kit.plants import configure
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.defaults import default_config
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.arm import arm_from_dh, rotation_from_rpy
 from servobench.plant.robot.hand_eye import HandEyeModel
@@ -40,7 +41,7 @@ def mismatched_model(degrees):
 def true_errors(entry, config, degrees=15.0, periods=160, **plant_settings):
     """Return the true error norms of a run, (periods,), m."""
     model, nominal = mismatched_model(degrees), nominal_ur5()
-    plant = KinematicPlant(KinematicConfig(**plant_settings), PlantSetup(model, START, 0.05))
+    plant = build_kinematic(configure(KinematicConfig, **plant_settings), PlantSetup(model, START, 0.05))
     controller = entry.build(config, RobotKnowledge(plant.spec, 1, nominal.jacobian, model.jacobian))
     observation, goal, errors = plant.reset(0), model.feature(GOAL), []
     controller.reset(observation, 0)

@@ -34,7 +34,7 @@ def robot(n, m, seed):
     """What may be known about a made-up robot y = A sin(B q) of any size; its true Jacobian has other numbers."""
     rng = np.random.default_rng(seed)
     names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
-    spec = PlantSpec(*names, rng.uniform(0.1, 3.0, n), np.full(n, -6.0), np.full(n, 6.0), 0.05)
+    spec = PlantSpec.of_joints(*names, rng.uniform(0.1, 3.0, n), np.full(n, -6.0), np.full(n, 6.0), 0.05)
     A, B = rng.normal(size=(m, n)), rng.normal(size=n)
 
     def nominal_jacobian(q):

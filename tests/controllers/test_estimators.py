@@ -153,7 +153,7 @@ def test_the_constant_estimator_keeps_the_first_jacobian():
 
 
 def test_the_true_estimator_answers_with_the_truth_where_the_arm_is():
-    spec = PlantSpec(("a", "b"), ("y",), np.ones(2), -np.ones(2), np.ones(2), 0.05)
+    spec = PlantSpec.of_joints(("a", "b"), ("y",), np.ones(2), -np.ones(2), np.ones(2), 0.05)
     estimator = TrueEstimator(TrueConfig(), RobotKnowledge(spec, 0, true_jacobian=lambda q: q[None, :] ** 2))
     estimator.reset(np.zeros((1, 2)))
     np.testing.assert_array_equal(estimator.jacobian(np.array([2.0, 3.0])), [[4.0, 9.0]])

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kit.plants import configure
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.methods import compose
 from servobench.plant.faults import ControllerDiverged
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import nominal_ur5
 from servobench.plant.signals import Command, Observation, PlantSpec
@@ -19,11 +20,11 @@ START = np.array([0.35, -1.69, -2.34, 0.89, 1.22, 0.0])
 
 def spec(n=2, m=1, reach=1.0):
     names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
-    return PlantSpec(*names, np.ones(n), np.full(n, -reach), np.full(n, reach), 0.05)
+    return PlantSpec.of_joints(*names, np.ones(n), np.full(n, -reach), np.full(n, reach), 0.05)
 
 
 def kinematic(**settings):
-    return KinematicPlant(KinematicConfig(**settings), PlantSetup(nominal_ur5(), START, 0.05))
+    return build_kinematic(configure(KinematicConfig, **settings), PlantSetup(nominal_ur5(), START, 0.05))
 
 
 def probe(plant, seed=0, **settings):

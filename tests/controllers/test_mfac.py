@@ -13,7 +13,7 @@ from servobench.plant.signals import Observation, PlantSpec
 
 def fresh(n, m, limit=1e6, preview=1, **settings):
     names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
-    spec = PlantSpec(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), 0.05)
+    spec = PlantSpec.of_joints(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), 0.05)
     return MfacLaw(MfacConfig(**settings), RobotKnowledge(spec, preview))
 
 

@@ -26,7 +26,7 @@ PERIOD = 0.05
 
 
 def make_spec(n=6, m=3, speed=1.0, reach=6.0):
-    return PlantSpec(
+    return PlantSpec.of_joints(
         tuple(f"joint_{i}" for i in range(n)),
         tuple(f"feature_{i}" for i in range(m)),
         np.full(n, speed),

@@ -11,7 +11,7 @@ from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.nmpc_calibrated import ENTRY, NmpcCalibrated, NmpcCalibratedConfig
 from servobench.plant.faults import SolverFailed
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.symbolic import symbolic_feature
@@ -34,7 +34,7 @@ def make(**changes):
 
 def small_spec(n, m, speed=1.0, reach=6.0):
     names = [tuple(f"{word}_{i}" for i in range(size)) for word, size in (("joint", n), ("feature", m))]
-    return PlantSpec(*names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), 0.05)
+    return PlantSpec.of_joints(*names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), 0.05)
 
 
 def hold(target, preview=12):
@@ -88,7 +88,7 @@ def test_the_plan_minimises_the_nonlinear_criterion():
 
 
 def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
-    plant = KinematicPlant(KinematicConfig(), PlantSetup(MODEL, START, 0.05))
+    plant = build_kinematic(KinematicConfig(), PlantSetup(MODEL, START, 0.05))
     controller = NmpcCalibrated(NmpcCalibratedConfig(), knowledge())
     angle = 2 * np.pi * np.arange(110) / 200
     path = MODEL.feature(START) + np.stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros_like(angle)], axis=-1)

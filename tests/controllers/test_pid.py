@@ -16,7 +16,7 @@ J = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
 
 def knowledge(limit=100.0, preview=1, n=3, m=2, period=0.05):
     names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
-    spec = PlantSpec(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), period)
+    spec = PlantSpec.of_joints(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), period)
     return RobotKnowledge(spec, preview)
 
 

@@ -37,7 +37,9 @@ def network(n=3, m=2, hidden=4, error_history=1, position_history=1, seed=0):
 
 def knowledge(n=3, m=2, limit=1e6, preview=PREVIEW):
     names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
-    return RobotKnowledge(PlantSpec(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), PERIOD), preview)
+    return RobotKnowledge(
+        PlantSpec.of_joints(*names, np.full(n, limit), np.full(n, -6.0), np.full(n, 6.0), PERIOD), preview
+    )
 
 
 def law(net, limit=1e6, preview=PREVIEW, **config):

@@ -14,7 +14,7 @@ from servobench.controllers.servo import ServoController
 from servobench.plant.faults import ControllerDiverged
 from servobench.plant.signals import Observation, PlantSpec
 
-SPEC = PlantSpec(("a", "b", "c"), ("x", "y"), np.ones(3), -np.ones(3), np.ones(3), 0.05)
+SPEC = PlantSpec.of_joints(("a", "b", "c"), ("x", "y"), np.ones(3), -np.ones(3), np.ones(3), 0.05)
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
 KNOWLEDGE = RobotKnowledge(SPEC, 1, nominal_jacobian=lambda q: J0)
 

@@ -39,7 +39,7 @@ from servobench.plant.signals import PlantSpec
 
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac_plus", "rbf_pid")]
 N, M, PERIOD = 3, 2, 0.05
-SPEC = PlantSpec(("a", "b", "c"), ("x", "y"), np.ones(N), np.full(N, -6.0), np.full(N, 6.0), PERIOD)
+SPEC = PlantSpec.of_joints(("a", "b", "c"), ("x", "y"), np.ones(N), np.full(N, -6.0), np.full(N, 6.0), PERIOD)
 JACOBIAN = JacobianTraining(centres=40, samples=400)
 CONTROLLER = ControllerTraining(hidden=12, samples=500)
 CONFIG = TrainingConfig((0.5,) * N, (1.5,) * N, jacobian=JACOBIAN, controller=CONTROLLER)
@@ -287,7 +287,7 @@ def test_all_presets_take_their_networks_from_the_harness(networks):
 
 def test_networks_of_another_robot_are_refused_at_construction(networks):
     names = tuple("abcdef"), tuple("xyz")
-    other = PlantSpec(*names, np.ones(6), np.full(6, -6.0), np.full(6, 6.0), PERIOD)
+    other = PlantSpec.of_joints(*names, np.ones(6), np.full(6, -6.0), np.full(6, 6.0), PERIOD)
     told = knowledge(spec=other, train=lambda config: networks)
     for entry in TRAINED:
         with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):

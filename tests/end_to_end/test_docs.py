@@ -121,7 +121,7 @@ def test_the_mapping_of_the_example_closes_a_loop_on_an_fmu(tmp_path):
     mapping.write_text(blocks(section(read("plants.md"), "`fmu:PATH.toml`, any FMU"), "toml")[0])
     plant = f"fmu:{mapping}"
     settings = read_settings(
-        None, ["ukf_mfac.initial.source=probe", "target.target=[0.2, 0.7]", f"{plant}.feature_noise=0.0"]
+        None, ["ukf_mfac.initial.source=probe", "target.target=[0.2, 0.7]", f"{plant}.sensing.feature_noise=0.0"]
     )
     result = run_experiment(RunRequest(plant, "ukf_mfac", "target", "none", 0), settings)
     assert result.row["settling_time_s"] < 8.0

@@ -19,6 +19,7 @@ from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.plant.faults import RunFault
+from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import _KEYS
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
@@ -28,7 +29,8 @@ PACKAGE = "servobench"
 def config_classes():
     """Every class of settings that a user can reach; settings of nested sections are in the table of the outer one."""
     parts = [entry.config for entry in (*ESTIMATORS.values(), *LAWS.values())]
-    whole = [registry.find_controller("nmpc_calibrated").config]
+    plants = [registry.find_plant(name).config for name in registry.PLANTS]
+    whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
     return {kind for kind in (*parts, *whole, InitialConfig, TrainingConfig) if dataclasses.fields(kind)}
 
 

@@ -39,7 +39,7 @@ from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, refer
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.validate import validate_fmu
 from servobench.fmus.variables import model_of, parameters_of
-from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.arm import rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -187,12 +187,11 @@ def test_the_sources_are_clean_c11_and_say_nothing(version, tmp_path):
 @pytest.mark.skipif(shutil.which("readelf") is None, reason="needs readelf")
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_library_needs_libc_and_libm_only(version, tmp_path):
-    folder = FmuFolder(cached_fmu(version))
-    library = next((folder.root / "binaries").rglob("*.so"))
+    folder = extract_fmu(cached_fmu(version))
+    library = next((folder / "binaries").rglob("*.so"))
     lines = subprocess.run(["readelf", "-d", str(library)], capture_output=True, text=True, check=True).stdout
     needed = [line.partition("[")[2].rstrip("]") for line in lines.splitlines() if "NEEDED" in line]
     assert set(needed) <= {"libc.so.6", "libm.so.6"}
-    folder.close()
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
-import subprocess
-import sys
-import tempfile
 import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import platformdirs
 import pytest
 
 from kit.foreign_fmu import build_crane, describe
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
+from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.archive import PREFIX, FmuFolder, sweep_stale_folders
-from servobench.plant.fmu.config import FmuConfig
-from servobench.plant.fmu.entry import mapped_entry
-from servobench.plant.fmu.fmu_plant import FmuPlant
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.fmu_plant import FmuConfig, FmuWorld, mapped_entry
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
-QUIET = FmuConfig(command_delay_periods=0, feature_noise=0.0)
+QUIET = FmuConfig(0, SensingConfig(0.0))
 START = np.array([0.3, 1.2])
 PERIOD = 0.05
 TOML = {
@@ -71,23 +67,20 @@ NAMES = {
 }
 
 
-def leftovers() -> set[Path]:
-    return {path for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}*") if (path / "fmu").is_dir()}
-
-
 @pytest.fixture(autouse=True)
-def _own_temporary_folder(tmp_path, monkeypatch):
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert leftovers() == set()
+def cache(tmp_path, monkeypatch) -> Path:
+    """The folder below which FMUs are extracted, empty for each test."""
+    folder = tmp_path / "cache"
+    monkeypatch.setattr(platformdirs, "user_cache_dir", lambda *_: str(folder))
+    return folder
 
 
-def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> FmuPlant:
+def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> Bench:
     path = build_crane(tmp_path / "crane.fmu", version)
     arguments = {"path": path, "max_joint_speed": 2.0, **NAMES[version], **changes}
-    return FmuPlant(config, FmuMapping(**arguments), START, PERIOD)
+    plant = Bench(FmuWorld(FmuMapping(**arguments), START, PERIOD), config.command_delay_periods, config.sensing)
+    plant.reset(0)
+    return plant
 
 
 def place_of(q, arm=(0.5, 0.4)):
@@ -117,7 +110,7 @@ def test_a_loop_closes_on_a_foreign_fmu_through_a_mapping_alone(tmp_path, versio
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_commands_are_clipped_delayed_and_held_over_the_fmus_own_steps(tmp_path, version):
-    plant = crane(tmp_path, version, FmuConfig(1, 0.0), period=0.01)
+    plant = crane(tmp_path, version, FmuConfig(1, SensingConfig(0.0)), period=0.01)
     plant.reset(0)
     assert plant.step(Command([9.0, -1.0])).joint_position.tolist() == START.tolist()
     observation = plant.step(Command([0.0, 0.0]))
@@ -135,7 +128,7 @@ def test_without_joints_the_commands_are_integrated(tmp_path):
 
 
 def test_feature_noise_has_the_configured_size_and_the_same_seed_gives_the_same_bits(tmp_path):
-    plant = crane(tmp_path, 2, FmuConfig(0, 0.01, 1, 0.1))
+    plant = crane(tmp_path, 2, FmuConfig(0, SensingConfig(0.01, 1, 0.1)))
     runs = []
     for _ in range(2):
         first = plant.reset(3)
@@ -202,7 +195,6 @@ def test_misbehaviour_at_run_time_is_an_fmu_error(tmp_path, version, quirk, mess
         ({"period": 0.03}, "whole multiple of the plant's own step of 0.03 s"),
         ({"inputs": ()}, "inputs must name at least one variable"),
         ({"max_joint_speed": 0.0}, "max_joint_speed must be above 0"),
-        ({"joints": (), "clips_itself": True}, "clips_itself needs joints"),
     ],
 )
 def test_a_mapping_that_does_not_fit_is_one_clear_error(tmp_path, changes, message):
@@ -226,22 +218,23 @@ def test_a_command_of_the_wrong_size_is_refused(tmp_path):
 
 def test_a_state_that_cannot_be_serialised_is_kept_by_the_plant_that_saved_it():
     plant = build_ur5(Ur5FmuConfig(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
-    plant.description = replace(plant.description, can_serialise=False)
+    plant.world.description = replace(plant.world.description, can_serialise=False)
+    plant.reset(0)
     plant.step(Command(np.full(6, 0.3)))
-    state = plant.save_state()
+    state = plant.save()
     runs = []
     for _ in range(2):
-        plant.restore_state(state)
+        plant.restore(state)
         runs.append([plant.step(Command(np.full(6, -0.5))).feature.tobytes() for _ in range(5)])
     assert runs[0] == runs[1]
-    assert not isinstance(state.fmu, bytes)
+    assert not isinstance(state.world.fmu, bytes)
     plant.close()
 
 
 def test_an_fmu_that_cannot_save_its_state_says_so(tmp_path):
     plant = crane(tmp_path, 2)
     with pytest.raises(ValueError, match="cannot save its state"):
-        plant.save_state()
+        plant.save()
     plant.close()
 
 
@@ -272,7 +265,7 @@ def rewritten(version: int, old: str, new: str) -> str:
 def test_an_fmu_that_cannot_be_used_is_one_clear_error(tmp_path, arguments, message):
     path = build_crane(tmp_path / "crane.fmu", 2, **arguments)
     with pytest.raises(ValueError, match=message):
-        FmuPlant(QUIET, FmuMapping(path, **NAMES[2]), START, PERIOD)
+        FmuWorld(FmuMapping(path, **NAMES[2]), START, PERIOD)
 
 
 def test_a_library_that_is_none_is_refused(tmp_path):
@@ -283,7 +276,7 @@ def test_a_library_that_is_none_is_refused(tmp_path):
         for name, content in contents.items():
             archive.writestr(name, b"nonsense" if name.startswith("binaries") else content)
     with pytest.raises(ValueError, match="cannot be loaded"):
-        FmuPlant(QUIET, FmuMapping(path, **NAMES[2]), START, PERIOD)
+        FmuWorld(FmuMapping(path, **NAMES[2]), START, PERIOD)
 
 
 @pytest.mark.parametrize("name", ["../evil.txt", "/etc/evil.txt", "a\\..\\evil.txt", "c:evil.txt", "a/../../evil.txt"])
@@ -293,49 +286,54 @@ def test_an_archive_that_climbs_out_of_its_folder_is_refused(tmp_path, name):
         archive.writestr("modelDescription.xml", "<x/>")
         archive.writestr(name, "evil")
     with pytest.raises(ValueError, match="would climb out"):
-        FmuFolder(path)
+        extract_fmu(path)
     assert not list(tmp_path.rglob("evil.txt"))
 
 
 def test_what_is_not_an_archive_of_an_fmu_is_refused(tmp_path):
     with pytest.raises(ValueError, match="does not exist"):
-        FmuFolder(tmp_path / "missing.fmu")
+        extract_fmu(tmp_path / "missing.fmu")
     (tmp_path / "text.fmu").write_text("hello")
     with pytest.raises(ValueError, match="not a zip archive"):
-        FmuFolder(tmp_path / "text.fmu")
+        extract_fmu(tmp_path / "text.fmu")
     with zipfile.ZipFile(tmp_path / "empty.fmu", "w") as archive:
         archive.writestr("readme", "hello")
     with pytest.raises(ValueError, match="holds no modelDescription.xml"):
-        FmuFolder(tmp_path / "empty.fmu")
+        extract_fmu(tmp_path / "empty.fmu")
 
 
-def test_a_damaged_archive_is_refused(tmp_path):
+def test_an_fmu_is_extracted_once_and_again_where_its_content_changes(tmp_path, cache):
+    path = build_crane(tmp_path / "crane.fmu", 2)
+    folder = extract_fmu(path)
+    copy = tmp_path / "copy.fmu"
+    copy.write_bytes(path.read_bytes())
+    assert extract_fmu(path) == extract_fmu(copy) == folder
+    assert [each.parent for each in (cache / "extracted").iterdir()] == [folder.parent]
+    build_crane(path, 3)
+    changed = extract_fmu(path)
+    assert changed != folder
+    assert "3.0" in (changed / "modelDescription.xml").read_text()
+    assert extract_fmu(copy) == folder
+
+
+def test_a_second_plant_of_an_fmu_reads_neither_archive_nor_description(tmp_path, monkeypatch):
+    path = build_crane(tmp_path / "crane.fmu", 2)
+    first = FmuWorld(FmuMapping(path, **NAMES[2]), START, PERIOD)
+    monkeypatch.setattr(zipfile, "ZipFile", None)
+    monkeypatch.setattr("fmpy.read_model_description", None)
+    second = FmuWorld(FmuMapping(path, **NAMES[2]), START, PERIOD)
+    assert second.description is first.description
+    first.close(), second.close()
+
+
+def test_what_cannot_be_extracted_leaves_nothing_behind(tmp_path, cache):
     path = build_crane(tmp_path / "crane.fmu", 2)
     content = bytearray(path.read_bytes())
     content[content.index(b"<?xml") + 20] ^= 0xFF
     path.write_bytes(content)
     with pytest.raises(ValueError, match="cannot be extracted"):
-        FmuFolder(path)
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no such signals")
-def test_the_folder_of_a_killed_process_is_removed_by_the_next_and_that_of_a_living_one_is_not(tmp_path):
-    path = build_crane(tmp_path / "crane.fmu", 2)
-    code = (
-        "import sys, time; from pathlib import Path; from servobench.plant.fmu.archive import FmuFolder;"
-        "folder = FmuFolder(Path(sys.argv[1])); print(folder.root, flush=True); time.sleep(60)"
-    )
-    environment = {**os.environ, "TMPDIR": tempfile.gettempdir(), "PYTHONPATH": str(Path.cwd())}
-    with subprocess.Popen(
-        [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True, env=environment
-    ) as other:
-        root = Path(other.stdout.readline().strip())
-        sweep_stale_folders()
-        assert root.is_dir()
-        other.send_signal(signal.SIGKILL)
-    assert root.is_dir()
-    sweep_stale_folders()
-    assert not root.exists()
+        extract_fmu(path)
+    assert list((cache / "extracted").iterdir()) == []
 
 
 def resident() -> int:

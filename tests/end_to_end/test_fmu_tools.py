@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
+from kit.plants import configure
 from servobench.fmus.export import arm_layout, default_actuation
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.fmus.variables import parameters_of
-from servobench.plant.fmu.archive import FmuFolder
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
@@ -39,8 +40,8 @@ def model_of(mismatch: str):
 @cache
 def oracle(mismatch: str):
     """Return joint positions and true features after each step, (STEPS, 9), by numpy."""
-    config = KinematicConfig(feature_noise=0.0, command_delay_periods=0)
-    plant = KinematicPlant(config, PlantSetup(model_of(mismatch), np.array(HOME), PERIOD))
+    config = configure(KinematicConfig, feature_noise=0.0, command_delay_periods=0)
+    plant = build_kinematic(config, PlantSetup(model_of(mismatch), np.array(HOME), PERIOD))
     rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in COMMANDS]
     return np.array(rows)
 
@@ -137,8 +138,8 @@ def test_libcosimpy_runs_it_and_agrees_over_a_thousand_random_steps(mismatch, tm
 
 @pytest.mark.parametrize("mismatch", MISMATCHES)
 def test_casadi_integrates_the_model_exchange_side_and_agrees_over_a_thousand_random_steps(mismatch):
-    folder = FmuFolder(cached_fmu(2))
-    builder = casadi.DaeBuilder("ur5", str(folder.root / "."))
+    folder = extract_fmu(cached_fmu(2))
+    builder = casadi.DaeBuilder("ur5", str(folder / "."))
     x, u = casadi.MX.sym("x", 12), casadi.MX.sym("u", 6)
     values = scalars(mismatch)
     p = casadi.DM([values[name] for name in builder.p()])
@@ -156,4 +157,3 @@ def test_casadi_integrates_the_model_exchange_side_and_agrees_over_a_thousand_ra
         output = np.asarray(model(state, command, p)[1])[:, 0]
         came.append(np.r_[state[positions], output[balls]])
     np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)
-    folder.close()

@@ -14,16 +14,18 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
+from kit.plants import configure
 from servobench.fmus.export import default_actuation
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.archive import FmuFolder
+from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description
-from servobench.plant.fmu.fmu_plant import open_slave
-from servobench.plant.fmu.slave import Port
-from servobench.plant.kinematic import KinematicConfig, KinematicPlant
+from servobench.plant.fmu.fmu_plant import open_instance
+from servobench.plant.fmu.instance import Port
+from servobench.plant.kinematic import ENTRY as KINEMATIC
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
@@ -45,31 +47,31 @@ class Opened:
 
     def __init__(self, version: int, start: bool = True) -> None:
         path = cached_fmu(version)
-        self.folder = FmuFolder(path)
-        self.description = read_description(path, self.folder.root)
-        self.slave = open_slave(self.description, self.folder)
+        self.root = extract_fmu(path)
+        self.description = read_description(path, self.root)
+        self.instance = open_instance(self.description, self.root)
         if start:
-            self.slave.start(0.0)
+            self.instance.start(0.0)
 
     def port(self, *names: str) -> Port:
         return Port(self.description.select(names, "test"))
 
     def get(self, *names: str):
         port = self.port(*names)
-        self.slave.reader(port)()
+        self.instance.reader(port)()
         return port.values
 
     def set(self, name: str, values) -> None:
         port = self.port(name)
         port.values[:] = values
-        self.slave.writer(port)()
+        self.instance.writer(port)()
 
     def derivative(self, unknown: str, known: str):
         knowns, unknowns = self.port(known), self.port(unknown)
         columns = []
         for k in range(knowns.values.size):
             knowns.values[:] = np.eye(knowns.values.size)[k]
-            self.slave.derivative(unknowns, knowns)
+            self.instance.derivative(unknowns, knowns)
             columns.append(unknowns.values.copy())
         return np.column_stack(columns)
 
@@ -77,16 +79,15 @@ class Opened:
         return self
 
     def __exit__(self, *_) -> None:
-        self.slave.close()
-        self.folder.close()
+        self.instance.close()
 
 
 @pytest.mark.parametrize("mismatch", ["none", "severe", "factory"])
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_fmu_agrees_with_the_kinematic_plant_over_a_thousand_random_steps(version, mismatch):
     common = {"feature_noise": 0.002, "latency_periods": 1, "drop_probability": 0.1, "joint_range": 2.9}
-    plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, max_joint_speed=2.0, **common), setup(mismatch))
-    oracle = KinematicPlant(KinematicConfig(max_joint_speed=2.0, **common), setup(mismatch))
+    plant = ENTRY.build(configure(Ur5FmuConfig, fmi_version=version, max_joint_speed=2.0, **common), setup(mismatch))
+    oracle = build_kinematic(configure(KinematicConfig, max_joint_speed=2.0, **common), setup(mismatch))
     assert plant.spec.joint_names == oracle.spec.joint_names
     generator, stops = np.random.default_rng(1), 0
     pairs = [(plant.reset(7), oracle.reset(7))]
@@ -107,7 +108,8 @@ def test_the_fmu_agrees_with_the_kinematic_plant_over_a_thousand_random_steps(ve
 @pytest.mark.parametrize("lag", [0.0, 1e-4, 10.0])
 def test_any_lag_is_solved_exactly(lag):
     quiet = {"lag": lag, "feature_noise": 0.0, "command_delay_periods": 0}
-    plant, oracle = ENTRY.build(Ur5FmuConfig(**quiet), setup()), KinematicPlant(KinematicConfig(**quiet), setup())
+    plant, oracle = (entry.build(configure(entry.config, **quiet), setup()) for entry in (ENTRY, KINEMATIC))
+    plant.reset(0), oracle.reset(0)
     for _ in range(20):
         command = Command(np.full(6, 0.7))
         came, wanted = plant.step(command), oracle.step(command)
@@ -120,8 +122,8 @@ def test_many_small_steps_end_where_one_large_step_ends(version):
     with Opened(version) as once, Opened(version) as often:
         for each in (once, often):
             each.set("joint_velocity_command", np.linspace(-0.9, 0.9, 6))
-        once.slave.stepper(0.5)(0.0)
-        advance = often.slave.stepper(0.005)
+        once.instance.stepper(0.5)(0.0)
+        advance = often.instance.stepper(0.005)
         for k in range(100):
             advance(k * 0.005)
         np.testing.assert_allclose(
@@ -162,9 +164,9 @@ def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(versio
     with Opened(version, start=False) as opened:
         for name, values in parameters_of(model, actuation).items():
             opened.set(name, values)
-        opened.slave.start(0.0)
+        opened.instance.start(0.0)
         opened.set("joint_velocity_command", [0.5, 2.0, -2.0, 0.1, 0.0, -0.3])
-        opened.slave.stepper(0.3)(0.0)
+        opened.instance.stepper(0.3)(0.0)
         q = opened.get("joint_position")
         ball = opened.derivative("ball_position", "joint_position")
         np.testing.assert_allclose(ball, model.jacobian(q), rtol=0, atol=1e-9)
@@ -204,11 +206,13 @@ CONTINUE = """
 import pickle, sys
 import numpy as np
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
+from servobench.plant.bench import SensingConfig
 from servobench.plant.plant import PlantSetup
 from servobench.plant.signals import Command
 version, setup, state = pickle.load(sys.stdin.buffer)
-plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, latency_periods=2, drop_probability=0.1), setup)
-plant.restore_state(state)
+sensing = SensingConfig(latency_periods=2, drop_probability=0.1)
+plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, sensing=sensing), setup)
+plant.restore(state)
 generator = np.random.default_rng(2)
 rows = [plant.step(Command(generator.uniform(-1.0, 1.0, 6))) for _ in range(30)]
 sys.stdout.buffer.write(b"".join(row.joint_position.tobytes() + row.feature.tobytes() for row in rows))
@@ -218,14 +222,14 @@ plant.close()
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_restored_state_gives_the_same_bits_here_and_in_another_process(version):
-    config = Ur5FmuConfig(fmi_version=version, latency_periods=2, drop_probability=0.1)
+    config = configure(Ur5FmuConfig, fmi_version=version, latency_periods=2, drop_probability=0.1)
     plant = ENTRY.build(config, setup("severe"))
     plant.reset(4)
     run(plant, 20, 1)
-    state = plant.save_state()
+    state = plant.save()
     wanted = run(plant, 30, 2)
     for _ in range(2):
-        plant.restore_state(state)
+        plant.restore(state)
         assert run(plant, 30, 2) == wanted
     plant.close()
     task = pickle.dumps((version, setup("severe"), state))
@@ -236,10 +240,11 @@ def test_a_restored_state_gives_the_same_bits_here_and_in_another_process(versio
 @pytest.mark.parametrize("version", VERSIONS)
 def test_bytes_that_are_no_state_of_this_model_are_refused(version):
     plant = ENTRY.build(Ur5FmuConfig(fmi_version=version), setup())
-    state = plant.save_state()
-    for content in (state.fmu[:-1], b"x" * len(state.fmu)):
+    plant.reset(0)
+    state = plant.save()
+    for content in (state.world.fmu[:-1], b"x" * len(state.world.fmu)):
         with pytest.raises(FmuError, match="these bytes are no state of this model"):
-            plant.restore_state(replace(state, fmu=content))
+            plant.restore(replace(state, world=replace(state.world, fmu=content)))
     plant.close()
 
 
@@ -275,15 +280,15 @@ def test_the_fmu_refuses_what_makes_no_sense(version):
         with pytest.raises(FmuError, match="computed by the model and cannot be set"):
             opened.set("ball_position", 0.0)
         with pytest.raises(FmuError, match="step size is negative"):
-            opened.slave.stepper(-0.1)(0.0)
+            opened.instance.stepper(-0.1)(0.0)
         with pytest.raises(FmuError, match="communication point is not where the last step ended"):
-            opened.slave.stepper(0.1)(1.0)
+            opened.instance.stepper(0.1)(1.0)
         with pytest.raises(FmuError, match="not allowed in this phase"):
-            opened.slave.start(0.0)
+            opened.instance.start(0.0)
     with Opened(version, start=False) as opened:
         opened.set("joint_lower", 10.0)
         with pytest.raises(FmuError, match="joint_lower is not below joint_upper"):
-            opened.slave.start(0.0)
+            opened.instance.start(0.0)
 
 
 def resident() -> int:
@@ -299,17 +304,17 @@ def test_memory_stays_flat_over_two_thousand_instances(version):
 
         def live(count: int) -> None:
             for _ in range(count):
-                slave = open_slave(opened.description, opened.folder)
-                slave.start(0.0)
-                advance = slave.stepper(0.05)
+                instance = open_instance(opened.description, opened.root)
+                instance.start(0.0)
+                advance = instance.stepper(0.05)
                 advance(0.0)
-                state = slave.save()
-                again = slave.from_bytes(slave.to_bytes(state))
+                state = instance.save()
+                again = instance.from_bytes(instance.to_bytes(state))
                 advance(0.05)
-                slave.restore(again)
-                slave.free(again)
-                slave.free(state)
-                slave.close()
+                instance.restore(again)
+                instance.free(again)
+                instance.free(state)
+                instance.close()
 
         live(1000)  # until the allocator has what it needs
         before = resident()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 
 import casadi
@@ -19,8 +18,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
-from servobench.plant.fmu.archive import PREFIX
-from servobench.plant.fmu.entry import mapped_entry
+from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.fmu.model_exchange import FmuModel
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -43,15 +41,6 @@ max_joint_speed = 2.0
 NOMINAL = '[nominal]\n"arm.slew" = 0.55\n"arm.luff" = 0.4\n'
 STATES = '[truth]\nstates = ["wheel.slew", "wheel.luff"]\n'
 TARGET = {"target": [0.2, 0.7], "duration": 3.0}
-
-
-@pytest.fixture(autouse=True)
-def _nothing_is_left_behind(tmp_path, monkeypatch):
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    yield
-    assert list(folder.glob(f"{PREFIX}*")) == []
 
 
 def mismatched(text: str):
@@ -81,7 +70,7 @@ def request(path: Path, controller: str) -> RunRequest:
 
 
 def quiet(path: Path) -> Settings:
-    plant = {"feature_noise": 0.0, "command_delay_periods": 1}
+    plant = {"sensing": {"feature_noise": 0.0}, "command_delay_periods": 1}
     bound = {"delay_periods": 1}  # the crane has no lag; the default bridges that of the UR5 as well
     return Settings({"target": TARGET, f"fmu:{path}": plant, "nmpc_calibrated": bound})
 
@@ -96,7 +85,6 @@ def test_casadi_reads_the_equations_of_the_ur5_back():
     squared = casadi.Function("squared", [symbol], [casadi.gradient(casadi.sumsqr(model.symbolic(symbol)), symbol)])
     wanted = 2.0 * mismatched("severe").jacobian(q[1]).T @ mismatched("severe").feature(q[1])
     np.testing.assert_allclose(np.asarray(squared(q[1])).ravel(), wanted, rtol=0, atol=1e-9)
-    model.close()
 
 
 def test_on_the_ur5_the_predictive_bound_commands_the_same_by_the_fmu_as_by_the_equations():
@@ -131,6 +119,7 @@ def test_upper_bounds_run_on_a_foreign_fmu_through_its_mapping(tmp_path, control
 def test_the_true_jacobian_is_the_fmus_and_goes_into_the_log_where_the_states_are_named(tmp_path):
     path = mapped(tmp_path, MAPPING + STATES)
     plant = crane(path)
+    plant.reset(0)
     for command in ([1.0, -0.5], [0.3, 2.0]):
         q = plant.step(Command(command)).joint_position
         np.testing.assert_allclose(plant.true_model().jacobian(q), crane_jacobian(q), rtol=0, atol=1e-12)

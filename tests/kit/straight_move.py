@@ -5,7 +5,7 @@ import numpy as np
 from servobench.harness.run.log import StepLog
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
-SPEC = PlantSpec(("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0)
+SPEC = PlantSpec.of_joints(("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0)
 X = (0.0, 0.5, 1.0, 1.0)
 VELOCITY = (2.0, -2.0, 1.0, 0.0)  # of joint a; its limit is 2
 CONDITION = (1.0, 3.0, 2.0, 1.0)

@@ -12,7 +12,7 @@ from servobench.plant.signals import Observation, PlantSpec
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
 A = 0.4 * np.random.default_rng(11).normal(size=(M, N))  # m/rad
-SPEC = PlantSpec(
+SPEC = PlantSpec.of_joints(
     tuple(f"j{i}" for i in range(N)),
     tuple(f"y{i}" for i in range(M)),
     np.full(N, LIMIT),

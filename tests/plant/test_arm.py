@@ -194,8 +194,8 @@ def test_a_well_formed_calibration_loads(tmp_path):
         (lambda: HandEyeModel(ur5_arm(), np.eye(3)), r"X_BC must be a finite \(4, 4\) matrix"),
         (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, -1.0, 1.0])), "X_BC must hold a rotation matrix"),
         (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, 1.1, 1.0])), "X_BC must hold a rotation matrix"),
-        (lambda: hand_eye_spec(nominal_ur5(), 0.05, -1.0, 6.0), "max_joint_speed must be above 0, got -1.0"),
-        (lambda: hand_eye_spec(nominal_ur5(), 0.05, 1.0, 0.0), "joint_range must be above 0, got 0.0"),
+        (lambda: hand_eye_spec(nominal_ur5(), 0.05, -1.0, 6.0), "joint_velocity_limit must be positive"),
+        (lambda: hand_eye_spec(nominal_ur5(), 0.05, 1.0, 0.0), "joint_lower must be below joint_upper"),
         (lambda: hand_eye_spec(nominal_ur5(), 0.0, 1.0, 6.0), "period must be positive"),
     ],
 )

@@ -70,10 +70,10 @@ def test_without_noise_nothing_is_drawn_and_nothing_changes():
     [
         ({"width": 0}, "width must be at least 1, got 0"),
         ({"height": -2}, "height must be at least 1"),
-        ({"vertical_fov": 0.0}, "vertical_fov must be above 0 and below 180"),
-        ({"vertical_fov": 180.0}, "vertical_fov must be above 0 and below 180"),
+        ({"vertical_fov": 0.0}, "vertical_fov must be above 0"),
+        ({"vertical_fov": 180.0}, "vertical_fov must be below 180"),
         ({"near": 0.0}, "near must be above 0"),
-        ({"far": 0.05}, "far must be above 0.1"),
+        ({"far": 0.05}, "far must be above near, 0.1 m, got 0.05 m"),
     ],
 )
 def test_a_bad_camera_is_refused(change, message):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from servobench.harness.config.registry import find_plant, plant_names
+from servobench.plant.bench import vary_sensing
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
@@ -115,6 +116,26 @@ def test_it_can_be_closed_twice_and_closes_no_other(entry, plant):
     other.close()
 
 
+def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_camera(plant):
+    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
+
+    def continued() -> list[bytes]:
+        seen = [plant.step(Command(u)) for u in COMMANDS]
+        truth = plant.truth()
+        arrays = [each for o in seen for each in (o.joint_position, o.feature)] + [truth.feature, truth.jacobian]
+        return [each.tobytes() for each in arrays]
+
+    plant.reset(5)
+    before = plant.save()
+    first = continued()
+    plant.move_camera(sample.moved(model).X_BC)
+    between = plant.save()
+    second = continued()
+    for state, expected in ((before, first), (between, second), (before, first)):
+        plant.restore(state)
+        assert continued() == expected
+
+
 def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):
     plain = record(plant, 3)
     plant.reset(3)
@@ -151,7 +172,7 @@ def test_noise_and_latency_can_be_varied(entry):
     model = nominal_ur5()
 
     def spread(factor: float) -> float:
-        plant = entry.build(entry.vary_sensing(entry.config(), factor, 3), PlantSetup(model, np.array(HOME), PERIOD))
+        plant = entry.build(vary_sensing(entry.config(), factor, 3), PlantSetup(model, np.array(HOME), PERIOD))
         try:
             seen = [plant.reset(4).feature, *(plant.step(Command(np.zeros(6))).feature for _ in range(30))]
             return float(np.std(seen, axis=0).max())
@@ -168,7 +189,7 @@ START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the po
 
 def test_latency_shows_a_moved_camera_late(entry):
     model, sample = sample_mismatch(Mismatch.parse("camera_move=20deg"), nominal_ur5(), 1)
-    plant = entry.build(entry.vary_sensing(entry.config(), 0.0, 3), PlantSetup(model, START, PERIOD))
+    plant = entry.build(vary_sensing(entry.config(), 0.0, 3), PlantSetup(model, START, PERIOD))
     first = plant.reset(0).feature
     plant.move_camera(sample.moved(model).X_BC)
     seen = [np.linalg.norm(plant.step(Command(np.zeros(6))).feature - first) for _ in range(6)]

@@ -3,9 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.checks import check_number
-from servobench.plant.plant import whole_steps
-from servobench.plant.signals import Command, Observation, PlantSpec
+from servobench.plant.checks import check_number, whole_steps
+from servobench.plant.signals import Channel, Command, Observation, PlantSpec
 
 
 def test_messages_keep_read_only_copies():
@@ -48,7 +47,7 @@ def test_a_spec_is_checked(change, message):
         "period": 0.1,
     }
     with pytest.raises(ValueError, match=message):
-        PlantSpec(**(values | change))
+        PlantSpec.of_joints(**(values | change))
 
 
 def test_a_number_is_held_against_its_bounds():
@@ -65,3 +64,42 @@ def test_a_period_is_a_whole_number_of_own_steps():
         whole_steps(0.051, 1 / 240)
     with pytest.raises(ValueError, match="whole multiple"):
         whole_steps(-0.05, 1 / 240)
+
+
+def test_each_feature_says_whether_it_is_valid():
+    assert Observation(0.0, np.zeros(1), np.zeros(2)).valid.tolist() == [True, True]
+    assert Observation(0.0, np.zeros(1), np.zeros(2), feature_valid=False).valid.tolist() == [False, False]
+    partial = Observation(0.0, np.zeros(1), np.zeros(2), valid=np.array([True, False]))
+    assert (partial.valid.tolist(), partial.feature_valid) == ([True, False], False)
+    with pytest.raises(ValueError, match=r"valid must have shape \(2,\), got \(1,\)"):
+        Observation(0.0, np.zeros(1), np.zeros(2), valid=np.array([True]))
+
+
+def test_a_spec_describes_features_and_commands_as_channels():
+    spec = PlantSpec.of_joints(("a", "b"), ("x",), [1.0, 2.0], [-3.0, -3.0], [3.0, 3.0], 0.1, "px")
+    assert (spec.n, spec.m, spec.feature_names, spec.feature_unit) == (2, 1, ("x",), "px")
+    assert (spec.joint_names, spec.command.unit) == (("a", "b"), "rad/s")
+    assert spec.joint_velocity_limit.tolist() == [1.0, 2.0]
+    assert (spec.command.lower == -spec.joint_velocity_limit).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"scale": 0.0}, "scale must be positive, got 0.0 m"),
+        ({"lower": np.zeros(2)}, "lower must hold 1 numbers, got"),
+        ({"upper": np.array([np.nan])}, "upper must hold 1 numbers, got"),
+        ({"lower": np.array([2.0])}, "lower must be below upper for every one of x"),
+    ],
+)
+def test_a_channel_is_checked(change, message):
+    values = {"names": ("x",), "unit": "m", "scale": 1.0, "lower": np.array([-np.inf]), "upper": np.ones(1)}
+    with pytest.raises(ValueError, match=message):
+        Channel(**(values | change))
+
+
+def test_command_limits_must_be_symmetric():
+    one = np.ones(1)
+    feature, command = Channel(("x",), "m", 1.0, -one, one), Channel(("a",), "rad/s", 1.0, -2 * one, one)
+    with pytest.raises(ValueError, match="command limits must be symmetric"):
+        PlantSpec(feature, command, -one, one, 0.1)

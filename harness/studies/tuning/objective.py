@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
 import joblib
@@ -30,6 +30,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import COMPLETED, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.tasks import find_task
+from servobench.plant.bench import can_vary_sensing
 
 MOVE: Final = "random"
 CURVE: Final = "circle"
@@ -62,7 +63,7 @@ class TuningSet:
     """The runs on which every trial of every method is scored.
 
     Attributes:
-        plants: names of plants that have the setting `latency_periods`.
+        plants: names of plants whose latency can be set.
         seeds: moves on each plant; even, so that both delays come equally often.
         offset: where in the tuning range the seeds begin.
     """
@@ -86,7 +87,7 @@ class TuningSet:
             raise ConfigurationError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
             entry = find_plant(name)
-            if entry.own_robot or "latency_periods" not in {item.name for item in fields(entry.config)}:
+            if entry.own_robot or not can_vary_sensing(entry.config()):
                 raise ConfigurationError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
     def runs(self) -> list[TuningRun]:
@@ -144,7 +145,8 @@ def carry_out(trial: Trial, run: TuningRun) -> float:
     Raises:
         ConfigurationError: settings that the controller or the plant refuses.
     """
-    settings = Settings({trial.controller: trial.settings, run.plant: {"latency_periods": run.latency_periods}})
+    sensing = {"latency_periods": run.latency_periods}
+    settings = Settings({trial.controller: trial.settings, run.plant: {"sensing": sensing}})
     request = RunRequest(run.plant, trial.controller, run.task, read_mismatch(MISMATCH), run.seed)
     return run_cost(run.task, run_experiment(request, settings).row)
 

@@ -8,17 +8,17 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from servobench.plant.fmu.slave import (
+from servobench.plant.fmu.instance import (
     DISCARD,
+    MIN_PROGRESS,
+    Instance,
     MessageLog,
     Port,
     RawCall,
-    Slave,
 )
 
 CO_SIMULATION = 1
 LAST_SUCCESSFUL_TIME = 2
-LEAST_PROGRESS = 1e-9  # of a step
 
 _Logger = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 _Allocate = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
@@ -47,7 +47,7 @@ def _log_message(environment: int | None, _name: bytes, status: int, _category: 
 _on_message = _Logger(_log_message)
 
 
-class Slave2(Slave):
+class Instance2(Instance):
     """One instance of an FMI 2.0 FMU."""
 
     def _instantiate(self) -> int | None:
@@ -104,12 +104,12 @@ class Slave2(Slave):
         return advance
 
     def _recover(self, status: int, time: float, step: float) -> None:
-        """Take a step that was cut short up where it ended, as often as needed.
+        """Resume a step that the FMU ended early, until the whole step is done.
 
         Raises:
             FmuError: the step failed, or made no progress.
         """
-        do_step, end, least = self.function("fmi2DoStep"), time + step, LEAST_PROGRESS * step
+        do_step, end, least = self.function("fmi2DoStep"), time + step, MIN_PROGRESS * step
         while status == DISCARD:
             reached = self._last_successful_time()
             if not reached > time + least:
@@ -170,7 +170,7 @@ _YES = ctypes.c_int(1)
 
 
 def _callbacks(log: MessageLog) -> _Callbacks:
-    """Return what an instance is given; fmpy's proxy fills the printf arguments of messages in, which ctypes cannot."""
+    """Return the callbacks of an instance; fmpy's proxy formats messages with printf arguments, which ctypes cannot."""
     import fmpy  # noqa: PLC0415 - see read_description
 
     callbacks = _Callbacks(

@@ -1,7 +1,7 @@
-"""A co-simulation FMU behind one small interface, whatever its version of FMI; calls go through prebuilt arguments.
+"""One interface to an instance of a co-simulation FMU for FMI 2 and FMI 3.
 
 The libraries are called by ctypes with argument objects that are made once: a call then costs a third of a microsecond,
-where converting lists at every call costs several.
+whereas converting lists at every call costs several.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ Call: TypeAlias = Callable[[], None]
 RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
 STATUS_WORDS = ("ok", "warning", "discard", "error", "fatal", "pending")
 OK, WARNING, DISCARD = 0, 1, 2
-REMEMBERED = 5  # messages
+REMEMBERED_MESSAGES = 5
+MIN_PROGRESS = 1e-9  # share of a step that a partial step must cover
 STATUS_LEVELS = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR, logging.ERROR, logging.DEBUG)
 
 
@@ -67,7 +68,7 @@ class MessageLog:
     def __init__(self, name: str) -> None:
         """Start empty."""
         self._name = name
-        self._last: deque[str] = deque(maxlen=REMEMBERED)
+        self._last: deque[str] = deque(maxlen=REMEMBERED_MESSAGES)
 
     def add(self, status: int, message: str) -> None:
         """Take a message with its status."""
@@ -84,7 +85,7 @@ class MessageLog:
         return FmuError(f"{self._name}: {function} returned {word}{said}")
 
 
-class Slave(ABC):
+class Instance(ABC):
     """One instance of a co-simulation FMU."""
 
     def __init__(self, description: FmuDescription, root: Path) -> None:

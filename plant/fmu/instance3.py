@@ -8,13 +8,12 @@ from collections.abc import Callable
 from functools import partial
 
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.slave import Port, RawCall, Slave
+from servobench.plant.fmu.instance import MIN_PROGRESS, Instance, Port, RawCall
 
-LEAST_PROGRESS = 1e-9  # of a step
 LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 
 
-class Slave3(Slave):
+class Instance3(Instance):
     """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
 
     def _instantiate(self) -> int | None:
@@ -82,7 +81,7 @@ class Slave3(Slave):
         return advance
 
     def _taker(self, step: ctypes.c_double) -> Callable[[float], float | None]:
-        """Return a function that takes one step from the time it is given and tells where it ended if it ended early.
+        """Return a function that takes one step from a time, s, and returns where it ended if it ended early.
 
         It reads the size of the step from `step` at every call.
         """
@@ -103,12 +102,12 @@ class Slave3(Slave):
         return take
 
     def _resume(self, reached: float | None, time: float, step: float) -> None:
-        """Take a step that returned early up where it ended, as often as needed.
+        """Resume a step that returned early, until the whole step is done.
 
         Raises:
             FmuError: it made no progress.
         """
-        end, least, rest = time + step, LEAST_PROGRESS * step, ctypes.c_double()
+        end, least, rest = time + step, MIN_PROGRESS * step, ctypes.c_double()
         take = self._taker(rest)
         while reached is not None:
             if not reached > time + least:

@@ -1,0 +1,139 @@
+"""The bench around any world: limits, delay, noise, latency, lost frames, and saved states."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from servobench.plant.bench import Bench, SensingConfig, World, can_vary_sensing, vary_sensing
+from servobench.plant.faults import FeatureLost
+from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.signals import Command, PlantSpec, Truth
+
+SPEC = PlantSpec.of_joints(("a", "b"), ("x",), [1.0, 0.5], [-9.0, -9.0], [9.0, 9.0], 0.1)
+QUIET = SensingConfig(0.0)
+COMMANDS = np.random.default_rng(3).uniform(-0.5, 0.5, (20, 2))
+
+
+class Counter(World):
+    """Joints move by the command times the period; the feature is the first joint, unless it is hidden there."""
+
+    spec = SPEC
+
+    def __init__(self, hidden=()):
+        self.hidden, self.joints, self.closed = hidden, np.zeros(2), 0
+
+    def reset(self, seed):
+        self.joints, self.frame = np.zeros(2), 0
+        return self.joints
+
+    def advance(self, joint_velocity):
+        self.joints, self.frame = self.joints + joint_velocity * 0.1, self.frame + 1
+        return self.joints
+
+    def see(self):
+        return None if self.frame in self.hidden else self.joints[:1]
+
+    def truth(self):
+        return Truth(self.joints[:1], None)
+
+    def close(self):
+        self.closed += 1
+
+
+def bench(delay=0, sensing=QUIET, hidden=(), seed=0) -> Bench:
+    plant = Bench(Counter(hidden), delay, sensing)
+    plant.reset(seed)
+    return plant
+
+
+def walk(plant, commands=COMMANDS):
+    return [plant.step(Command(u)) for u in commands]
+
+
+def test_commands_are_clipped_to_the_limits_of_each_joint():
+    np.testing.assert_allclose(bench().step(Command([9.0, -9.0])).joint_position, [0.1, -0.05])
+
+
+def test_a_command_arrives_after_its_delay_and_the_arm_rests_until_then():
+    moved = [o.joint_position[0] for o in walk(bench(delay=2), np.full((4, 2), 0.5))]
+    np.testing.assert_allclose(moved, [0.0, 0.0, 0.05, 0.1], atol=1e-15)
+
+
+def test_a_feature_arrives_after_its_latency():
+    late, prompt = walk(bench(sensing=SensingConfig(0.0, 3))), walk(bench())
+    assert [o.feature[0] for o in late] == [0.0, 0.0, 0.0, *(o.feature[0] for o in prompt[:-3])]
+
+
+def test_noise_has_the_configured_spread_times_its_factor():
+    plant = bench(sensing=SensingConfig(0.003, noise_factor=2.0))
+    errors = [o.feature - o.joint_position[:1] for o in walk(plant, np.zeros((1500, 2)))]
+    assert np.std(errors) == pytest.approx(0.006, rel=0.05)
+    assert abs(np.mean(errors)) < 0.0006
+
+
+def test_a_lost_frame_is_not_valid_and_the_last_feature_is_held():
+    plant = bench(sensing=SensingConfig(0.0, drop_probability=0.5))
+    held, valid = np.zeros(1), []
+    for observation in walk(plant, np.full((200, 2), 0.1)):
+        valid.append(observation.feature_valid)
+        assert observation.valid.tolist() == [observation.feature_valid]
+        expected = observation.joint_position[:1] if observation.feature_valid else held
+        np.testing.assert_array_equal(observation.feature, expected)
+        held = observation.feature
+    assert 60 < sum(valid) < 140
+
+
+def test_a_frame_without_the_feature_comes_out_late_as_well():
+    seen = walk(bench(sensing=SensingConfig(0.0, 1), hidden=(2,)), np.full((4, 2), 0.5))
+    assert [o.feature_valid for o in seen] == [True, True, False, True]
+    np.testing.assert_allclose([o.feature[0] for o in seen], [0.0, 0.05, 0.05, 0.15], atol=1e-15)
+
+
+def test_a_feature_that_is_hidden_at_the_start_ends_the_run():
+    with pytest.raises(FeatureLost, match="not visible at the start"):
+        bench(hidden=(0,))
+
+
+def test_a_run_begins_with_a_reset():
+    with pytest.raises(ValueError, match="reset must be called before the first step"):
+        Bench(Counter(), 0, QUIET).step(Command(np.zeros(2)))
+
+
+def test_a_saved_state_restores_delay_latency_noise_and_lost_frames():
+    plant = bench(2, SensingConfig(0.01, 2, 0.3), seed=5)
+    walk(plant)
+    state = plant.save()
+    first = walk(plant)
+    for saved in (state, pickle.loads(pickle.dumps(state))):
+        plant.restore(saved)
+        again = walk(plant)
+        for name in ("time", "joint_position", "feature", "feature_valid"):
+            np.testing.assert_array_equal(*([getattr(o, name) for o in run] for run in (first, again)))
+    assert not plant.step(Command(np.zeros(2))).feature.flags.writeable
+
+
+def test_closing_closes_the_world():
+    plant = bench()
+    plant.close()
+    assert plant.world.closed == 1
+
+
+def test_noise_and_latency_are_varied_in_the_section_sensing_alone():
+    config = KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 1))
+    varied = vary_sensing(vary_sensing(config, 2.0, None), 3.0, 4)
+    assert varied == KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 4, noise_factor=6.0))
+    assert can_vary_sensing(config)
+    with pytest.raises(ValueError, match="cannot be varied"):
+        vary_sensing(object(), 2.0, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("feature_noise", -0.001), ("latency_periods", -1), ("drop_probability", 1.0), ("noise_factor", -1.0)],
+)
+def test_a_setting_of_sensing_out_of_bounds_is_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        SensingConfig(**{name: value})
