@@ -17,6 +17,7 @@ from itables.javascript import generate_init_offline_itables_html
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
+
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.folder import describe_folder, other_tables
 from servobench.harness.analysis.tables import (
@@ -26,7 +27,6 @@ from servobench.harness.analysis.tables import (
     settling_table,
     tracking_table,
 )
-
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.conditions import draw_conditions

@@ -7,9 +7,9 @@ import math
 import re
 import tomllib
 
-import generated_tables
 import pytest
 
+import generated_tables
 from kit.documents import names, read, section, tables
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.networks.config import TrainingConfig
