@@ -13,12 +13,14 @@ Rules across fields stand in `__post_init__` and raise `ValueError`. Validation 
 
 from __future__ import annotations
 
-from dataclasses import Field, field, fields
-from functools import wraps
-from typing import Annotated, Any, TypeAlias, TypeVar, dataclass_transform
+import difflib
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, field, fields, is_dataclass, replace
+from functools import cache, wraps
+from typing import Annotated, Any, TypeAlias, TypeVar, cast, dataclass_transform, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt
-from pydantic import AllowInfNan, ConfigDict, ValidationError
+from pydantic import AllowInfNan, ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 Number: TypeAlias = Annotated[float, AllowInfNan(False)]
@@ -39,6 +41,7 @@ Periods: TypeAlias = Annotated[int, Ge(0)]
 """A whole number of control periods, or another count that may be 0."""
 
 Class = TypeVar("Class", bound=type)
+Config = TypeVar("Config")
 
 _BOUNDS = {
     "greater_than": ("gt", "above"),
@@ -56,15 +59,16 @@ _WANTED = {
 }
 
 
+STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(field, Field))
 def settings(kind: Class) -> Class:
     """Make a class a frozen dataclass whose fields are checked on construction.
 
     Construction raises a `ValueError` of one line that names the field, what was wanted and what came.
     """
-    checked: Any = dataclass(frozen=True, config=ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True))(
-        kind
-    )
+    checked: Any = dataclass(frozen=True, config=STRICT)(kind)
     construct, names = checked.__init__, [item.name for item in fields(checked)]
 
     @wraps(construct)
@@ -84,10 +88,71 @@ def nested(kind: type[Any]) -> Any:  # noqa: ANN401 - the default of a field of 
     return field(default_factory=kind)
 
 
-def describe(error: ValidationError) -> str:
-    """Return the first complaint of pydantic as one line: field, what was wanted, what came."""
+def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
+    """Return the dataclass `default` with nested `values`, as TOML gives them, in place of its own.
+
+    Args:
+        name: of the section, for error messages.
+        default: any frozen dataclass; fields that are dataclasses are sections of their own.
+        values: lists become tuples, whole numbers are taken for numbers, true and false are not.
+
+    Raises:
+        ValueError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
+    """
+    known = [item.name for item in fields(cast(Any, default))]
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in known:
+            raise ValueError(f"{name} has no setting {key!r}: {suggest(key, known) if known else 'it has none'}")
+        present = getattr(default, key)
+        if is_dataclass(present) != isinstance(value, Mapping):
+            kind = "a section of its own" if is_dataclass(present) else "a plain value"
+            raise ValueError(f"{name}.{key} is {kind}, got {value!r}")
+        if is_dataclass(present):
+            changes[key] = override(f"{name}.{key}", present, value)
+        else:
+            changes[key] = _convert(f"{name}.{key}", _adapters(cast(Any, type(default)))[key], value)
+    try:
+        return replace(cast(Any, default), **changes) if changes else default
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Return what to say after an unknown word: the nearest known one, then all of them."""
+    names = sorted(known)
+    nearest = difflib.get_close_matches(word, names, n=1)
+    hint = f"did you mean {nearest[0]!r}? " if nearest else ""
+    return f"{hint}valid: {', '.join(names)}"
+
+
+def _convert(name: str, adapter: TypeAdapter[Any], value: object) -> Any:  # noqa: ANN401 - the adapter decides
+    try:
+        return adapter.validate_python(_with_tuples(value))
+    except ValidationError as error:
+        raise ValueError(describe(error, name)) from None
+
+
+def _with_tuples(value: object) -> object:
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
+
+
+@cache
+def _adapters(kind: type) -> dict[str, TypeAdapter[Any]]:
+    """Return what checks a value of each field that is not a section."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {key: TypeAdapter(hint, config=STRICT) for key, hint in hints.items() if not is_dataclass(hint)}
+
+
+def describe(error: ValidationError, name: str = "") -> str:
+    """Return the first complaint of pydantic as one line: field, what was wanted, what came.
+
+    Args:
+        error: what pydantic raised.
+        name: of what was checked, in front of the field.
+    """
     first = error.errors(include_url=False)[0]
-    name = ".".join(str(part) for part in first["loc"])
+    name = ".".join([name] * bool(name) + [str(part) for part in first["loc"]])
     kind, context, came = first["type"], first.get("ctx", {}), first["input"]
     if kind == "value_error":
         return " ".join(str(context["error"]).split())

@@ -27,8 +27,9 @@ from servobench.harness.analysis.statistics import (
     median_with_interval,
     tail_mean,
 )
-from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import COMPLETED
+from servobench.plant.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 

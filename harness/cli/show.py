@@ -112,8 +112,9 @@ def record(
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results  # noqa: PLC0415 - see statistics
-    from servobench.harness.config.settings import ConfigurationError, suggest  # noqa: PLC0415
+    from servobench.harness.config.settings import ConfigurationError  # noqa: PLC0415
     from servobench.harness.pictures.replay import logged_run  # noqa: PLC0415
+    from servobench.plant.settings import suggest  # noqa: PLC0415
 
     runs = results.load_runs(folder)
     names = runs["run_id"].tolist()

@@ -22,6 +22,7 @@ def tuned_file(name: str) -> Traversable:
     return files("servobench.controllers") / "tuned" / f"{name}.toml"
 
 
+@cache
 def default_config(entry: ControllerEntry) -> Any:  # noqa: ANN401 - any configuration dataclass
     """Return the configuration of a controller for which nothing is set.
 

@@ -13,9 +13,10 @@ from pathlib import Path
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
 from servobench.harness.config.extras import missing_extra
-from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.plant import PlantEntry
+from servobench.plant.settings import suggest
 
 PLANT_GROUP = "servobench.plants"
 CONTROLLER_GROUP = "servobench.controllers"

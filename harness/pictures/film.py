@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.panels import SETTLED
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
@@ -27,6 +27,7 @@ from servobench.harness.pictures.style import figure_style, method_styles
 from servobench.harness.run.metrics import SETTLING_BAND
 from servobench.plant.bullet.detection import ByteArray
 from servobench.plant.checks import FloatArray
+from servobench.plant.settings import suggest
 
 MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
 WIDTH, HEIGHT = 960, 736  # px of a frame; ffmpeg wants multiples of 16

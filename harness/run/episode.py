@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build_experiment
@@ -17,6 +16,7 @@ from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.threads import one_thread
 from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
 
@@ -58,7 +58,7 @@ def run_experiment(
     log = StepLog(plant.spec, experiment.periods)
     status, reason = COMPLETED, ""
     try:
-        with threadpool_limits(1), np.errstate(divide="raise", over="raise", invalid="raise"):
+        with one_thread(), np.errstate(divide="raise", over="raise", invalid="raise"):
             run_loop(plant, experiment.controller, scenario.reference, experiment.loop, request.seed, log)
     except RunFault as fault:
         status, reason = fault.status, _one_line(fault)

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from servobench.harness.config.settings import ConfigurationError, suggest
+from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.references import (
     Circle,
     FixedPoint,
@@ -33,11 +33,12 @@ from servobench.plant.robot.ur5 import (
     nominal_ur5,
 )
 from servobench.plant.seeds import named_generator
+from servobench.plant.settings import Count, NonNegative, Number, Positive, settings, suggest
 
-Vector = tuple[float, ...]
+Vector: TypeAlias = tuple[float, ...]
 
-SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
-REACH = (0.35, 0.75)  # m, from the shoulder to the ball: some way from the arm's own column and from the stretched arm
+SHOULDER = (0.0, 0.0, 0.09)  # [m] base frame
+REACH = (0.35, 0.75)  # [m] from the shoulder to the ball: away from the arm's own column and from the stretched arm
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ class Scenario:
     """A task made concrete for one true robot.
 
     Attributes:
-        start: (n,), rad, joint positions at time 0; None for a plant that brings its own.
+        start: (n,), joint positions at time 0; None for a plant that brings its own [rad].
         reference: the desired feature over time.
-        duration: s.
-        evaluate_from: s, where the evaluated part begins.
+        duration: [s].
+        evaluate_from: where the evaluated part begins [s].
         kind: whether the reference is a fixed target or moves.
     """
 
@@ -59,84 +60,99 @@ class Scenario:
     kind: TaskKind = "curve"
 
 
-@dataclass(frozen=True)
+@settings
 class PointTask:
     """A move from rest to a fixed target that was taught at given joint positions."""
 
-    start: Vector = HOME  # rad, joint positions at time 0
-    target: Vector = HOME  # rad, joint positions at which the target was taught
-    duration: float = 10.0  # s
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    target: Vector = HOME
+    """[rad] joint positions at which the target was taught"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
 
 
-@dataclass(frozen=True)
+@settings
 class RandomTask:
     """A move whose start and target are drawn by the run's seed from a box of joint positions.
 
     Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
     """
 
-    lower: Vector = TRAINING_LOWER  # rad
-    upper: Vector = TRAINING_UPPER  # rad
-    shortest: float = 0.1  # m, least distance between start and target (on the nominal model)
-    lowest: float = 0.08  # m, least height of the ball above the table (on the nominal model)
-    duration: float = 10.0  # s
+    lower: Vector = TRAINING_LOWER
+    """[rad] lower corner of the box"""
+    upper: Vector = TRAINING_UPPER
+    """[rad] upper corner of the box"""
+    shortest: Number = 0.1
+    """[m] least distance between start and target on the nominal model"""
+    lowest: Number = 0.08
+    """[m] least height of the ball above the table on the nominal model"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
 
 
-@dataclass(frozen=True)
+@settings
 class CircleTask:
     """A horizontal circle in the camera frame, entered from its centre: a large initial error."""
 
-    start: Vector = HOME  # rad
-    centre: Vector = (0.0, 0.0, 1.25)  # m, camera frame: (0.5, 0, 0.3) m in the base frame of the nominal robot
-    radius: float = 0.3  # m
-    lap_time: float = 10.0  # s: 200 points a lap at the default period
-    laps: int = 2
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    centre: Vector = (0.0, 0.0, 1.25)
+    """[m] camera frame; (0.5, 0, 0.3) m in the base frame of the nominal robot"""
+    radius: Positive = 0.3
+    """[m]"""
+    lap_time: Positive = 10.0
+    """[s] 200 points a lap at the default period"""
+    laps: Count = 2
+    """laps in the run; the last one is judged"""
 
-    def __post_init__(self) -> None:
-        """Check the numbers that the reference does not."""
-        check_number("laps", self.laps, at_least=1)
 
-
-@dataclass(frozen=True)
+@settings
 class LemniscateTask(CircleTask):
     """A figure of eight in the plane of the camera's image."""
 
+    radius: Positive = 0.25
+    """[m] half of its length"""
 
-@dataclass(frozen=True)
+
+@settings
 class LineTask:
     """A straight line at constant speed, then rest at its end."""
 
-    start: Vector = HOME  # rad
-    begin: Vector = (-0.2, 0.0, 1.25)  # m, camera frame
-    end: Vector = (0.2, 0.1, 1.2)  # m, camera frame
-    moving: float = 8.0  # s
-    duration: float = 10.0  # s
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    begin: Vector = (-0.2, 0.0, 1.25)
+    """[m] camera frame"""
+    end: Vector = (0.2, 0.1, 1.2)
+    """[m] camera frame"""
+    moving: Positive = 8.0
+    """[s] from the beginning to the end of the line"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
 
 
-@dataclass(frozen=True)
+@settings
 class WaypointTask:
     """Waypoints from a CSV file with the columns time_s, x_m, y_m, z_m in the camera frame."""
 
-    start: Vector = HOME  # rad
-    file: str = ""  # path of the CSV file
-    settle: float = 2.0  # s after the last waypoint
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    file: str = ""
+    """path of the CSV file"""
+    settle: NonNegative = 2.0
+    """[s] rest after the last waypoint"""
 
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("settle", self.settle, at_least=0.0)
 
-
-@dataclass(frozen=True)
+@settings
 class TargetTask:
     """A move from rest to a fixed target that is given as a feature."""
 
-    start: Vector = HOME  # rad
-    target: Vector = (0.1, -0.1, 1.2)  # m, camera frame
-    duration: float = 10.0  # s
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("duration", self.duration, above=0.0)
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    target: Vector = (0.1, -0.1, 1.2)
+    """[m] camera frame"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
 
 
 @dataclass(frozen=True)
@@ -208,7 +224,6 @@ def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
 
 
 def _move(start: Vector, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
-    check_number("duration", duration, above=0.0)
     return Scenario(setting.start(start), reference, duration, 0.75 * duration, "point_to_point")
 
 
@@ -253,7 +268,6 @@ def _lap_scenario(config: CircleTask, reference: Reference, setting: TaskSetting
 def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
     m = setting.m
     reference = line(as_vector("begin", config.begin, m), as_vector("end", config.end, m), config.moving)
-    check_number("duration", config.duration, above=0.0)
     return Scenario(setting.start(config.start), reference, config.duration, 0.5 * config.duration)
 
 
@@ -291,9 +305,7 @@ _ENTRIES = (
     TaskEntry("exp4", "a move that starts outside the training region", EXP4, _build_point),
     TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle, any_robot=True),
     TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line, any_robot=True),
-    TaskEntry(
-        "lemniscate", "two laps on a figure of eight", LemniscateTask(radius=0.25), _build_lemniscate, any_robot=True
-    ),
+    TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(), _build_lemniscate, any_robot=True),
     TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
     TaskEntry("target", "a move to a given feature (target.target)", TargetTask(), _build_target, any_robot=True),
     TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),

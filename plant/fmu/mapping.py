@@ -33,7 +33,6 @@ feature_unit = "m"
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -44,6 +43,7 @@ import numpy as np
 
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.fmu.description import FmuDescription, total_size
+from servobench.plant.settings import suggest
 from servobench.plant.signals import PlantSpec
 
 Names: TypeAlias = tuple[str, ...]
@@ -141,9 +141,7 @@ def _arguments(table: dict[str, Any]) -> dict[str, Any]:
             arguments[section] = {name: _numbers(name, value) for name, value in values.items()}
     for key, value in _flatten(table):
         if key not in _KEYS:
-            nearest = difflib.get_close_matches(key, _KEYS, n=1)
-            hint = f"did you mean {nearest[0]!r}? " if nearest else ""
-            raise ValueError(f"unknown key {key!r}; {hint}valid: {', '.join(_KEYS)}, [parameters], [nominal]")
+            raise ValueError(f"unknown key {key!r}; {suggest(key, [*_KEYS, *_SECTIONS])}")
         argument, convert = _KEYS[key]
         arguments[argument] = convert(key, value)
     for key in ("file", "inputs", "features"):

@@ -12,7 +12,7 @@ import pytest
 
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.experiment import RunRequest, RunSettings
+from servobench.harness.run.request import RunRequest, RunSettings
 
 NEVER = math.nan
 SEEDS = (702, 705)  # whose settling times four kinds of processors give alike

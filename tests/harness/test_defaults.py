@@ -22,11 +22,15 @@ def tuned(tmp_path, monkeypatch):
     def write(text):
         (tmp_path / "tuned").mkdir(exist_ok=True)
         (tmp_path / "tuned" / "ukf_mfac.toml").write_text(text)
+        forget()
+
+    def forget():
         defaults.tuned_settings.cache_clear()
+        defaults.default_config.cache_clear()
 
     monkeypatch.setattr(defaults, "files", lambda _: tmp_path)
     yield write
-    defaults.tuned_settings.cache_clear()
+    forget()
 
 
 @pytest.mark.parametrize("name", controller_names())
@@ -65,7 +69,7 @@ def test_a_controller_without_a_file_keeps_the_defaults_of_its_class(tuned):
         ("score = 1.0\n", "tuned values .*ukf_mfac.toml cannot be read: 'settings'"),
         ("settings = 3\n", r"\[settings\] must be a table, got 3"),
         ("[settings.law]\nstep_facto = 0.3\n", "ukf_mfac.law has no setting 'step_facto'"),
-        ("[settings.law]\nstep_factor = 3.0\n", "ukf_mfac.law: step_factor must be .* got 3"),
+        ("[settings.law]\nstep_factor = 3.0\n", "ukf_mfac.law.step_factor must be .* got 3"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(tuned, text, message):

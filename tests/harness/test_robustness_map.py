@@ -29,7 +29,7 @@ def test_the_map_has_every_place_for_every_method_and_no_run_twice():
     assert len({cell.request.run_id for cell in usual}) == len(usual)
     assert len(cells) == 2 * 3 * sum(len(line.places) for line in LINES)
     assert {cell.axis for cell in moved} == {MOVE}
-    assert {cell.request.mismatch for cell in moved} >= {"moderate+camera_move=90deg"}
+    assert {str(cell.request.mismatch) for cell in moved} >= {"moderate+camera_move=90deg"}
     assert {cell.request.latency_periods for cell in usual if cell.axis == "latency"} == {0, 1, 2, 3, 4, 5}
     assert {cell.request.noise_factor for cell in usual if cell.axis == "noise"} == {0.0, 1.0, 2.0, 4.0, 8.0}
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import pytest
@@ -12,24 +12,32 @@ from servobench.harness.config.settings import (
     read_settings,
 )
 from servobench.plant.checks import check_number
+from servobench.plant.settings import Positive, nested, settings
 
 
-@dataclass(frozen=True)
+@settings
 class Inner:
-    gain: float = 1.0
+    gain: Positive = 1.0
     kind: Literal["one", "two"] = "one"
 
-    def __post_init__(self) -> None:
-        check_number("gain", self.gain, above=0.0)
 
-
-@dataclass(frozen=True)
+@settings
 class Outer:
     count: int = 3
     on: bool = False
     name: str = "a"
     point: tuple[float, ...] = (0.0, 1.0)
-    inner: Inner = field(default_factory=Inner)
+    inner: Inner = nested(Inner)
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """What a third party may write: a dataclass that checks itself."""
+
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_number("gain", self.gain, above=0.0)
 
 
 def resolve(*assignments: str) -> Outer:
@@ -64,6 +72,12 @@ def test_a_default_that_differs_from_the_class_is_kept():
     assert Settings({"outer": {"on": True}}).resolve("outer", Outer(count=9)) == Outer(count=9, on=True)
 
 
+def test_the_own_checks_of_a_foreign_dataclass_are_one_line():
+    assert Settings({"theirs": {"gain": 2}}).resolve("theirs", Foreign()) == Foreign(2.0)
+    with pytest.raises(ConfigurationError, match="theirs: gain must be above 0, got -1"):
+        Settings({"theirs": {"gain": -1}}).resolve("theirs", Foreign())
+
+
 def test_flatten_names_every_leaf():
     assert list(flatten(Outer())) == ["count", "on", "name", "point", "inner.gain", "inner.kind"]
 
@@ -73,17 +87,19 @@ def test_flatten_names_every_leaf():
     [
         ("outer.cuont=1", r"outer has no setting 'cuont': did you mean 'count'\? valid: count, inner, name, on, point"),
         ("outer.inner.gian=1", r"outer.inner has no setting 'gian': did you mean 'gain'"),
-        ("outer.inner.gain=-1", r"outer.inner: gain must be above 0, got -1"),
-        ("outer.inner.gain=nan", r"outer.inner: gain must be above 0, got nan"),
-        ("outer.inner.gain=high", r"outer.inner.gain: wanted a number, got 'high'"),
-        ("outer.count=2.5", r"outer.count: wanted a whole number, got 2.5"),
-        ("outer.count=true", r"outer.count: wanted a whole number, got True"),
-        ("outer.on=1", r"outer.on: wanted true or false, got 1"),
-        ("outer.name=1", r"outer.name: wanted text, got 1"),
-        ("outer.point=[1, 'x']", r"outer.point: wanted a number, got 'x'"),
+        ("outer.inner.gain=-1", r"outer.inner.gain must be above 0, got -1"),
+        ("outer.inner.gain=nan", r"outer.inner.gain must be finite, got nan"),
+        ("outer.inner.gain=high", r"outer.inner.gain must be a number, got 'high'"),
+        ("outer.count=2.5", r"outer.count must be a whole number, got 2.5"),
+        ("outer.count=true", r"outer.count must be a whole number, got True"),
+        ("outer.on=1", r"outer.on must be true or false, got 1"),
+        ("outer.name=1", r"outer.name must be text, got 1"),
+        ("outer.point=[1, 'x']", r"outer.point.1 must be a number, got 'x'"),
+        ("outer.point=[true]", r"outer.point.0 must be a number, got True"),
+        ("outer.point=1", r"outer.point must be a list, got 1"),
         ("outer.inner=1", r"outer.inner is a section of its own, got 1"),
         ("outer.count.x=1", r"outer.count is a plain value"),
-        ("outer.inner.kind=three", r"outer.inner.kind: wanted one of one, two, got 'three'"),
+        ("outer.inner.kind=three", r"outer.inner.kind must be one of one, two, got 'three'"),
         ("outer=1", r"--set needs section.key=value"),
         ("outer.count", r"--set needs section.key=value"),
     ],

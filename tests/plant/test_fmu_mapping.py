@@ -66,7 +66,7 @@ def test_every_key_arrives(tmp_path):
     [
         ('file = "crane.fmu"', "", "the key 'file' is missing"),
         ('features = "hook"', "", "the key 'features' is missing"),
-        ('home = "q0"', 'hoem = "q0"', r"unknown key 'hoem'; did you mean 'home'\? valid: file, inputs"),
+        ('home = "q0"', 'hoem = "q0"', r"unknown key 'hoem'; did you mean 'home'\? valid: features, file"),
         ("joint_lower", "joint_low", "unknown key 'limits.joint_low'; did you mean 'limits.joint_lower'"),
         ('home = "q0"', "home = 3", "home must be text, got 3"),
         ('joints = ["q"]', "joints = [1]", r"joints must be a name or a list of names, got \[1\]"),

@@ -23,7 +23,8 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import ConfigurationError, flatten, suggest
+from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.plant.settings import suggest
 
 Space: TypeAlias = Mapping[str, BaseDistribution]
 
