@@ -1,22 +1,22 @@
-"""How noisy the feature is, estimated online from what predictions leave unexplained.
+"""The standard deviation of the feature's noise, estimated online from innovations.
 
-    E ‖ν‖²/m = a σ² + b        ν innovation (m,), m; a how often σ² is in it; b what else is, m²
-    sample = (‖ν‖²/m − b)/a,   weight = (a σ²/(a σ² + b))²:   where b is large, ν says little about σ
-    σ² = Σ weight · sample / Σ weight, with forgetting, from a first guess that counts as `GUESS` samples
+    E ‖ν‖²/m = a σ² + b        ν innovation (m,), m; a how often multiple of σ² in it; b its other variance, m²
+    sample = (‖ν‖²/m − b)/a,   weight = (a σ²/(a σ² + b))²:   a sample counts less where b is large
+    σ² = Σ weight · sample / Σ weight, with forgetting, from an initial guess that counts as `GUESS_SAMPLES`
 
-A sample counts at most `LARGEST` σ², so that a camera that is moved does not make all that follows look like noise;
-while less than `TRUSTED` samples are known, more in proportion, so that a wrong guess is left at once.
+A sample is capped at `MAX_SAMPLE_RATIO` σ², so that a camera that is moved does not pass for noise. During the warm-up
+the cap is higher in proportion, so that a wrong guess is corrected at once.
 """
 
 from __future__ import annotations
 
 from typing import final
 
-GUESS = 1.0  # samples that the first guess is worth
-TRUSTED = 10.0  # samples, the guess included
-FORGETTING = 0.99  # of the sums, a sample
-LARGEST = 9.0  # of a sample, in σ²
-SMALLEST = 1e-2  # of σ² against the first guess: a perfect feature is none
+GUESS_SAMPLES = 1.0  # [samples] weight of the initial guess
+WARM_UP_SAMPLES = 10.0  # [samples] the guess included
+FORGETTING = 0.99  # [1] of the sums, per sample
+MAX_SAMPLE_RATIO = 9.0  # [1] of a sample to σ²
+MIN_VARIANCE_RATIO = 1e-2  # [1] floor of σ² relative to the initial guess
 
 
 @final
@@ -24,24 +24,24 @@ class NoiseLevel:
     """The estimate above; `variance` is σ², m²."""
 
     def __init__(self, deviation: float) -> None:
-        """Start at a first guess of σ, m."""
+        """Start at an initial guess of σ, m."""
         self.variance = deviation**2
-        self._floor = SMALLEST * self.variance
-        self._weights, self._sum = GUESS, GUESS * self.variance
+        self._floor = MIN_VARIANCE_RATIO * self.variance
+        self._weights, self._sum = GUESS_SAMPLES, GUESS_SAMPLES * self.variance
 
     def learn(self, square: float, multiple: float, other: float) -> None:
         """Learn from an innovation.
 
         Args:
             square: ‖ν‖²/m, m².
-            multiple: a.
-            other: b, m².
+            multiple: a, the multiple of σ² in its variance.
+            other: b, the rest of its variance, m².
         """
-        if square == 0.0:  # the same frame again: it tells nothing
+        if square == 0.0:  # the same frame again, which holds no information
             return
         own = multiple * self.variance
         weight = (own / (own + other)) ** 2
-        largest = LARGEST * max(1.0, TRUSTED / self._weights) * self.variance
+        largest = MAX_SAMPLE_RATIO * max(1.0, WARM_UP_SAMPLES / self._weights) * self.variance
         sample = min((square - other) / multiple, largest)
         self._sum = FORGETTING * self._sum + weight * sample
         self._weights = FORGETTING * self._weights + weight

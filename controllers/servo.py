@@ -14,9 +14,11 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.controller import Controller, Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.initial import InitialJacobian
 from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.prediction import Predictor, shifted
 from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import ControllerDiverged
 from servobench.plant.signals import Command, Observation
@@ -36,8 +38,30 @@ class ServoController(Controller):
         law: the control law, likewise.
     """
 
-    def __init__(self, estimator: Estimator, law: Law, initial: InitialJacobian, knowledge: RobotKnowledge) -> None:
-        """Compose a controller; `reset` must be called before the first `step`."""
+    def __init__(
+        self,
+        estimator: Estimator,
+        law: Law,
+        initial: InitialJacobian,
+        knowledge: RobotKnowledge,
+        predictor: Predictor | None = None,
+    ) -> None:
+        """Compose a controller; `reset` must be called before the first `step`.
+
+        Args:
+            estimator: estimates the Jacobian.
+            law: commands by the estimate.
+            initial: provides the first Jacobian.
+            knowledge: of the robot.
+            predictor: the predict stage; None: the law gets what is measured.
+
+        Raises:
+            ValueError: a predictor for a law that predicts itself.
+        """
+        if predictor is not None and "predict" in law.owns:
+            raise ValueError(f"predictor must be None for {type(law).__name__}, which predicts itself")
+        self._predictor = predictor
+        self._period = knowledge.spec.period
         self.estimator = estimator
         self.law = law
         self._initial = initial
@@ -84,18 +108,31 @@ class ServoController(Controller):
         if not self._ready:
             self.estimator.reset(self._initial.jacobian())
             self.law.reset(observation)
+            if self._predictor is not None:
+                self._predictor.reset()
             self._ready, self._probing = True, False
         self._learn(observation, reference)
         estimate = self.estimator.estimate(observation.joint_position)
         J = self._jacobian = estimate.jacobian
         if not is_finite(J):
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
-        u = self.law.command(estimate, observation, reference)
+        u = self._command(estimate, observation, reference)
         if not is_finite(u):
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
             )
         return Command(u)
+
+    def _command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
+        """Return what leaves the chain predict, law, posture, limit: a joint velocity (n,), rad/s."""
+        predictor = self._predictor
+        if predictor is None:
+            return self.law.command(estimate, observation, reference)
+        bound = predictor.predict(estimate, observation)
+        ahead = Observation(observation.time, bound.joint_position, bound.feature, observation.feature_valid)
+        u = self.law.command(estimate, ahead, shifted(reference, bound.lead, len(reference)))
+        predictor.note(u * self._period)
+        return u
 
     def diagnostics(self) -> Diagnostics:
         """Return what estimator and law tell, besides `probing` and `jacobian_prediction_error`.

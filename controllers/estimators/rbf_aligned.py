@@ -2,8 +2,8 @@
 
     Ĵ(q) = M̄ Ĵ_net(q),   Δy(k) ≈ M̄ Ĵ_net Δq(k − d)
 
-The network knows the arm, the map M the camera: a turned camera is a rotation in front of the whole Jacobian, which a
-map learns from two motions and a network not at all. Not in the paper.
+The network models the arm and the map M the camera: a turned camera is a rotation in front of the whole Jacobian, which
+a map learns from two motions and a network cannot learn. Not in the paper.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
 
-ROOM = 16  # periods that a motion over lost frames may span; after a longer gap the past is forgotten
-JUMP_SHARE = 2.0  # of the longest step that the model knows of: a longer one of the feature is no motion of the arm
-JUMP_NOISE = 10.0  # σ, beyond which it is no noise either
-LARGEST_SURPRISE = 50.0  # ‖ν‖²/s beyond which a single motion counts no more against a delay
-USUAL_SURPRISE = 3.0  # ‖ν‖²/(s m) of a motion up to which nothing is suspected; 1 is expected
-LARGEST_SUSPICION = 10.0  # of one motion, so that one outlier alone is below the gate
+MAX_GAP = 16  # [periods] that a motion over lost frames may span; after a longer gap the past is forgotten
+MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
+MIN_JUMP_DEVIATIONS = 10.0  # [σ] above which it is no noise either
+NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), of one motion in the score of a delay
+CUSUM_DRIFT = 3.0  # [1] NIS per feature that is subtracted at each motion; 1 is its expectation
+CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier cannot reach the gate
 
 
 @settings
@@ -84,10 +84,10 @@ class RbfAlignedEstimator(Estimator):
 
     with x_d = Ĵ_net Δq(k−d). Symbols: M map (m, m); P its covariance (m, m); R rotation (m, m); d delay, periods; σ m.
 
-    The network's ε is in proportion to σ²: the noisier the feature, the more motion a lesson takes.
+    The network's ε is in proportion to σ²: with a noisier feature it learns from larger motions only.
 
     P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
-    explains, from which nothing is learned, or surprises that add up, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
+    explains, from which nothing is learned, or a CUSUM of innovations, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
     gate. M stays, as the best guess.
     """
 
@@ -112,7 +112,7 @@ class RbfAlignedEstimator(Estimator):
         self._past: FloatArray | None = None  # rows [q, Σ x], a row a period, the newest last
         self._moves = 0
         self._key, self._latest = b"", np.zeros((self._m, self._n))
-        self._surprise = self._suspicion = 0.0
+        self._nis = self._cusum = 0.0
 
     @property
     def map(self) -> FloatArray:
@@ -136,10 +136,10 @@ class RbfAlignedEstimator(Estimator):
     def update(self, motion: Motion) -> None:
         """Learn map, delay and network from one motion."""
         config, n, periods = self._config, self._n, max(1, round(motion.duration / self._period))
-        if periods > ROOM:
+        if periods > MAX_GAP:
             self._past = None
             return
-        past, last = self._extended_past(motion, periods), self._candidates + ROOM
+        past, last = self._extended_past(motion, periods), self._candidates + MAX_GAP
         passed = (
             past[last : last - self._candidates : -1] - past[last - periods : last - periods - self._candidates : -1]
         )
@@ -164,30 +164,30 @@ class RbfAlignedEstimator(Estimator):
         return np.asarray(self._map.dot(self._network_jacobian(joint_position)))
 
     def diagnostics(self) -> Diagnostics:
-        """Return what the network tells, and delay, rotation (rad), deviation and surprise of the map, moves."""
+        """Return those of the network, and delay, rotation (rad), deviation and NIS of the map, moves, noise level."""
         cosine = min(1.0, max(-1.0, 1.0 - 0.25 * float(np.sum((self._rotation - self._eye) ** 2))))
         return {
             **self._network.diagnostics(),
             "delay": float(self._delay),
             "map_rotation": math.acos(cosine),
             "map_deviation": self._deviation(),
-            "map_surprise": self._surprise,
+            "map_surprise": self._nis,
             "camera_moves": float(self._moves),
             "noise_level": math.sqrt(self._noise.variance),
         }
 
     def _network_jacobian(self, q: FloatArray) -> FloatArray:
-        """Return Ĵ_net, (m, n), at q; it is asked for several times at the same place between two updates."""
+        """Return Ĵ_net, (m, n), at q; cached because it is needed several times at one place between two updates."""
         key = q.tobytes()
         if key != self._key:
             self._key, self._latest = key, self._network.jacobian(q)
         return self._latest
 
     def _extended_past(self, motion: Motion, periods: int) -> FloatArray:
-        """Return the past up to now, (candidates + ROOM + 1, n + m): in a gap the joints moved evenly."""
+        """Return the past up to now, (candidates + MAX_GAP + 1, n + m): in a gap the joints moved evenly."""
         q, dq, n = motion.joint_position, motion.joint_step, self._n
         if self._past is None:  # the arm was at rest
-            self._past = np.zeros((self._candidates + ROOM + 1, n + self._m))
+            self._past = np.zeros((self._candidates + MAX_GAP + 1, n + self._m))
             self._past[:, :n] = q
         begin = np.concatenate([q, self._past[-1, n:]])
         step = np.concatenate([dq, self._network_jacobian(q).dot(dq)])
@@ -199,11 +199,11 @@ class RbfAlignedEstimator(Estimator):
     def _jumped(self, square: FloatArray, feature_step: FloatArray) -> bool:
         reach = math.sqrt(max(square.tolist()))
         seen = math.sqrt(float(feature_step @ feature_step))
-        return seen > JUMP_SHARE * reach + JUMP_NOISE * math.sqrt(self._noise.variance)
+        return seen > MIN_JUMP_RATIO * reach + MIN_JUMP_DEVIATIONS * math.sqrt(self._noise.variance)
 
     def _expect_any_map(self) -> None:
         self._bank[:, self._m :] = self._P0
-        self._suspicion, self._moves = 0.0, self._moves + 1
+        self._cusum, self._moves = 0.0, self._moves + 1
 
     def _deviation(self) -> float:
         return math.sqrt(float(self._bank[self._delay, self._m :].trace()) / self._m)
@@ -218,16 +218,16 @@ class RbfAlignedEstimator(Estimator):
             excess = P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
             if max(excess.tolist()) > 1.0:
                 P /= np.maximum(excess, 1.0)[:, None, None]
-        bank, surprise, s = map_update(self._bank, x, feature_step, variance)
-        self._surprise, expected = float(surprise[self._delay]) / m, float(s[self._delay])
+        bank, nis, s = map_update(self._bank, x, feature_step, variance)
+        self._nis, expected = float(nis[self._delay]) / m, float(s[self._delay])
         if config.find_noise:
-            self._noise.learn(self._surprise * expected, 2.0, expected - 2.0 * self._noise.variance)
-        self._suspicion = max(0.0, self._suspicion + min(self._surprise, LARGEST_SUSPICION) - USUAL_SURPRISE)
-        if config.detect_moves and self._suspicion > config.gate:
+            self._noise.learn(self._nis * expected, 2.0, expected - 2.0 * self._noise.variance)
+        self._cusum = max(0.0, self._cusum + min(self._nis, CUSUM_CAP) - CUSUM_DRIFT)
+        if config.detect_moves and self._cusum > config.gate:
             self._expect_any_map()
             bank, _, _ = map_update(self._bank, x, feature_step, variance)
         self._bank = bank
-        self._scores = config.forgetting * self._scores + np.minimum(surprise, LARGEST_SURPRISE) + m * np.log(s)
+        self._scores = config.forgetting * self._scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
         best = int(self._scores.argmin())
         if self._scores[best] < self._scores[self._delay] - config.margin:
             self._delay = best

@@ -1,11 +1,11 @@
-"""Where the feature is: what the camera tells, and what the joints' motion says between its frames.
+"""The feature from the camera's frames and from the motion of the joints between them.
 
     z ← z + Ĵ Δq(k−d),   p ← p + c² ‖Ĵ‖² ‖Δq(k−d)‖²/n + r²        as far as the arm moved until the exposure
     L = p / (p + σ²),   z ← z + L (y − z),   p ← (1 − L) p               with a valid feature y
 
-A Kalman filter with one variance p for all axes. In motion the Jacobian's error c makes it believe the camera, whether
-or not Ĵ says that the feature moves; at rest it averages: L tends to r/σ. A frame further away than its variance allows
-(a camera that was moved) starts it anew.
+A Kalman filter with one variance p for all axes. In motion the Jacobian's error c makes it follow the camera, whether
+or not Ĵ predicts a motion of the feature; at rest it averages: L tends to r/σ. A frame outside the innovation gate (a
+camera that was moved) restarts it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 
-REST_DRIFT = 1e-4  # r, m: how far z may drift a period at rest
-OUTLIER = 25.0  # ‖y − z‖² over its expectation from which on the camera is right and z wrong
+REST_DRIFT = 1e-4  # [m] r, process noise of z per period at rest
+RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y
 
 
 @final
@@ -42,17 +42,17 @@ class FeatureFilter:
         self.variance = self._noise.variance
 
     def advance(self, jacobian: FloatArray, joint_step: FloatArray, feature: FloatArray | None) -> None:
-        """Go on by a period.
+        """Advance by one period.
 
         Args:
             jacobian: Ĵ, (m, n), m/rad.
             joint_step: Δq, (n,), rad.
-            feature: y, (m,), m; None where no valid one came.
+            feature: y, (m,), m; None where the frame is lost.
         """
         sigma2 = self._noise.variance
         z = self.feature + jacobian @ joint_step
-        unsure = float(np.vdot(jacobian, jacobian)) * float(joint_step @ joint_step) / len(joint_step)
-        p = self.variance + self._model_error**2 * unsure + REST_DRIFT**2
+        uncertainty = float(np.vdot(jacobian, jacobian)) * float(joint_step @ joint_step) / len(joint_step)
+        p = self.variance + self._model_error**2 * uncertainty + REST_DRIFT**2
         if feature is None:
             self.feature, self.variance = z, p
             return
@@ -60,7 +60,7 @@ class FeatureFilter:
         square = float(error @ error) / len(z)
         if self._find_noise:
             self._noise.learn(square, 1.0, p)
-        if square > OUTLIER * (p + sigma2):
+        if square > RESTART_RATIO * (p + sigma2):
             self._restart(feature)
             return
         share = p / (p + sigma2)

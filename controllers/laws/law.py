@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-
-import numpy as np
+from typing import ClassVar, Literal, TypeAlias
 
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimate import Estimate
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Observation
 
+Stage: TypeAlias = Literal["predict", "posture", "limit"]
+
 
 class Law(ABC):
-    """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator."""
+    """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator.
+
+    Attributes:
+        owns: the stages of the chain that the law brings itself, so that a controller may not add another one.
+    """
+
+    owns: ClassVar[frozenset[Stage]] = frozenset({"limit"})
 
     @abstractmethod
     def reset(self, observation: Observation) -> None:
@@ -35,22 +42,3 @@ class Law(ABC):
     @abstractmethod
     def diagnostics(self) -> Diagnostics:
         """Return named numbers about the last command; for the log only."""
-
-
-def largest_excess(joint_velocity: FloatArray, limit: FloatArray) -> float:
-    """Return the largest |u_i| / limit_i of a joint velocity (n,); above 1 some joint exceeds its limit."""
-    return float(np.maximum.reduce(np.abs(joint_velocity) / limit))
-
-
-def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
-    """Shrink a joint velocity until every joint keeps its limit; the direction stays, and so does the path.
-
-    Args:
-        joint_velocity: (..., n), rad/s.
-        limit: (n,), rad/s, positive.
-
-    Returns:
-        (..., n), rad/s.
-    """
-    excess = np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1, keepdims=True)
-    return np.asarray(joint_velocity / np.maximum(excess, 1.0))

@@ -22,7 +22,8 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics
-from servobench.controllers.laws.damped_inverse import damped_inverse
+from servobench.controllers.laws.inverses import damped_inverse
+from servobench.controllers.laws.posture import step_with_posture
 from servobench.controllers.networks.rbf import ControllerNetwork
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Observation
@@ -30,12 +31,12 @@ from servobench.plant.signals import Observation
 
 @dataclass(frozen=True)
 class CorrectionGains:
-    """What the correction needs to know besides the present Jacobian.
+    """The settings of the correction, per period.
 
     Attributes:
         k: step size, 0 ≤ k < 2; 0 learns nothing.
         epsilon: ε, m⁴.
-        leak: l, share of the weights that is forgotten a period.
+        leak: l, share of the weights that is forgotten per period.
         error_share: γ.
         posture_share: κ.
         damping: δ, m/rad.
@@ -93,7 +94,7 @@ class LearnedCorrection:
             jacobian: Ĵ, (m, n), m/rad.
             error: e, (m,), m.
             joint_position: q, (n,), rad.
-            forward: feature step that is made besides, (m,), m: that of the reference, which it leaves the error as is.
+            forward: feedforward feature step (m,), m: the reference's own motion, which does not enter the error.
             learn: whether the weights may be updated.
 
         Returns:
@@ -102,8 +103,7 @@ class LearnedCorrection:
         gains = self._gains
         pinv = damped_inverse(jacobian, gains.damping)
         away = self._posture - joint_position
-        wanted = pinv.dot(gains.error_share * error - gains.posture_share * jacobian.dot(away))
-        wanted += gains.posture_share * away
+        wanted = step_with_posture(pinv, jacobian, gains.error_share * error, away, gains.posture_share)
         following = pinv.dot(forward)
         if gains.k == 0.0:
             return np.asarray(wanted + following)

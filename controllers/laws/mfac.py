@@ -15,7 +15,8 @@ from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law, largest_excess
+from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.limit import largest_excess
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Positive, settings
 from servobench.plant.signals import Observation

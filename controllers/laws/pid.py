@@ -17,8 +17,9 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.damped_inverse import damped_inverse
-from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.laws.inverses import damped_inverse
+from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.limit import scale_to_limit
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import NonNegative, Positive, settings
 from servobench.plant.signals import Observation

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.laws.inverses import project_to_row_space
+from servobench.controllers.laws.law import Law, Stage
+from servobench.controllers.laws.limit import largest_excess, scale_to_limit
+from servobench.controllers.laws.prediction import pushed
 from servobench.controllers.laws.roll_out import (
     RollOut,
     descent_direction,
     roll_out,
     update_step,
 )
-from servobench.controllers.laws.row_space import project_to_row_space
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
 from servobench.plant.checks import FloatArray
@@ -67,6 +69,8 @@ class RbfnnLaw(Law):
     - Without a valid feature nothing is learned; the last error is held.
     """
 
+    owns: ClassVar[frozenset[Stage]] = frozenset({"posture", "limit"})
+
     def __init__(self, config: RbfnnConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
         """Take the settings, the offline networks, limits, period and preview.
 
@@ -114,9 +118,9 @@ class RbfnnLaw(Law):
     def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return u, (n,), rad/s; see `Law.command`."""
         config, network, jacobian = self._config, self._network, estimate.jacobian
-        self._errors = _pushed(self._errors, reference[0] - observation.feature, network.error_history)
+        self._errors = pushed(self._errors, reference[0] - observation.feature, network.error_history)
         if self._positions is None or config.position == "measured":
-            self._positions = _pushed(self._positions, observation.joint_position, network.position_history)
+            self._positions = pushed(self._positions, observation.joint_position, network.position_history)
         if config.row_space_only:
             self._learned = project_to_row_space(self._learned, jacobian)
         history, reference_steps = (self._errors, self._positions), self._reference_steps(reference)
@@ -124,7 +128,7 @@ class RbfnnLaw(Law):
         wanted = self._wanted = self._learn(jacobian, ahead) if observation.feature_valid else ahead.wanted
         step = scale_to_limit(wanted, self._step_limit)
         if config.position == "commanded":
-            self._positions = _pushed(self._positions, self._positions[0] + step, network.position_history)
+            self._positions = pushed(self._positions, self._positions[0] + step, network.position_history)
         return step / self._period
 
     def diagnostics(self) -> Diagnostics:
@@ -135,7 +139,7 @@ class RbfnnLaw(Law):
             "predicted_error": float(np.linalg.norm(self._ahead.errors[-1])) if self._ahead else 0.0,
             "controller_weight_norm": float(np.linalg.norm(self.weights)),
             "learned_weight_norm": float(np.linalg.norm(self._learned)),
-            "saturated": float(self._excess(self._wanted) > 1.0),
+            "saturated": float(largest_excess(self._wanted, self._step_limit) > 1.0),
         }
 
     def _reference_steps(self, reference: FloatArray) -> FloatArray:
@@ -152,20 +156,10 @@ class RbfnnLaw(Law):
         direction = descent_direction(jacobian, ahead)
         alpha = update_step(direction, ahead, self._config.k, self._config.epsilon)
         renewed = ahead.wanted + alpha * controller_output(direction, ahead.xi[0], ahead.h[0])
-        before = self._excess(ahead.wanted)
-        if self._config.anti_windup and before > 1.0 and self._excess(renewed) > before:
+        before = largest_excess(ahead.wanted, self._step_limit)
+        if self._config.anti_windup and before > 1.0 and largest_excess(renewed, self._step_limit) > before:
             self._step_size = 0.0
             return ahead.wanted
         self._step_size = alpha
         self._learned = self._learned + alpha * direction
         return renewed
-
-    def _excess(self, step: FloatArray) -> float:
-        return float(np.maximum.reduce(np.abs(step) / self._step_limit))
-
-
-def _pushed(history: FloatArray | None, newest: FloatArray, length: int) -> FloatArray:
-    """Return the history (length, …), the newest first; a first value fills it."""
-    if history is None:
-        return np.repeat(newest[None], length, axis=0)
-    return np.concatenate([newest[None], history[:-1]])

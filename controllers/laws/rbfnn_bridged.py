@@ -13,22 +13,20 @@ model that its networks were trained on. What exceeds the limits of joint speed 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, final
+from typing import Annotated, ClassVar, Literal, final
 
 import numpy as np
 from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import MAX_DELAY, Estimate
-from servobench.controllers.laws.damped_inverse import damped_inverse
-from servobench.controllers.laws.feature_filter import FeatureFilter
-from servobench.controllers.laws.joint_response import JointResponse
-from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.inverses import damped_inverse
+from servobench.controllers.laws.law import Law, Stage
 from servobench.controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
+from servobench.controllers.laws.limit import largest_excess, redistribute, scale_to_limit
+from servobench.controllers.laws.prediction import Predictor, shifted
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
-from servobench.controllers.laws.redistribution import redistribute
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.noise_level import NoiseLevel
 from servobench.controllers.rotation import nearest_rotation
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Count, NonNegative, Positive, Share, settings
@@ -102,6 +100,8 @@ class RbfnnBridgedLaw(Law):
     beyond the preview it goes on as in its last period.
     """
 
+    owns: ClassVar[frozenset[Stage]] = frozenset({"predict", "posture", "limit"})
+
     def __init__(self, config: RbfnnBridgedConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
         """Take the settings, the offline networks, limits, period and preview.
 
@@ -128,20 +128,22 @@ class RbfnnBridgedLaw(Law):
             posture = centres.mean(axis=(0, 1))
             self._law = LearnedCorrection(config.gains(spec.period), network, posture, self._limit)
         self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
-        self._forget()
-
-    def _forget(self) -> None:
-        self._response = JointResponse(self._config.response_length, self._n)
-        self._filter: FeatureFilter | None = None
-        self._noise = NoiseLevel(self._config.feature_noise)
-        self._filtered_delay = 0
-        self._past: FloatArray | None = None  # q(k), q(k−1), …
+        self._predictor = Predictor(
+            spec.n,
+            bridge=config.bridge,
+            response_length=config.response_length,
+            observe=config.observe,
+            feature_noise=config.feature_noise,
+            find_noise=config.find_noise,
+            model_error=config.model_error,
+        )
         self._wanted = np.zeros(self._n)
 
     def reset(self, observation: Observation) -> None:
         """Forget everything that was learned and seen."""
         self._law.reset(observation)
-        self._forget()
+        self._predictor.reset()
+        self._wanted = np.zeros(self._n)
 
     def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return u, (n,), rad/s; see `Law.command`.
@@ -149,52 +151,24 @@ class RbfnnBridgedLaw(Law):
         Raises:
             ValueError: a delay beyond what the law keeps of the past.
         """
-        if not 0 <= estimate.delay <= MAX_DELAY:
-            raise ValueError(f"delay must be from 0 to {MAX_DELAY} periods, got {estimate.delay}")
-        config, jacobian = self._config, estimate.jacobian
-        past = self._extended_past(observation.joint_position)
-        delay, flight, lead = 0, np.zeros(self._n), 0.0
-        if config.bridge:
-            self._response.learn(past[0] - past[1])
-            delay, flight, lead = estimate.delay, self._response.flight(), self._response.lead
-        seen = self._seen(jacobian, past, delay, observation)
-        ahead, q = seen + jacobian @ (past[0] - past[delay] + flight), past[0] + flight
-        wanted = self._wanted = self._wanted_step(jacobian, ahead, q, shifted(reference, lead, self._rows), observation)
+        config, J = self._config, estimate.jacobian
+        bound = self._predictor.predict(estimate, observation)
+        ahead = shifted(reference, bound.lead, self._rows)
+        wanted = self._wanted = self._wanted_step(J, bound.feature, bound.joint_position, ahead, observation)
         if config.redistribute:
             lower, upper = self._region
-            further = np.maximum(q - lower, 0.0), np.maximum(upper - q, 0.0)
-            dq = redistribute(wanted, jacobian, self._limit, config.damping, further)
+            further = np.maximum(bound.joint_position - lower, 0.0), np.maximum(upper - bound.joint_position, 0.0)
+            dq = redistribute(wanted, J, self._limit, config.damping, further)
         else:
             dq = scale_to_limit(wanted, self._limit)
-        self._response.command(dq)
+        self._predictor.note(dq)
         return dq / self._period
 
     def diagnostics(self) -> Diagnostics:
         """Return criterion, α, predicted error, norm of what was learned, lead (periods), saturation."""
-        told = self._law.diagnostics()
-        saturated = float(np.max(np.abs(self._wanted) / self._limit) > 1.0)
-        lead = self._response.lead if self._config.bridge else 0.0
-        return {**{name: told[name] for name in LEARNED}, "lead": lead, "saturated": saturated}
-
-    def _extended_past(self, joint_position: FloatArray) -> FloatArray:
-        if self._past is None:  # the arm was at rest
-            self._past = np.repeat(joint_position[None], MAX_DELAY + 2, axis=0)
-        else:
-            self._past = np.concatenate([joint_position[None], self._past[:-1]])
-        return self._past
-
-    def _seen(self, jacobian: FloatArray, past: FloatArray, delay: int, observation: Observation) -> FloatArray:
-        """Return z, (m,), m: where the feature was at its exposure, `delay` periods ago."""
-        config, y = self._config, observation.feature
-        if not config.observe:
-            return y
-        if self._filter is None or delay != self._filtered_delay:
-            self._filter = FeatureFilter(self._noise, config.model_error, y, find_noise=config.find_noise)
-            self._filtered_delay = delay
-        else:
-            step = past[delay] - past[delay + 1]
-            self._filter.advance(jacobian, step, y if observation.feature_valid else None)
-        return self._filter.feature
+        learned = self._law.diagnostics()
+        saturated = float(largest_excess(self._wanted, self._limit) > 1.0)
+        return {**{name: learned[name] for name in LEARNED}, "lead": self._predictor.lead, "saturated": saturated}
 
     def _wanted_step(
         self, jacobian: FloatArray, y: FloatArray, q: FloatArray, reference: FloatArray, observation: Observation
@@ -217,22 +191,3 @@ class RbfnnBridgedLaw(Law):
         if not self._config.frame:
             return np.eye(self._m)
         return nearest_rotation(self._model.jacobian(q) @ jacobian.T)
-
-
-def shifted(reference: FloatArray, lead: float, rows: int) -> FloatArray:
-    """Return the reference `lead` periods later, (rows, m): interpolated, and extrapolated beyond its end.
-
-    Args:
-        reference: (1 + preview, m), m.
-        lead: periods, at least 0.
-        rows: how many instants are wanted, at most 1 + preview.
-    """
-    if lead == 0.0 or len(reference) == 1:
-        return reference[:rows]
-    whole = int(lead)
-    missing = whole + rows + 1 - len(reference)
-    if missing > 0:
-        further = np.arange(1, missing + 1)[:, None] * (reference[-1] - reference[-2])
-        reference = np.concatenate([reference, reference[-1] + further])
-    before = reference[whole : whole + rows]
-    return np.asarray(before + (lead - whole) * (reference[whole + 1 : whole + 1 + rows] - before))

@@ -24,8 +24,8 @@ from servobench.plant.checks import FloatArray
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
-LARGEST_EXPONENT = 60.0
-LOWEST_EXPONENT = np.array(-LARGEST_EXPONENT)
+MAX_EXPONENT = 60.0
+MIN_EXPONENT = np.array(-MAX_EXPONENT)
 
 
 def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) -> FloatArray:
@@ -41,7 +41,7 @@ def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) ->
     """
     offset = q[..., None, None, :] - centres
     exponent = np.einsum("...k,...k->...", offset, offset) / widths**2
-    return np.asarray(np.exp(-np.minimum(exponent, LARGEST_EXPONENT)))
+    return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
 
 
 def jacobian_output(weights: FloatArray, theta: FloatArray) -> FloatArray:
@@ -65,7 +65,7 @@ def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, ker
     offset = xi[..., None, :] - centres
     square = np.einsum("...p,...p->...", offset, offset)
     exponent = (square if kernel == "gaussian" else np.sqrt(square)) / widths**2
-    return np.asarray(np.exp(-np.minimum(exponent, LARGEST_EXPONENT)))
+    return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
 
 
 def controller_output(weights: FloatArray, xi: FloatArray, h: FloatArray) -> FloatArray:
@@ -142,7 +142,7 @@ class JacobianNetwork:
         offset = q[..., None, None, :] - centres
         offset *= offset
         theta: FloatArray = offset.dot(ones) * decay
-        np.maximum(theta, LOWEST_EXPONENT, out=theta)
+        np.maximum(theta, MIN_EXPONENT, out=theta)
         return np.exp(theta, out=theta)
 
     def jacobian(self, q: FloatArray) -> FloatArray:
@@ -231,7 +231,7 @@ class ControllerNetwork:
         if self.kernel == "exponential":
             np.sqrt(h, out=h)
         h *= decay
-        np.maximum(h, LOWEST_EXPONENT, out=h)
+        np.maximum(h, MIN_EXPONENT, out=h)
         return np.exp(h, out=h)
 
     def command(self, xi: FloatArray) -> FloatArray:

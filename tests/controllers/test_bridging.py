@@ -5,11 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kit.toy import PERIOD, A, M, N, ToyArm
+from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.feature_filter import FeatureFilter
 from servobench.controllers.laws.joint_response import JointResponse
-from servobench.controllers.laws.law import scale_to_limit
-from servobench.controllers.laws.rbfnn_bridged import shifted
-from servobench.controllers.laws.redistribution import redistribute
+from servobench.controllers.laws.limit import redistribute, scale_to_limit
+from servobench.controllers.laws.prediction import Predictor, shifted
 from servobench.controllers.noise_level import NoiseLevel
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
@@ -151,6 +152,32 @@ def test_a_feature_far_off_starts_the_filter_anew():
     made = FeatureFilter(NoiseLevel(0.001), 0.2, np.zeros(2), find_noise=True)
     made.advance(np.eye(2), np.zeros(2), np.array([0.3, 0.1]))
     np.testing.assert_array_equal(made.feature, [0.3, 0.1])
+
+
+def test_the_prediction_is_where_the_arm_ends_up_once_its_response_is_known():
+    arm, predictor, rng = (
+        ToyArm(np.eye(M), (0.0, 0.6, 0.4), latency=2),
+        Predictor(N, observe=False),
+        np.random.default_rng(0),
+    )
+    observation = arm.observe()
+    for k in range(40):
+        bound = predictor.predict(Estimate(A, delay=2), observation)
+        if k > 20:
+            np.testing.assert_allclose(bound.feature, arm.end(), atol=1e-3)
+            assert np.linalg.norm(arm.end() - observation.feature) > 3e-3
+            assert bound.lead == pytest.approx(1.4, abs=0.05)
+        step = 0.05 * rng.uniform(-1.0, 1.0, N)
+        predictor.note(step)
+        observation = arm.step(step / PERIOD)
+
+
+def test_with_both_halves_off_the_prediction_is_the_measurement():
+    off, look = Predictor(N, bridge=False, observe=False), ToyArm(np.eye(M)).observe()
+    bound = off.predict(Estimate(A, delay=3), look)
+    np.testing.assert_array_equal(bound.feature, look.feature)
+    np.testing.assert_array_equal(bound.joint_position, look.joint_position)
+    assert bound.lead == 0.0
 
 
 def test_the_shifted_reference_is_interpolated_and_goes_on():

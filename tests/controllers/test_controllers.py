@@ -150,6 +150,18 @@ def test_a_row_of_the_table_may_change_defaults_of_its_law():
     assert not compose("pid", "true").config().law.feedforward
 
 
+def test_predictive_and_learning_laws_declare_the_stages_that_they_bring():
+    owned = {name: sorted(part.make.owns - {"limit"}) for name, part in LAWS.items()}
+    expected = {
+        "pid": [],
+        "mfac": [],
+        "mpc": ["predict"],
+        "rbfnn": ["posture"],
+        "rbfnn_bridged": ["posture", "predict"],
+    }
+    assert owned == expected
+
+
 def test_a_pair_is_called_by_its_parts_and_has_a_training_only_with_networks():
     assert compose("pid", "rls").name == "pid+rls"
     assert [f.name for f in dataclasses.fields(compose("pid", "rls").config())] == ["estimator", "law", "initial"]

@@ -172,7 +172,7 @@ def test_the_weighted_error_of_the_map_falls_by_each_innovation():
     for k in range(80):
         before = weighted()
         feed(made, q[k : k + 2], y[k : k + 2])
-        fall = made._surprise * M
+        fall = made._nis * M
         moved += fall
         assert weighted() <= before - fall + 1e-9 * (1.0 + before)
     assert moved > 1.0

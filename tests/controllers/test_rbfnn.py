@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kit.toy import only_controller
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import scale_to_limit
+from servobench.controllers.laws.limit import scale_to_limit
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.laws.roll_out import (
     RollOut,

@@ -10,7 +10,7 @@ from kit.toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, SPEC, A, M, N, ToyArm, ne
 from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
-from servobench.controllers.laws.damped_inverse import damped_inverse
+from servobench.controllers.laws.inverses import damped_inverse
 from servobench.controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
 from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, update_step

@@ -10,6 +10,8 @@ from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.controllers.laws.prediction import Prediction, Predictor
 from servobench.controllers.servo import ServoController
 from servobench.plant.faults import ControllerDiverged
 from servobench.plant.signals import Observation, PlantSpec
@@ -47,9 +49,9 @@ class Broken(Law):
         return {}
 
 
-def servo(estimator, law=None):
+def servo(estimator, law=None, predictor=None):
     law = MfacLaw(MfacConfig(), KNOWLEDGE) if law is None else law
-    return ServoController(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE)
+    return ServoController(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE, predictor)
 
 
 def seen(k, q, y, valid=True):
@@ -125,3 +127,32 @@ def test_observations_and_references_of_the_wrong_size_are_refused():
         controller.step(first, np.zeros((1, 2)))
     with pytest.raises(ValueError, match="reference must be finite"):
         controller.step(first, np.full((2, 2), np.nan))
+
+
+def test_a_predictor_stands_before_the_law_and_gets_the_command():
+    seen = []
+
+    class Doubling:
+        def reset(self):
+            seen.append("reset")
+
+        def predict(self, estimate, observation):
+            return Prediction(2.0 * observation.feature, observation.joint_position, 1.0)
+
+        def note(self, joint_step):
+            seen.append(joint_step)
+
+    controller, law = servo(ConstantEstimator(), predictor=Doubling()), MfacLaw(MfacConfig(), KNOWLEDGE)
+    first = Observation(0.0, np.zeros(3), np.array([0.1, 0.0]))
+    controller.reset(first, 0)
+    u = controller.step(first, np.array([[0.0, 0.0], [0.3, 0.2]])).joint_velocity
+    doubled = Observation(0.0, np.zeros(3), np.array([0.2, 0.0]))
+    np.testing.assert_array_equal(u, law.command(Estimate(J0), doubled, np.array([[0.3, 0.2], [0.6, 0.4]])))
+    assert seen[0] == "reset"
+    np.testing.assert_array_equal(seen[1], u * 0.05)
+
+
+def test_a_second_predict_stage_is_refused():
+    law = MpcLaw(MpcConfig(use_preview=False), KNOWLEDGE)
+    with pytest.raises(ValueError, match="predictor must be None for MpcLaw, which predicts itself"):
+        servo(ConstantEstimator(), law, Predictor(3))

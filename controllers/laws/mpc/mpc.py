@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Annotated, Final, Literal, final
+from typing import Annotated, ClassVar, Final, Literal, final
 
 import numpy as np
 from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law, scale_to_limit
+from servobench.controllers.laws.law import Law, Stage
+from servobench.controllers.laws.limit import scale_to_limit
 from servobench.controllers.laws.mpc.closed_form import (
     constant_step,
     decay_targets,
@@ -101,6 +102,8 @@ class MpcLaw(Law):
     ahead, ŷ(k+d) = y + Ĵ Σ of the last d steps sent; the paper has d = 0. A position or view limit that is already
     violated may not get worse, so that noise alone never makes the program infeasible.
     """
+
+    owns: ClassVar[frozenset[Stage]] = frozenset({"predict", "limit"})
 
     def __init__(self, config: MpcConfig, knowledge: RobotKnowledge) -> None:
         """Build the quadratic program.
