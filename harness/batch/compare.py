@@ -1,31 +1,27 @@
-"""Many runs: every plant with every controller, task, mismatch and seed, side by side on worker processes."""
+"""The runs of a comparison: every plant with every controller, task, mismatch and seed; and which seeds are for what.
+
+A run's seed decides its true robot, its task and its noise. Methods are tuned on the seeds `TUNING` and judged on all
+others, so that no method is judged by a robot on which it was tuned.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
-from typing import Any
-
-import joblib
-from joblib.externals.loky import get_reusable_executor
+from typing import Final
 
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.batch import results
-from servobench.harness.batch.seed_ranges import refuse_tuning_seeds
-from servobench.harness.batch.workers import leave_interrupts_to_parent
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment, known_sections
 from servobench.harness.run.request import RunRequest, read_mismatch
 
-PICTURES = "pictures"
+TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The runs of a comparison: all combinations of these, in this order."""
+    """All combinations of these."""
 
     plants: tuple[str, ...]
     controllers: tuple[str, ...]
@@ -80,12 +76,12 @@ def check_batch(
 ) -> None:
     """Build every plant, controller, task and mismatch once, so that a bad one is refused before anything is written.
 
-    Networks that controllers need are trained on the way.
+    Networks that controllers need are trained.
 
     Args:
         batch: what will be run.
         settings: overrides of the defaults.
-        progress: told how far a training of networks is.
+        progress: receives how much of a training of networks is done.
         noise_factor: on the plants' sensor noise.
         latency_periods: of the camera; None for what a plant is configured with.
 
@@ -105,45 +101,55 @@ def check_batch(
         ]
     )
     for request in requests:
-        build_experiment(request, settings, progress=progress).plant.close()
+        build_once(request, settings, progress)
 
 
-def run_batch(
-    requests: Sequence[RunRequest], settings: Settings, folder: Path, workers: int
-) -> Iterator[dict[str, Any]]:
-    """Carry out `requests` and yield each run's row as it finishes; every finished run is on disk by then.
+def build_once(request: RunRequest, settings: Settings, progress: Progress | None = None) -> None:
+    """Build a run and throw it away: this refuses what is configured wrongly, and trains networks.
 
-    Args:
-        requests: the runs.
-        settings: overrides of the defaults.
-        folder: a results folder made by `results.create_folder`.
-        workers: number of processes; with 1 the runs happen in this one.
+    Whatever else fails is left to the run, whose row says so.
+
+    Raises:
+        ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    pictured = min(request.seed for request in requests)
-    parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)
-    jobs = (
-        joblib.delayed(_carry_out)(index, request, settings, folder, request.seed == pictured, workers > 1)
-        for index, request in enumerate(requests)
-    )
     try:
-        yield from parallel(jobs)
-    finally:
-        if workers > 1:  # idle workers would keep their memory while tables and pictures are made
-            get_reusable_executor().shutdown(wait=True)
+        build_experiment(request, settings, progress=progress).plant.close()
+    except ConfigurationError:
+        raise
+    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
+        return
 
 
-def _carry_out(
-    index: int, request: RunRequest, settings: Settings, folder: Path, picture: bool, in_worker: bool
-) -> dict[str, Any]:
-    if in_worker:
-        leave_interrupts_to_parent()
-    result = run_experiment(request, settings, picture=picture, keep=folder)
-    if result.steps is not None:
-        results.write_part(folder, index, result.row, result.steps)
-    if result.picture is not None:
-        (folder / PICTURES).mkdir(exist_ok=True)
-        import cv2  # noqa: PLC0415 - only the extra bullet brings it
+def tuning_seeds(count: int, offset: int = 0) -> tuple[int, ...]:
+    """Return `count` seeds of the tuning range that begin `offset` after its first.
 
-        large = cv2.resize(result.picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-        cv2.imwrite(str(folder / PICTURES / f"{request.run_id}.png"), cv2.cvtColor(large, cv2.COLOR_RGB2BGR))
-    return result.row
+    Raises:
+        ConfigurationError: fewer than one, or some of them outside the range.
+    """
+    if count < 1:
+        raise ConfigurationError(f"the number of tuning seeds must be at least 1, got {count}")
+    if offset < 0 or offset + count > len(TUNING):
+        raise ConfigurationError(
+            f"{count} seeds from {TUNING.start + offset} on leave the tuning range {_words()}; "
+            f"count and offset must not be negative and together at most {len(TUNING)}"
+        )
+    return tuple(TUNING[offset : offset + count])
+
+
+def refuse_tuning_seeds(seeds: Iterable[int]) -> None:
+    """Refuse to judge methods by robots on which they were tuned.
+
+    Raises:
+        ConfigurationError: names the first seed of the tuning range and says what to take instead.
+    """
+    found = [seed for seed in seeds if seed in TUNING]
+    if found:
+        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+        raise ConfigurationError(
+            f"seed {found[0]}{more} cannot be used to judge: {_words()} are kept for tuning; "
+            f"take seeds below {TUNING.start} or from {TUNING.stop} on"
+        )
+
+
+def _words() -> str:
+    return f"{TUNING.start}:{TUNING.stop}"

@@ -28,7 +28,7 @@ PACKAGES = (
     "casadi",
     "fmpy",
     "opencv-python-headless",
-    "joblib",
+    "pebble",
 )
 
 

@@ -1,31 +1,86 @@
 """A folder of results: `runs.parquet` (a row a run), `steps.parquet` (a row a period), `manifest.json`.
 
-While a batch is under way every finished run is a pair of files below `parts/`, each written under another name and
-then renamed, steps first: what is there is whole. At the end they are put together. If the batch was killed,
-`load_runs` and `load_steps` read the parts, and `collect` puts together what there is.
+While runs are under way, finished ones lie below `parts/`: a pair of files for each run or chunk of runs, each written
+atomically, steps first, so that a part counts once its rows are there. At the end the parts are put together. If the
+process was killed, `load_runs` and `load_steps` read the parts, and `collect` puts together what there is.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import pyarrow as pa
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.files import write_atomically
 
-SCHEMA_VERSION = "2"
+if TYPE_CHECKING:
+    from servobench.harness.run.episode import RunResult
+    from servobench.plant.plant import ImageArray
+
+SCHEMA_VERSION = "3"
 PARTS = "parts"
+PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 MANIFEST = "manifest.json"
+LOCK = ".lock"
+
+
+@contextlib.contextmanager
+def locked(folder: Path, *, new: bool = False) -> Iterator[None]:
+    """Keep other processes from writing the same folder; the lock of a process that died does not count.
+
+    Args:
+        folder: made if needed.
+        new: refuse a folder with anything in it.
+
+    Raises:
+        ConfigurationError: another process writes the folder, it has something in it, or it cannot be made.
+    """
+    if new:
+        _check_empty(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("a")
+    except OSError as error:
+        raise ConfigurationError(f"results folder {folder} cannot be made: {error.strerror}") from error
+    with file:
+        if not _lock(file.fileno()):
+            raise ConfigurationError(f"results folder {folder} is being written by another process")
+        try:
+            yield
+        finally:
+            (folder / LOCK).unlink(missing_ok=True)
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file as long as it is open; return whether that was possible."""
+    try:
+        import fcntl  # noqa: PLC0415 - not on Windows
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return os.fstat(descriptor).st_nlink > 0  # another process held this file and has removed it since
+
+
+def _check_empty(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
+        raise ConfigurationError(f"results folder {folder} exists already; name another one with --out")
 
 
 def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
@@ -34,8 +89,7 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
     Raises:
         ConfigurationError: the folder has something in it, or cannot be made.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigurationError(f"results folder {folder} exists already; name another one with --out")
+    _check_empty(folder)
     try:
         (folder / PARTS).mkdir(parents=True)
         write_manifest(folder, manifest)
@@ -44,11 +98,9 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    """Write `manifest.json`, whole or not at all; JSON has no infinity, so that a setting without limit reads "inf"."""
-    partial = folder / f".{MANIFEST}"
+    """Write `manifest.json` atomically; JSON has no infinity, so a setting without limit reads "inf"."""
     content = json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2, allow_nan=False)
-    partial.write_text(content + "\n", encoding="utf-8")
-    partial.replace(folder / MANIFEST)
+    write_atomically(folder / MANIFEST, lambda file: file.write_text(content + "\n", encoding="utf-8"))
 
 
 def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
@@ -59,23 +111,30 @@ def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_part(folder: Path, index: int, row: dict[str, Any], steps: pd.DataFrame) -> None:
-    """Write one finished run; the row comes last and makes it count."""
-    stem = f"{index:08d}"
-    if len(steps):
-        _write_table(pa.Table.from_pandas(steps, preserve_index=False), folder / PARTS / f"{stem}.{STEPS}")
-    _write_table(pa.Table.from_pylist([row]), folder / PARTS / f"{stem}.{RUNS}")
-
-
-def write_rows(folder: Path, index: int, rows: list[dict[str, Any]]) -> None:
-    """Write several finished runs without their steps as one part.
+def write_part(folder: Path, index: int, outcome: Sequence[RunResult]) -> None:
+    """Write finished runs as one part, pictures and steps before the rows that make it count.
 
     Args:
         folder: a results folder.
         index: of the first of them among all runs.
-        rows: rows of the table of runs, in order.
+        outcome: results of consecutive runs.
     """
-    _write_table(pa.Table.from_pandas(pd.DataFrame(rows), preserve_index=False), folder / PARTS / f"{index:08d}.{RUNS}")
+    for result in outcome:
+        if result.picture is not None:
+            _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result.picture)
+    steps = [result.steps for result in outcome if result.steps is not None and len(result.steps)]
+    if steps:
+        _write_frame(pd.concat(steps, ignore_index=True), folder / PARTS / f"{index:08d}.{STEPS}")
+    _write_frame(pd.DataFrame([result.row for result in outcome]), folder / PARTS / f"{index:08d}.{RUNS}")
+
+
+def _write_picture(path: Path, picture: ImageArray) -> None:
+    import cv2  # noqa: PLC0415 - only the extra bullet brings it
+
+    path.parent.mkdir(exist_ok=True)
+    large = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    content = cv2.imencode(".png", cv2.cvtColor(large, cv2.COLOR_RGB2BGR))[1].tobytes()
+    write_atomically(path, lambda file: file.write_bytes(content))
 
 
 def write_summary(folder: Path, tables: dict[str, pd.DataFrame], manifest: dict[str, Any]) -> None:
@@ -87,17 +146,18 @@ def write_summary(folder: Path, tables: dict[str, pd.DataFrame], manifest: dict[
         manifest: of the whole.
     """
     runs = pd.concat([table.assign(part=name) for name, table in tables.items()], ignore_index=True)
-    _write_table(pa.Table.from_pandas(runs, preserve_index=False), folder / RUNS)
+    _write_frame(runs, folder / RUNS)
     write_manifest(folder, manifest)
 
 
-def finished_parts(folder: Path) -> set[int]:
-    """Return the indices of the parts that are there."""
-    return {int(path.name.split(".")[0]) for path in _part_files(folder, RUNS)}
+def finished_runs(folder: Path) -> set[int]:
+    """Return the indices of the runs whose part is there."""
+    begins = ((int(path.name.split(".")[0]), pq.read_metadata(path).num_rows) for path in _part_files(folder, RUNS))
+    return {index for begin, count in begins for index in range(begin, begin + count)}
 
 
 def collect(folder: Path) -> int:
-    """Put the parts together into the two tables and, unless runs of a sweep are missing, remove them.
+    """Put the parts together into the two tables and, unless runs are missing, remove them.
 
     Returns:
         Number of runs.
@@ -114,9 +174,10 @@ def collect(folder: Path) -> int:
     row_files = _part_files(folder, RUNS)
     if not row_files:
         raise ConfigurationError(f"{folder} holds no finished run")
-    step_files = [path for path in (_steps_of(path) for path in row_files) if path.is_file()]
-    _concatenate(step_files, folder / STEPS)
-    _concatenate(row_files, folder / RUNS)
+    for kind in (STEPS, RUNS):
+        data = _dataset(_part_files(folder, kind))
+        if data is not None:
+            write_atomically(folder / kind, partial(_write_batches, data))
     count = int(pq.read_metadata(folder / RUNS).num_rows)
     if count >= wanted:
         shutil.rmtree(folder / PARTS)
@@ -130,7 +191,7 @@ def load_runs(folder: Path) -> pd.DataFrame:
         ConfigurationError: not a results folder, or one of another schema.
     """
     check_folder(folder)
-    return _join(_tables(folder, RUNS))
+    return _load(folder, RUNS)
 
 
 def load_steps(folder: Path, run_ids: list[str] | None = None) -> pd.DataFrame:
@@ -140,8 +201,7 @@ def load_steps(folder: Path, run_ids: list[str] | None = None) -> pd.DataFrame:
         ConfigurationError: not a results folder, or one of another schema.
     """
     check_folder(folder)
-    filters = None if run_ids is None else [("run_id", "in", run_ids)]
-    steps = _join(_tables(folder, STEPS, filters))
+    steps = _load(folder, STEPS, None if run_ids is None else ds.field("run_id").isin(run_ids))
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
     return steps
@@ -190,45 +250,34 @@ def point_latest(folder: Path) -> None:
 
 
 def _part_files(folder: Path, kind: str) -> list[Path]:
-    return sorted((folder / PARTS).glob(f"[0-9]*.{kind}"))
+    """Return the files of one kind of the parts that count, in order."""
+    rows = sorted((folder / PARTS).glob(f"[0-9]*.{RUNS}"))
+    files = [path.with_name(path.name.removesuffix(RUNS) + kind) for path in rows]
+    return [path for path in files if path.is_file()]
 
 
-def _steps_of(row_file: Path) -> Path:
-    return row_file.with_name(row_file.name.removesuffix(RUNS) + STEPS)
+def _load(folder: Path, kind: str, only: ds.Expression | None = None) -> pd.DataFrame:
+    data = _dataset([folder / kind] if (folder / kind).is_file() else _part_files(folder, kind))
+    if data is None:
+        return pd.DataFrame()
+    table: pd.DataFrame = data.to_table(filter=only).to_pandas()
+    return table
 
 
-def _tables(folder: Path, kind: str, filters: list[tuple[str, str, Any]] | None = None) -> Iterator[pa.Table]:
-    whole = folder / kind
-    paths = [whole] if whole.is_file() else _part_files(folder, kind)
-    for path in paths:
-        yield pq.read_table(path, filters=filters)
-
-
-def _join(tables: Iterator[pa.Table]) -> pd.DataFrame:
-    frames: list[pd.DataFrame] = [table.to_pandas() for table in tables]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame()
-
-
-def _write_table(table: pa.Table, path: Path) -> None:
-    partial = path.with_name(f".{path.name}")
-    pq.write_table(table, partial)
-    partial.replace(path)
-
-
-def _concatenate(paths: list[Path], target: Path) -> None:
-    """Write the tables in `paths` into one file, one in memory at a time; columns that a table lacks become null."""
+def _dataset(paths: Sequence[Path]) -> ds.Dataset | None:
+    """Return tables as one with the columns of all; what a table lacks is null. None where there is no table."""
     if not paths:
-        return
-    schema = pa.unify_schemas([pq.read_schema(path).remove_metadata() for path in paths], promote_options="permissive")
-    partial = target.with_name(f".{target.name}")
-    with pq.ParquetWriter(partial, schema) as writer:
-        for path in paths:
-            table = pq.read_table(path)
-            columns = [
-                table[field.name].cast(field.type)
-                if field.name in table.column_names
-                else pa.nulls(len(table), field.type)
-                for field in schema
-            ]
-            writer.write_table(pa.table(columns, schema=schema))
-    partial.replace(target)
+        return None
+    schemas = [pq.read_schema(path).remove_metadata() for path in paths]
+    return ds.dataset([str(path) for path in paths], pa.unify_schemas(schemas, promote_options="permissive"))
+
+
+def _write_batches(data: ds.Dataset, path: Path) -> None:
+    """Write a table without holding all of it in memory."""
+    with pq.ParquetWriter(path, data.schema) as writer:
+        for batch in data.to_batches(batch_readahead=1, fragment_readahead=1):
+            writer.write_batch(batch)
+
+
+def _write_frame(frame: pd.DataFrame, path: Path) -> None:
+    write_atomically(path, lambda file: pq.write_table(pa.Table.from_pandas(frame, preserve_index=False), file))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -15,24 +16,22 @@ from rich.table import Table
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.analysis.tables import SUMMARY_LEGEND, summary_tables
 from servobench.harness.batch import results
-from servobench.harness.batch.compare import (
-    Batch,
-    check_batch,
-    parse_seeds,
-    run_batch,
-)
-from servobench.harness.batch.manifest import describe_batch
-from servobench.harness.batch.workers import default_workers
+from servobench.harness.batch.campaign import Campaign, carry_out, comparison
+from servobench.harness.batch.compare import Batch, parse_seeds
 from servobench.harness.cli.claims import claims
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.options import (
     INTERRUPTED,
     ConfigOption,
+    ResumeOption,
+    SchedulerOption,
     SetOption,
+    TimeoutOption,
+    WorkersOption,
     split_names,
     split_words,
 )
-from servobench.harness.cli.progress import run_progress
+from servobench.harness.cli.progress import ConsoleObserver, run_progress
 from servobench.harness.cli.robustness import robustness
 from servobench.harness.cli.show import make_report, record, report, statistics
 from servobench.harness.cli.sweep import sweep
@@ -47,7 +46,6 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.settings import (
     ConfigurationError,
-    Settings,
     flatten,
     read_settings,
 )
@@ -119,17 +117,20 @@ def run(
         assignments.append("bullet.view=true")
     name = f"{controller}+{estimator}" if estimator else controller
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
-    _carry_out(batch, read_settings(config, assignments), 1, out, with_report=with_report)
+    _carry_out(comparison(batch, read_settings(config, assignments)), out, with_report=with_report, workers=1)
 
 
 @app.command()
 def compare(
-    plants: Annotated[str, typer.Option(help="Names by comma, or all.")] = "kinematic",
-    controllers: Annotated[str, typer.Option(help="Names by comma, or all.")] = "all",
-    tasks: Annotated[str, typer.Option(help="Names by comma.")] = "exp1,exp2,exp3,exp4,circle",
-    mismatch: Annotated[str, typer.Option(help="Mismatches by comma.")] = "moderate",
+    plants: Annotated[str, typer.Option(help="Comma-separated names, or all.")] = "kinematic",
+    controllers: Annotated[str, typer.Option(help="Comma-separated names, or all.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Comma-separated names.")] = "exp1,exp2,exp3,exp4,circle",
+    mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
     seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "1",
-    workers: Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    run_timeout: TimeoutOption = None,
+    resume: ResumeOption = False,
     set_: SetOption = None,
     config: ConfigOption = None,
     out: OutOption = None,
@@ -143,8 +144,12 @@ def compare(
         split_words(mismatch),
         parse_seeds(seeds),
     )
-    count = workers or default_workers()
-    _carry_out(batch, read_settings(config, set_ or []), count, out, with_report=with_report)
+    if resume and out is None:
+        raise ConfigurationError("--resume needs --out, the folder to continue in")
+    _carry_out(
+        comparison(batch, read_settings(config, set_ or [])), out, with_report=with_report, workers=workers,
+        scheduler=scheduler, run_timeout=run_timeout, resume=resume,
+    )  # fmt: skip
 
 
 @app.command()
@@ -188,22 +193,28 @@ def main() -> None:
         sys.exit(INTERRUPTED)
 
 
-def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None, *, with_report: bool) -> None:
+def _carry_out(
+    campaign: Campaign,
+    out: Path | None,
+    *,
+    with_report: bool,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    run_timeout: float | None = None,
+    resume: bool = False,
+) -> None:
     """Check everything, run everything, and leave tables, figures and a report behind."""
-    with console.status("checking the configuration") as status:
-        check_batch(
-            batch, settings, lambda share, what: status.update(f"training networks once: {100 * share:3.0f} %, {what}")
-        )
-    requests = batch.requests()
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    results.create_folder(folder, describe_batch(requests, settings))
     interrupted = False
-    with run_progress(console) as progress:
-        bar = progress.add_task("running", total=len(requests))
+    with contextlib.closing(ConsoleObserver(console)) as observer:
         try:
-            for row in run_batch(requests, settings, folder, min(workers, len(requests))):
-                progress.update(bar, advance=1, description=row["run_id"])
+            carry_out(
+                campaign, folder, workers=workers, scheduler=scheduler, run_timeout=run_timeout, resume=resume,
+                observer=observer,
+            )  # fmt: skip
         except KeyboardInterrupt:
+            if not folder.exists():
+                raise
             interrupted = True
     results.collect(folder)
     runs = results.load_runs(folder)
@@ -217,7 +228,7 @@ def _carry_out(batch: Batch, settings: Settings, workers: int, out: Path | None,
         results.point_latest(folder)
     console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
     if interrupted:
-        console.print(f"interrupted: {len(runs)} of {len(requests)} runs were finished and kept")
+        console.print(f"interrupted: {len(runs)} of {len(campaign.cells)} runs were finished and kept")
         sys.exit(INTERRUPTED)
     if with_report:
         try:

@@ -16,15 +16,21 @@ ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file w
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting, such as kinematic.lag=0.1.")
 ]
+WorkersOption = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")]
+SchedulerOption = Annotated[str | None, typer.Option(help="Address of a Dask scheduler that the runs are sent to.")]
+TimeoutOption = Annotated[
+    float | None, typer.Option(min=0.001, help="Time limit of a run [s]; a run that takes longer becomes a failed row.")
+]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.")]
 
 
 def split_words(text: str) -> tuple[str, ...]:
-    """Return the words in a list by comma."""
+    """Split a comma-separated list."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
-    """Return the names in a list by comma, each of which `find` knows; `all` for those in `known`."""
+    """Split a comma-separated list of names, each of which `find` accepts; `all` stands for those in `known`."""
     if text.strip() == "all":
         return tuple(known)
     names = tuple(dict.fromkeys(split_words(text)))

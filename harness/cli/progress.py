@@ -1,9 +1,11 @@
-"""Progress bars of the commands."""
+"""What the commands that run batches show on their way."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import (
@@ -16,7 +18,10 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.status import Status
 from rich.text import Text
+
+from servobench.harness.batch.campaign import Observer, Row
 
 
 class RateColumn(ProgressColumn):
@@ -41,9 +46,59 @@ def run_progress(console: Console, *further: ProgressColumn) -> Progress:
     )
 
 
+class ConsoleObserver(Observer):
+    """Shows what happens before the runs as a line, then a bar with throughput and time left."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._status: Status | None = console.status("checking the configuration")
+        self._status.start()
+        self._bar: Progress | None = None
+
+    def training(self, share: float, what: str) -> None:
+        """Show how much of a training of networks is done."""
+        if self._status is not None:
+            self._status.update(f"training networks once: {100 * share:3.0f} %, {what}")
+
+    def begin(self, total: int, done: int) -> None:
+        """Show the bar."""
+        self.close()
+        self._bar = run_progress(self._console, RateColumn())
+        self._bar.add_task("running", total=total, completed=done)
+        self._bar.start()
+
+    def finished(self, rows: Sequence[Row]) -> None:
+        """Advance the bar."""
+        if self._bar is not None:
+            self._bar.advance(self._bar.task_ids[0], len(rows))
+
+    def note(self, text: str) -> None:
+        """Print a line."""
+        self._console.print(text, soft_wrap=True)
+
+    def close(self) -> None:
+        """Take line and bar away."""
+        for shown in (self._status, self._bar):
+            if shown is not None:
+                shown.stop()
+        self._status = self._bar = None
+
+
 @contextlib.contextmanager
-def sweep_progress(console: Console, total: int, done: int) -> Iterator[Callable[[int], None]]:
-    """Show a bar with throughput and time left; yield a function that is told how many more runs are done."""
-    with run_progress(console, RateColumn()) as progress:
-        bar = progress.add_task("running", total=total, completed=done)
-        yield lambda count: progress.update(bar, advance=count)
+def watching(console: Console, folder: Path) -> Iterator[Observer]:
+    """Yield an observer for one campaign; after Ctrl-C one line says how to continue.
+
+    Args:
+        console: where it shows the progress.
+        folder: what the user named with --out.
+    """
+    observer = ConsoleObserver(console)
+    try:
+        yield observer
+    except KeyboardInterrupt:
+        observer.close()
+        if folder.exists():
+            sys.stderr.write(f"servobench: finished runs are kept in {folder}; the same call with --resume continues\n")
+        raise
+    finally:
+        observer.close()

@@ -11,10 +11,17 @@ from rich.console import Console
 from rich.progress import TextColumn
 from rich.table import Table
 
-from servobench.harness.batch.workers import default_workers
-from servobench.harness.cli.options import INTERRUPTED, split_names, split_words
+from servobench.harness.batch.results import locked
+from servobench.harness.batch.workers import Workers, open_workers
+from servobench.harness.cli.options import (
+    INTERRUPTED,
+    SchedulerOption,
+    TimeoutOption,
+    WorkersOption,
+    split_names,
+    split_words,
+)
 from servobench.harness.cli.progress import run_progress
-from servobench.harness.config.settings import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,35 +33,37 @@ console = Console()
 
 
 def tune(
-    controllers: Annotated[str, typer.Option(help="Names by comma, or all that have a search space.")] = "all",
+    controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
     trials: Annotated[int, typer.Option(help="Trials of each method, that of the defaults included.")] = 100,
-    seeds: Annotated[int, typer.Option(help="Moves a trial on each plant; half as many circles come on top.")] = 8,
-    plants: Annotated[str, typer.Option(help="Names by comma.")] = "kinematic",
-    workers: Annotated[int | None, typer.Option(help="Worker processes; default: the processors.")] = None,
-    offset: Annotated[int, typer.Option(help="Where in the range of tuning seeds to begin.")] = 0,
+    seeds: Annotated[int, typer.Option(help="Moves of a trial on each plant; half as many circles are added.")] = 8,
+    plants: Annotated[str, typer.Option(help="Comma-separated names.")] = "kinematic",
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    run_timeout: TimeoutOption = None,
+    offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
     study_seed: Annotated[int, typer.Option(help="Seed of the sampler.")] = 0,
-    out: Annotated[Path, typer.Option(help="Folder of the studies; one that was interrupted goes on.")] = (
+    out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
 ) -> None:
     """Search for the best settings of each method, with the same budget on the same training plants."""
     from servobench.harness.studies.tuning.objective import TuningSet  # noqa: PLC0415 - the optimiser costs half a second, for tune alone
-    from servobench.harness.studies.tuning.study import TuningPlan, open_studies, write_outcomes  # noqa: PLC0415
+    from servobench.harness.studies.tuning.study import TuningPlan, check_study_folder, open_studies, write_outcomes  # noqa: PLC0415
 
-    if workers is not None and workers < 1:
-        raise ConfigurationError(f"workers must be at least 1, got {workers}")
     plan = TuningPlan(_controllers(controllers), trials, TuningSet(split_words(plants), seeds, offset), study_seed)
-    studies = open_studies(out, plan)
-    count = workers or default_workers()
-    interrupted = not _carry_out(studies, plan, count)
+    check_study_folder(out)
+    names = {"plants": plan.runs.plants, "controllers": plan.controllers}
+    with open_workers(workers, scheduler, run_timeout, **names) as place, locked(out):
+        studies = open_studies(out, plan)
+        interrupted = not _carry_out(studies, plan, place)
     console.print(_table(write_outcomes(out, studies)))
     console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
     if interrupted:
-        console.print("interrupted; the same call goes on where it stopped")
+        console.print("interrupted; the same call continues where it stopped")
         sys.exit(INTERRUPTED)
 
 
-def _carry_out(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> bool:
+def _carry_out(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> bool:
     """Advance the studies to their end and show how far they are; return whether they got there."""
     from servobench.harness.studies.tuning.study import advance  # noqa: PLC0415 - as above
 

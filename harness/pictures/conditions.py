@@ -52,31 +52,29 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
     Where a sweep says along which axis a run stands, the axes are its own; else the mismatches are read.
     """
-    axes = runs["axis"].fillna("") if "axis" in runs else pd.Series("", index=runs.index)
-    if (axes != "").any():
-        own = runs[axes != ""]
-        words = own["axis"].str.replace("_", " ") + "=" + own["magnitude"]
-        return _along_axes(own, words)
+    if "axis" in runs and (runs["axis"].fillna("") != "").any():
+        own = runs[runs["axis"].fillna("") != ""]
+        return _along_axes(own.assign(size=own["magnitude"]), own.head(0))
     sweeps = {
         label: runs[runs[name].notna()].assign(size=runs[name].dropna().astype(float))
         for name, label in NUMBERS.items()
         if name in runs and runs[name].nunique() > 1
     }
-    return sweeps | _along_axes(runs, runs["mismatch"])
-
-
-def _along_axes(runs: pd.DataFrame, words: pd.Series[str]) -> dict[str, pd.DataFrame]:
-    """Return the runs of each axis with at least two sizes; `words` say axis and size of each run, `links=10%`."""
-    matches = words.map(MAGNITUDE.match)
-    found = runs[matches.notna()].assign(
-        axis=[match["axis"] for match in matches if match],
-        unit=[match["unit"] for match in matches if match],
-        size=[float(match["size"]) for match in matches if match],
+    words = runs["mismatch"].map(MAGNITUDE.match)
+    found = runs[words.notna()].assign(
+        axis=[match["axis"] for match in words if match],
+        unit=[match["unit"] for match in words if match],
+        size=[float(match["size"]) for match in words if match],
     )
-    none = runs[words == "none"].assign(size=0.0)
+    return sweeps | _along_axes(found, runs[runs["mismatch"] == "none"].assign(size=0.0))
+
+
+def _along_axes(found: pd.DataFrame, none: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the runs of each axis with at least two sizes; those without mismatch, `none`, have size 0 on each."""
     sweeps = {}
     for (axis, unit), group in found.groupby(["axis", "unit"], sort=False):
         part = pd.concat([none, group]) if len(none) else group
         if part["size"].nunique() > 1:
-            sweeps[f"{str(axis).replace('_', ' ')} [{unit}]" if unit else str(axis)] = part
+            name = str(axis).replace("_", " ")
+            sweeps[f"{name} [{unit}]" if unit else name] = part
     return sweeps

@@ -11,13 +11,13 @@ from pathlib import Path
 from PIL import Image
 
 from servobench.harness.batch import results
-from servobench.harness.batch.compare import Batch, check_batch, run_batch
-from servobench.harness.batch.manifest import describe_batch
-from servobench.harness.cli.robustness import make_map
+from servobench.harness.batch.campaign import carry_out, comparison
+from servobench.harness.batch.compare import Batch
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.draw import folder_figures, picture_of
 from servobench.harness.pictures.film import draw_frame
 from servobench.harness.pictures.replay import logged_run
+from servobench.harness.studies.robustness import make_map
 
 BATCH = Batch(
     plants=("bullet",),
@@ -39,17 +39,12 @@ def draw_pictures(folder: Path) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="servobench-") as scratch:
         batch = Path(scratch) / "batch"
-        settings, requests = Settings(), BATCH.requests()
-        check_batch(BATCH, settings)
-        results.create_folder(batch, describe_batch(requests, settings))
-        for _ in run_batch(requests, settings, batch, 1):
-            pass
-        results.collect(batch)
+        carry_out(comparison(BATCH, Settings()), batch, workers=1)
         yield _write(folder / "bench.png", _bench(batch))
         for named in folder_figures(batch):
             if named.kind in FILES:
                 yield _write(folder / f"{FILES[named.kind]}.png", picture_of(named.figure)[0])
-        for path in make_map(Path(scratch) / "map", "fmu", MAP_CONTROLLERS, MAP_SEEDS, settings):
+        for path in make_map(Path(scratch) / "map", "fmu", MAP_CONTROLLERS, MAP_SEEDS, Settings()):
             if path.suffix == ".png":
                 with Image.open(path) as picture:
                     yield _write(folder / path.name, _small(picture.convert("RGB")))

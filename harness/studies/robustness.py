@@ -1,12 +1,11 @@
-"""The robustness map: one axis of the world made worse at a time, everything else `moderate`, and who still arrives.
+"""The robustness map: success and settling time along seven axes, each varied by itself from a `moderate` mismatch.
 
-Every method meets the same robots, starts and targets at every place of the map. The camera that is moved in the middle
-of a run has a longer run, so that there is time to recover.
+Every method gets the same robots, starts and targets at every place of the map. Runs whose camera is moved half-way
+take longer, so that there is time to recover.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,21 +18,23 @@ from matplotlib.figure import Figure
 from servobench.harness.analysis.comparison import settled_share, settling_times
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Campaign, Cell, Observer, carry_out
 from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.sweep import Cell, vary
+from servobench.harness.batch.sweep import place_columns, vary
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.places import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.request import RunRequest
-from servobench.plant.robot.mismatch import parse_magnitudes
+from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"
 TASK: Final = "random"
 MOVE: Final = "camera_move"
-MOVE_DURATION: Final = 20.0  # s, of a run whose camera is moved in its middle
+MOVE_DURATION: Final = 20.0  # [s], of a run whose camera is moved half-way
 
-
-USUAL, MOVED = "usual", "moved"  # folders of a map: runs of usual length, and those whose camera moves
+STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it is
+MOVED_CAMERA: Final = "moved"  # folder of the runs whose camera is moved
+FIGURES: Final = "figures"
 
 
 @dataclass(frozen=True)
@@ -42,51 +43,93 @@ class Line:
 
     Attributes:
         axis: of the mismatch, or "latency" or "noise".
-        title: what the reader sees.
-        places: magnitudes as written.
+        title: label of the axis.
+        places: its magnitudes.
     """
 
     axis: str
     title: str
-    places: tuple[str, ...]
+    places: tuple[Magnitude, ...]
 
-    def request(self, request: RunRequest, place: str) -> RunRequest:
+    def request(self, request: RunRequest, place: Magnitude) -> RunRequest:
         """Return `request` at one place of this axis."""
         if self.axis == "latency":
-            return replace(request, latency_periods=int(place))
+            return replace(request, latency_periods=int(place.number))
         if self.axis == "noise":
-            return replace(request, noise_factor=float(place))
-        return replace(request, mismatch=vary(request.mismatch, self.axis, place))
-
-
-def _texts(axis: str, text: str) -> tuple[str, ...]:
-    return tuple(str(magnitude) for magnitude in parse_magnitudes(axis, text))
+            return replace(request, noise_factor=place.number)
+        return vary(request, self.axis, place)
 
 
 LINES: Final = (
-    Line("camera_rotation", "camera turned, °", _texts("camera_rotation", "0:180:30deg")),
-    Line("links", "link lengths wrong by up to, %", _texts("links", "0:30:10%")),
-    Line("joint_offsets", "joint zeros wrong by up to, °", _texts("joint_offsets", "0:20:5deg")),
-    Line("tool", "tool wrong by up to, mm", _texts("tool", "0:100:25mm")),
-    Line("latency", "camera latency, periods of 50 ms", tuple("012345")),
-    Line("noise", "sensor noise, times the usual", ("0", "1", "2", "4", "8")),
-    Line(MOVE, "camera moved in mid-run, °", _texts(MOVE, "0:180:45deg")),
+    Line("camera_rotation", "camera turned, °", parse_magnitudes("camera_rotation", "0:180:30deg")),
+    Line("links", "link lengths wrong by up to, %", parse_magnitudes("links", "0:30:10%")),
+    Line("joint_offsets", "joint zeros wrong by up to, °", parse_magnitudes("joint_offsets", "0:20:5deg")),
+    Line("tool", "tool wrong by up to, mm", parse_magnitudes("tool", "0:100:25mm")),
+    Line("latency", "camera latency, periods of 50 ms", tuple(Magnitude(float(n), "periods") for n in range(6))),
+    Line("noise", "sensor noise, times the usual", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
+    Line(MOVE, "camera moved half-way through the run, °", parse_magnitudes(MOVE, "0:180:45deg")),
 )
 
 
+def make_map(
+    out: Path,
+    plant: str,
+    controllers: Sequence[str],
+    seeds: Sequence[int],
+    settings: Settings,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    run_timeout: float | None = None,
+    resume: bool = False,
+    observer: Observer | None = None,
+) -> list[Path]:
+    """Carry out the runs of a map, put its tables together and draw it.
+
+    Args:
+        out: folder of the map.
+        plant: name of the plant.
+        controllers: names of the methods.
+        seeds: one robot each.
+        settings: overrides of the defaults.
+        workers: as these, see `servobench.harness.batch.campaign.carry_out`.
+        scheduler: the same.
+        run_timeout: the same.
+        resume: the same.
+        observer: the same.
+
+    Returns:
+        The files of the pictures.
+    """
+    static, moved = map_cells(plant, controllers, seeds)
+    parts = (STATIC_CAMERA, static, settings), (MOVED_CAMERA, moved, moved_settings(settings))
+    for name, cells, chosen in parts:
+        folder = out / name
+        carry_out(
+            Campaign(cells, chosen), folder, workers=workers, scheduler=scheduler, run_timeout=run_timeout,
+            resume=resume and folder.exists(), observer=observer,
+        )  # fmt: skip
+    results.write_summary(out, map_tables(out), results.read_manifest(out / STATIC_CAMERA))
+    return draw_map(results.load_runs(out), out / FIGURES)
+
+
 def map_cells(plant: str, controllers: Sequence[str], seeds: Sequence[int]) -> tuple[list[Cell], list[Cell]]:
-    """Return the runs of the map: those of usual length, and those whose camera moves."""
+    """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
     requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), tuple(seeds)).requests()
-    usual: list[Cell] = []
+    static: list[Cell] = []
     moved: list[Cell] = []
     for line in LINES:
-        cells = [Cell(line.request(request, place), line.axis, place) for place in line.places for request in requests]
-        (moved if line.axis == MOVE else usual).extend(cells)
-    return usual, moved
+        cells = [
+            Cell(line.request(request, place), place_columns(line.axis, place))
+            for place in line.places
+            for request in requests
+        ]
+        (moved if line.axis == MOVE else static).extend(cells)
+    return static, moved
 
 
 def moved_settings(settings: Settings) -> Settings:
-    """Return the settings of the runs whose camera moves; a duration that the user gives stays."""
+    """Return the settings of the runs whose camera is moved; a duration that the user gives is kept."""
     task = {"duration": MOVE_DURATION, **settings.sections.get(TASK, {})}
     return Settings({**settings.sections, TASK: task})
 
@@ -97,11 +140,13 @@ def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
     Raises:
         ConfigurationError: not the folder of a map.
     """
-    usual, moved = (results.load_runs(folder / part) for part in (USUAL, MOVED))
-    configuration = results.read_manifest(folder / MOVED)["configuration"]
+    static, moved = (results.load_runs(folder / part) for part in (STATIC_CAMERA, MOVED_CAMERA))
+    configuration = results.read_manifest(folder / MOVED_CAMERA)["configuration"]
     moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
-    at_rest = moved["magnitude"].map(number_of).astype(float) == 0.0
-    return {USUAL: usual, MOVED: moved.assign(moved_at_s=np.where(at_rest, np.nan, moment))}
+    return {
+        STATIC_CAMERA: static,
+        MOVED_CAMERA: moved.assign(moved_at_s=np.where(moved["magnitude"] == 0.0, np.nan, moment)),
+    }
 
 
 def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:
@@ -153,9 +198,9 @@ def _draw(
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, line in zip(grid.flat, lines, strict=False):
         cells = dict(iter(runs[runs["axis"] == line.axis].groupby(["controller", "magnitude"])))
-        values = {name: [measure(cells[name, place]) for place in line.places] for name in controllers}
+        values = {name: [measure(cells[name, place.number]) for place in line.places] for name in controllers}
         draw_places(axes, range(len(line.places)), values, styles, joined=True)
-        axes.set_xticks(range(len(line.places)), [number_of(place) for place in line.places])
+        axes.set_xticks(range(len(line.places)), [f"{place.number:g}" for place in line.places])
         axes.set_xlabel(line.title)
         axes.set_ylim(0.0, top)
         axes.grid(visible=True, alpha=0.3)
@@ -172,8 +217,3 @@ def _draw(
     for file in files:
         figure.savefig(file, dpi=150)
     return files
-
-
-def number_of(place: str) -> str:
-    """Return a magnitude without its unit."""
-    return re.sub(r"[a-z%]+$", "", place)

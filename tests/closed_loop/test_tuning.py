@@ -12,7 +12,8 @@ from optuna.distributions import CategoricalDistribution, IntDistribution
 from optuna.trial import TrialState
 
 from servobench import controllers
-from servobench.harness.batch.seed_ranges import TUNING
+from servobench.harness.batch.compare import TUNING
+from servobench.harness.batch.workers import Workers, open_workers
 from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
@@ -24,7 +25,6 @@ from servobench.harness.studies.tuning.objective import (
     MOVE,
     Trial,
     TuningSet,
-    carry_out,
     evaluate,
     run_cost,
     score,
@@ -59,8 +59,9 @@ def ends(distribution):
 def trials_of(folder, plan, workers=1):
     """Carry a plan out and return the numbers tried and the scores of each study."""
     studies = open_studies(folder, plan)
-    for _ in advance(studies, plan, workers):
-        pass
+    with open_workers(workers) as place:
+        for _ in advance(studies, plan, place):
+            pass
     return [[(trial.params, study.trial_score(trial)) for trial in each.finished()] for each in studies]
 
 
@@ -72,7 +73,12 @@ def made_up(monkeypatch):
         numbers = [value for value in flatten_nested(trial.settings) if isinstance(value, float)]
         return float(np.tanh(np.sum(np.square(np.array(numbers[:2]) - 0.1))) + 1e-3 * (run.seed % 7))
 
-    monkeypatch.setattr(objective, "carry_out", cost)
+    def costs(trials, runs, _workers):
+        for r, run in enumerate(runs):
+            for t, trial in enumerate(trials):
+                yield t, r, cost(trial, run)
+
+    monkeypatch.setattr(study, "evaluate", costs)
 
 
 def flatten_nested(values):
@@ -166,7 +172,7 @@ def test_a_better_tuned_controller_has_the_better_score():
     trials = [Trial("calibrated", full_settings(entry, {"law": {"feedforward": switch}})) for switch in (True, False)]
     runs = [run for run in SMALL.runs() if run.task == CURVE]
     costs = np.zeros((2, len(runs)))
-    for trial, run, cost in evaluate(trials, runs, 1):
+    for trial, run, cost in evaluate(trials, runs, Workers()):
         costs[trial, run] = cost
     assert (costs[0] < 0.5 * costs[1]).all()
 
@@ -175,7 +181,8 @@ def test_the_delay_of_the_set_reaches_the_plant():
     entry = find_tunable("calibrated")
     trial = Trial("calibrated", full_settings(entry, {"law": {"proportional_gain": 6.0}}))
     prompt, late = (objective.TuningRun("kinematic", MOVE, TUNING.start, latency) for latency in (0, 1))
-    assert carry_out(trial, prompt) < carry_out(trial, late)
+    costs = {run: cost for _, run, cost in evaluate([trial], [prompt, late], Workers())}
+    assert costs[0] < costs[1]
 
 
 def test_the_first_trial_is_the_default_of_the_class_and_no_two_are_alike(made_up, tmp_path):
@@ -197,7 +204,7 @@ def test_a_study_taken_up_again_is_that_which_was_never_interrupted(made_up, tmp
     whole = trials_of(tmp_path / "whole", TuningPlan(names, 14, SMALL))
     trials_of(tmp_path / "parts", TuningPlan(names[:1], 3, SMALL))
     stopped = TuningPlan(names, 12, SMALL)
-    halfway = advance(open_studies(tmp_path / "parts", stopped), stopped, 1)
+    halfway = advance(open_studies(tmp_path / "parts", stopped), stopped, Workers())
     for _ in range(100):  # leaves in the middle of a round, as a kill does
         next(halfway)
     del halfway
@@ -240,7 +247,8 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
 def checked_score(tuned, settings):
     runs = [tuned.tuning_set().runs()[index] for index in tuned.tuning_set().checked()]
     trial = Trial(tuned.controller, full_settings(find_tunable(tuned.controller), settings))
-    return score(runs, [carry_out(trial, run) for run in runs])
+    costs = {run: cost for _, run, cost in evaluate([trial], runs, Workers())}
+    return score(runs, [costs[run] for run in range(len(runs))])
 
 
 def assert_checked_score(tuned):
@@ -282,7 +290,7 @@ def test_a_study_of_something_else_is_refused_and_no_other_is_begun(made_up, tmp
 def test_a_study_of_another_objective_or_search_space_is_refused(made_up, tmp_path, monkeypatch):
     plan = TuningPlan(("rls",), 1, SMALL)
     trials_of(tmp_path, plan)
-    monkeypatch.setattr(objective, "WORST_RMS", 0.1)
+    monkeypatch.setattr(objective, "RMS_SATURATION", 0.1)
     monkeypatch.setattr(study, "SPACES", {"rls": SPACES["broyden"]})
     with pytest.raises(ConfigurationError, match="was made with other search space, objective; name another folder"):
         open_studies(tmp_path, plan)

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from servobench.harness.batch import results
-from servobench.harness.batch.cluster import open_backend
+from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.settings import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
@@ -91,6 +91,11 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
 def test_a_scheduler_that_does_not_answer_is_one_line():
     with (
         pytest.raises(ConfigurationError, match=r"scheduler tcp://127\.0\.0\.1:9 does not answer; start one with"),
-        open_backend("tcp://127.0.0.1:9", 1),
+        open_workers(1, "tcp://127.0.0.1:9"),
     ):
         pass
+
+
+def test_a_time_limit_on_a_cluster_is_refused():
+    with pytest.raises(ConfigurationError, match="--run-timeout works with processes of this machine only"):
+        open_workers(1, "tcp://127.0.0.1:9", 5.0).__enter__()

@@ -8,12 +8,14 @@ import pytest
 
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.episode import RunResult
+from servobench.plant.files import write_atomically
 
 
 def add_part(folder, index: int, **extra: float) -> None:
     run_id = f"run{index}"
     steps = pd.DataFrame({"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | extra)
-    results.write_part(folder, index, {"run_id": run_id, "seed": index} | extra, steps)
+    results.write_part(folder, index, [RunResult({"run_id": run_id, "seed": index} | extra, steps)])
 
 
 @pytest.fixture
@@ -55,7 +57,7 @@ def test_a_run_without_its_row_does_not_count(folder):
 
 
 def test_a_run_that_ended_before_its_first_period_has_a_row_and_no_steps(folder):
-    results.write_part(folder, 0, {"run_id": "run0"}, pd.DataFrame())
+    results.write_part(folder, 0, [RunResult({"run_id": "run0"}, pd.DataFrame())])
     assert results.collect(folder) == 1
     with pytest.raises(ConfigurationError, match="holds no steps"):
         results.load_steps(folder)
@@ -115,3 +117,42 @@ def test_the_manifest_is_json_for_every_reader(tmp_path):
     assert "Infinity" not in text
     manifest = json.loads(text)
     assert (manifest["limit"], manifest["low"], manifest["count"]) == ("inf", [1.5, "-inf"], 3)
+
+
+def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(folder):
+    for index, latency in enumerate((None, 2, None)):
+        results.write_part(folder, index, [RunResult({"run_id": f"run{index}", "latency_periods": latency}, None)])
+    before = results.load_runs(folder)
+    results.collect(folder)
+    pd.testing.assert_frame_equal(results.load_runs(folder), before)
+    assert before["latency_periods"].tolist() == pytest.approx([np.nan, 2.0, np.nan], nan_ok=True)
+
+
+def test_a_part_of_several_runs_says_which_runs_are_there(folder):
+    results.write_part(folder, 8, [RunResult({"run_id": f"run{index}"}, None) for index in (8, 9, 10)])
+    add_part(folder, 2)
+    assert results.finished_runs(folder) == {2, 8, 9, 10}
+
+
+def test_a_folder_is_written_by_one_process_at_a_time_and_a_dead_one_does_not_count(tmp_path):
+    out = tmp_path / "out"
+    with results.locked(out), pytest.raises(ConfigurationError, match="is being written by another process"):
+        results.locked(out).__enter__()
+    assert list(out.iterdir()) == []
+    (out / results.LOCK).touch()  # what a process that was killed leaves behind
+    with results.locked(out, new=True):
+        results.create_folder(out, {})
+
+
+def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
+    path = tmp_path / "table"
+    path.write_text("old")
+
+    def fail(file):
+        file.write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, fail)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

@@ -18,7 +18,6 @@ from servobench.harness.studies.robustness import (
     draw_map,
     map_cells,
     moved_settings,
-    number_of,
     settling_median,
 )
 
@@ -28,10 +27,10 @@ def test_the_map_has_every_place_for_every_method_and_no_run_twice():
     cells = [*usual, *moved]
     assert len({cell.request.run_id for cell in usual}) == len(usual)
     assert len(cells) == 2 * 3 * sum(len(line.places) for line in LINES)
-    assert {cell.axis for cell in moved} == {MOVE}
+    assert {cell.columns["axis"] for cell in moved} == {MOVE}
     assert {str(cell.request.mismatch) for cell in moved} >= {"moderate+camera_move=90deg"}
-    assert {cell.request.latency_periods for cell in usual if cell.axis == "latency"} == {0, 1, 2, 3, 4, 5}
-    assert {cell.request.noise_factor for cell in usual if cell.axis == "noise"} == {0.0, 1.0, 2.0, 4.0, 8.0}
+    assert {cell.request.latency_periods for cell in usual if cell.columns["axis"] == "latency"} == {0, 1, 2, 3, 4, 5}
+    assert {cell.request.noise_factor for cell in usual if cell.columns["axis"] == "noise"} == {0.0, 1.0, 2.0, 4.0, 8.0}
 
 
 def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long():
@@ -45,10 +44,6 @@ def test_settling_counts_from_the_move_of_the_camera():
     assert settling_median(runs.drop(columns="moved_at_s")).value == 12.0
     assert settled_share(runs).value == pytest.approx(200 / 3)
     assert math.isinf(settling_median(runs.tail(1)).value)
-
-
-def test_the_number_of_a_magnitude_has_no_unit():
-    assert [number_of(place) for place in ("0deg", "12.5mm", "30%", "4")] == ["0", "12.5", "30", "4"]
 
 
 def test_a_table_that_is_no_map_is_refused(tmp_path):

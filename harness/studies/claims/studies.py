@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from servobench.harness.batch.campaign import Cell
 from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.sweep import Cell
 from servobench.harness.config.settings import Settings
 
 PROPOSED: Final = "rbfnn_mfac"

@@ -12,6 +12,7 @@ from typing import Any
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.objective import TuningSet
+from servobench.plant.files import write_atomically
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
 
@@ -62,11 +63,10 @@ class TunedValues:
 
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:
-    """Write the file, whole or not at all."""
+    """Write the file atomically."""
     header = {item.name: getattr(tuned, item.name) for item in fields(tuned) if item.name != "settings"}
-    partial = path.with_name(f".{path.name}")
-    partial.write_text(HEADING + _table("", header) + _table("settings", tuned.settings), encoding="utf-8")
-    partial.replace(path)
+    text = HEADING + _table("", header) + _table("settings", tuned.settings)
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
 def read_tuned(path: Path | Traversable) -> TunedValues:

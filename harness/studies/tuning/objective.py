@@ -1,16 +1,14 @@
 """What tuning minimises, and the runs that it is measured on.
 
 For each plant, `seeds` moves of the task `random` and half as many runs of the task `circle`, every one on another
-robot of `moderate` mismatch. Every other run has a camera that delivers one period late, so that gains must bear the
-delay of the rendered plant too. With the score of each set of runs a mean,
+robot of `moderate` mismatch. Every other run has a camera latency of one period, as the rendered plant has.
 
     score = mean over random of c_random + mean over circle of c_circle         (0 is perfect, 4 the worst)
 
     c_random = settling time / duration; 1 if it never settled; 2 if the run did not complete
     c_circle = min(RMS error of the second lap / 0.05 m, 1);     2 if the run did not complete
 
-Overshoot has no term: what matters of it is in the settling time, since the error must come back and stay within 5 mm,
-and a method's character is not to be tuned away before it is compared.
+Overshoot has no term of its own: it lengthens the settling time, since the error must come back and stay within 5 mm.
 """
 
 from __future__ import annotations
@@ -20,14 +18,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
-import joblib
 import numpy as np
 
-from servobench.harness.batch.seed_ranges import tuning_seeds
-from servobench.harness.batch.workers import leave_interrupts_to_parent
+from servobench.harness.batch.campaign import Cell, Chunk, carry_out_chunks
+from servobench.harness.batch.compare import tuning_seeds
+from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.episode import COMPLETED, run_experiment
+from servobench.harness.run.episode import COMPLETED
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.tasks import find_task
 from servobench.plant.bench import can_vary_sensing
@@ -35,9 +33,9 @@ from servobench.plant.bench import can_vary_sensing
 MOVE: Final = "random"
 CURVE: Final = "circle"
 MISMATCH: Final = "moderate"
-LATENCIES: Final = (0, 1)  # periods between exposure and delivery of the feature, in turn
-WORST_RMS: Final = 0.05  # m, on the circle: more is not worse
-FAULT: Final = 1.0  # on top of the worst
+LATENCIES: Final = (0, 1)  # [periods] between exposure and delivery of the feature, in turn
+RMS_SATURATION: Final = 0.05  # [m] on the circle; the cost saturates at 1 here
+FAULT_PENALTY: Final = 1.0  # added to the cost 1 of a run that did not complete
 CHECKED: Final = len(LATENCIES)  # runs of each task in the subset that a test scores again
 
 
@@ -124,9 +122,9 @@ Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run
 def run_cost(task: str, row: Mapping[str, Any]) -> float:
     """Return the cost of one run from its row of results; see the module's docstring."""
     if row["status"] != COMPLETED:
-        return 1.0 + FAULT
+        return 1.0 + FAULT_PENALTY
     if task == CURVE:
-        return min(float(row["rms_error_evaluated"]) / WORST_RMS, 1.0)
+        return min(float(row["rms_error_evaluated"]) / RMS_SATURATION, 1.0)
     settling_time = float(row["settling_time_s"])
     return 1.0 if math.isnan(settling_time) else settling_time / float(find_task(MOVE).default.duration)
 
@@ -139,35 +137,28 @@ def score(runs: Sequence[TuningRun], costs: Sequence[float]) -> float:
     return float(sum(np.mean(values) for values in by_task.values()))
 
 
-def carry_out(trial: Trial, run: TuningRun) -> float:
-    """Carry out one run of a trial and return its cost.
-
-    Raises:
-        ConfigurationError: settings that the controller or the plant refuses.
-    """
-    sensing = {"latency_periods": run.latency_periods}
-    settings = Settings({trial.controller: trial.settings, run.plant: {"sensing": sensing}})
-    request = RunRequest(run.plant, trial.controller, run.task, read_mismatch(MISMATCH), run.seed)
-    return run_cost(run.task, run_experiment(request, settings).row)
-
-
-def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: int) -> Iterator[Cost]:
+def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: Workers) -> Iterator[Cost]:
     """Carry out every run of every trial and yield each cost as it is known, in any order.
 
     Args:
         trials: what to score.
         runs: on what.
-        workers: number of processes; with 1 the runs happen in this one.
+        workers: where.
+
+    Raises:
+        ConfigurationError: the worker processes cannot be started.
     """
-    jobs = (
-        joblib.delayed(_evaluate_one)(t, r, trial, run, workers > 1)
-        for r, run in enumerate(runs)
-        for t, trial in enumerate(trials)
+    pairs = [(t, r) for r in range(len(runs)) for t in range(len(trials))]
+    chunks = [
+        Chunk(index, (Cell(_request(trials[t], runs[r])),), Settings({trials[t].controller: trials[t].settings}))
+        for index, (t, r) in enumerate(pairs)
+    ]
+    for chunk, (result,) in carry_out_chunks(chunks, workers):
+        t, r = pairs[chunk.index]
+        yield t, r, run_cost(runs[r].task, result.row)
+
+
+def _request(trial: Trial, run: TuningRun) -> RunRequest:
+    return RunRequest(
+        run.plant, trial.controller, run.task, read_mismatch(MISMATCH), run.seed, latency_periods=run.latency_periods
     )
-    yield from joblib.Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
-
-
-def _evaluate_one(trial_index: int, run_index: int, trial: Trial, run: TuningRun, in_worker: bool) -> Cost:
-    if in_worker:
-        leave_interrupts_to_parent()
-    return trial_index, run_index, carry_out(trial, run)

@@ -1,10 +1,10 @@
 """The studies: for each method an Optuna study in a journal file of its own, all advanced in step.
 
-In a round every method that has trials left asks its sampler for one, all runs of these trials are shared out among the
-worker processes, and the scores are told. Sampling happens in this process alone, and each trial's sampler is seeded by
-the study's seed and the number of trials that are finished. So the outcome is the same for any number of workers, and
-for a study that was interrupted and taken up again. The first trial is the default of the controller's class. There is
-no pruning: each trial of each method has the same runs.
+In a round every method with trials left asks its sampler for one, all runs of these trials are carried out by the
+workers, and the scores are stored. Sampling happens in this process only, and each trial's sampler is seeded by the
+study's seed and the number of finished trials. So the outcome is the same for any number of workers, and for a study
+that was interrupted and continued. The first trial is the default of the controller's class. There is no pruning: each
+trial of each method has the same runs.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
+from servobench.harness.batch.compare import build_once
+from servobench.harness.batch.results import LOCK
+from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten
-from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.files import TunedValues, write_tuned
@@ -83,10 +85,10 @@ class TuningPlan:
 
 @dataclass(frozen=True)
 class Finished:
-    """One more run is finished.
+    """A run that is finished.
 
     Attributes:
-        controller: of which.
+        controller: whose run it was.
         best: least score of its finished trials; None while there is none.
     """
 
@@ -119,7 +121,7 @@ class MethodStudy:
             raise ConfigurationError(f"study {self._path} cannot be opened: {error}") from error
         self._check_fingerprint()
         for trial in self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-            # Of a call that was killed: the sampler will ask for the same values again.
+            # It belongs to a call that was killed; the sampler will ask for the same values again.
             self._study.tell(trial.number, state=TrialState.FAIL)
         if not self.finished() and not self._study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
             self._study.enqueue_trial(default_values(self._entry))
@@ -202,7 +204,7 @@ def trial_score(trial: FrozenTrial) -> float:
 def fingerprint(controller: str, plan: TuningPlan) -> dict[str, Any]:
     """Return all that a study's scores depend on, as JSON has it; the number of trials may grow and is not in it."""
     entry = find_tunable(controller)
-    constants = ("MOVE", "CURVE", "MISMATCH", "LATENCIES", "WORST_RMS", "FAULT")
+    constants = ("MOVE", "CURVE", "MISMATCH", "LATENCIES", "RMS_SATURATION", "FAULT_PENALTY")
     return {
         "search space": {key: distribution_to_json(value) for key, value in SPACES[controller].items()},
         "defaults": {key: repr(value) for key, value in flatten(entry.config()).items()},
@@ -215,7 +217,7 @@ def fingerprint(controller: str, plan: TuningPlan) -> dict[str, Any]:
 
 
 def mend_journal(path: Path) -> None:
-    """Cut off a last line that a killed process left unfinished; nothing that counts is in it."""
+    """Remove a last line that a killed process left unfinished."""
     if path.is_file():
         data = path.read_bytes()
         whole = data.rfind(b"\n") + 1
@@ -224,14 +226,27 @@ def mend_journal(path: Path) -> None:
                 file.truncate(whole)
 
 
+def check_study_folder(folder: Path) -> None:
+    """Refuse a folder with other things than studies in it.
+
+    Raises:
+        ConfigurationError: names the folder.
+    """
+    if folder.exists() and not (folder.is_dir() and (any(folder.glob(f"*{JOURNAL}")) or not _contents(folder))):
+        raise ConfigurationError(f"{folder} exists already and holds no study; name another folder with --out")
+
+
+def _contents(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name != LOCK]
+
+
 def open_studies(folder: Path, plan: TuningPlan) -> list[MethodStudy]:
     """Open or make the studies of a plan.
 
     Raises:
         ConfigurationError: the folder has other things in it or cannot be made, or a study of it is another one.
     """
-    if folder.exists() and (not folder.is_dir() or (any(folder.iterdir()) and not any(folder.glob(f"*{JOURNAL}")))):
-        raise ConfigurationError(f"{folder} exists already and holds no study; name another folder with --out")
+    check_study_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -241,7 +256,7 @@ def open_studies(folder: Path, plan: TuningPlan) -> list[MethodStudy]:
     return [opened[name] for name in plan.controllers]
 
 
-def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> Iterator[Finished]:
+def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> Iterator[Finished]:
     """Carry out the trials that are left, a round at a time, and yield after every run."""
     runs = plan.runs.runs()
     while active := [study for study in studies if len(study.finished()) < plan.trials]:
@@ -261,7 +276,7 @@ def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: int) -> I
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Hold Ctrl-C back until the end: it must not come while a journal is locked or written."""
+    """Hold Ctrl-C back until the end, so that it cannot interrupt a journal that is locked or written."""
     pressed: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
     try:
@@ -281,6 +296,6 @@ def write_outcomes(folder: Path, studies: Sequence[MethodStudy]) -> Mapping[str,
 
 
 def _train(trial: Trial, plant: str) -> None:
-    """Build the controller once, so that networks which it needs are in the cache before the workers ask for them."""
+    """Train the networks of a controller, if it has any, before workers need them."""
     request = RunRequest(plant, trial.controller, objective.MOVE, read_mismatch(objective.MISMATCH), 0)
-    build_experiment(request, Settings({trial.controller: trial.settings})).plant.close()
+    build_once(request, Settings({trial.controller: trial.settings}))

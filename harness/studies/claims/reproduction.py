@@ -1,0 +1,72 @@
+"""The reproduction as a whole: carry out the runs, answer the claims, and leave tables and figures behind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Campaign, Observer, carry_out
+from servobench.harness.config.registry import find_plant
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.studies.claims.answers import answer_all
+from servobench.harness.studies.claims.figures import draw_answers
+from servobench.harness.studies.claims.measurements import Answer
+from servobench.harness.studies.claims.studies import MAIN, studies
+from servobench.harness.studies.claims.table import markdown_table, write_tables
+
+MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
+FIGURES: Final = "figures"
+
+
+def reproduce(
+    out: Path,
+    plants: Sequence[str],
+    robots: int,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    run_timeout: float | None = None,
+    resume: bool = False,
+    observer: Observer | None = None,
+) -> list[Answer]:
+    """Carry out the runs and answer the claims.
+
+    Args:
+        out: folder for runs, tables and figures.
+        plants: names.
+        robots: number of robots for each move; two fifths of them for the circle.
+        workers: as these, see `servobench.harness.batch.campaign.carry_out`.
+        scheduler: the same.
+        run_timeout: the same.
+        resume: the same.
+        observer: the same.
+
+    Returns:
+        The answers of all plants, by claim.
+
+    Raises:
+        ConfigurationError: too few robots, or a plant that is no UR5.
+    """
+    if robots < MIN_ROBOTS:
+        raise ConfigurationError(f"--seeds must be at least {MIN_ROBOTS} to tell methods apart, got {robots}")
+    if any(find_plant(name).own_robot for name in plants):
+        raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
+    tables = {}
+    for study in studies(plants, robots):
+        folder = out / study.name
+        carry_out(
+            Campaign(study.cells, study.settings), folder, workers=workers, scheduler=scheduler,
+            run_timeout=run_timeout, resume=resume and folder.exists(), observer=observer,
+        )  # fmt: skip
+        tables[study.name] = results.load_runs(folder)
+    answers = sorted(
+        (answer for plant in plants for answer in answer_all(tables, plant)),
+        key=lambda answer: (not answer.claim.isdigit(), answer.claim),
+    )
+    results.write_summary(out, {MAIN: tables[MAIN]}, results.read_manifest(out / MAIN))
+    write_tables(answers, out)
+    (out / "answers.md").write_text(markdown_table(answers), encoding="utf-8")
+    draw_answers(answers, out / FIGURES)
+    return answers
