@@ -24,14 +24,14 @@ Diagnostics: TypeAlias = Mapping[str, float]
 
 @dataclass(frozen=True)
 class RobotKnowledge:
-    """What a controller is told about the robot, through its constructor.
+    """What a controller may know about the robot, through its constructor.
 
     Attributes:
         spec: sizes, limits and control period of the plant.
-        preview: how many future rows `reference` has besides row 0.
+        preview: number of future rows that `reference` has after row 0.
         nominal_jacobian: (n,) rad -> (m, n), the Jacobian of the nominal model; vectorised over leading axes. None
             where no model exists.
-        true_jacobian: the same of the true robot; only handed to a controller whose entry asks for the truth.
+        true_jacobian: the same of the true robot; given only to a controller whose entry needs the truth.
         true_symbolic: a CasADi expression (MX) q, (n, 1) rad -> the expression of the true robot's feature, (m, 1);
             under the same condition.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are

@@ -1,4 +1,4 @@
-"""A second upper bound: nonlinear predictive control over the kinematics of the true robot. It is told the truth."""
+"""A second upper bound: nonlinear predictive control over the kinematics of the true robot."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ class NmpcCalibrated(Controller):
     |---|---|---|---|
     | `plan` | dq_1 … dq_H | (H, n) | rad |
     | `J` | ∂h/∂q along the plan | (H, m, n) | m/rad |
-    | `b` | what the camera sees besides the model | (m,) | m |
+    | `b` | feature as seen minus that of the model | (m,) | m |
     """
 
     def __init__(self, config: NmpcCalibratedConfig, knowledge: RobotKnowledge) -> None:
         """Build the linearisation and the quadratic program.
 
         Raises:
-            ValueError: nobody told the symbolic kinematics, it has another size, or the preview is too short.
+            ValueError: the symbolic kinematics is not known or has another size, or the preview is too short.
         """
         reach = config.horizon + config.delay_periods
         if knowledge.preview < reach:

@@ -26,16 +26,16 @@ from servobench.plant.signals import Command, Observation
 
 @final
 class ServoController(Controller):
-    """Estimates the Jacobian from what moved and commands by what it estimates.
+    """Estimates the Jacobian from observed motions and commands with the estimate.
 
     Each step learns from the motion between the last valid feature and the present one, so that Δy and Δq span the same
     gap when frames are lost; a step without a valid feature learns nothing. Joint positions are read without delay, so
     under camera latency Δy is that of a motion a little earlier: while the arm speeds up or slows down, an estimator is
-    misled. While the initial Jacobian is probed, the probing moves are the command; estimator and law are not asked.
+    misled. While the initial Jacobian is probed, the probing moves are the command; estimator and law are not used.
 
     Attributes:
-        estimator: the Jacobian estimator, for a look at its state.
-        law: the control law, likewise.
+        estimator: the Jacobian estimator.
+        law: the control law.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class ServoController(Controller):
         return u
 
     def diagnostics(self) -> Diagnostics:
-        """Return what estimator and law tell, besides `probing` and `jacobian_prediction_error`.
+        """Return those of estimator and law, with `probing` and `jacobian_prediction_error`.
 
         `jacobian_prediction_error` is ‖Δy − ĴΔq‖ in m of the last motion, with Ĵ from before its update; NaN until
         something has moved. `probing` is 1 while the initial Jacobian is being measured.

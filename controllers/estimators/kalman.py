@@ -55,6 +55,16 @@ def cholesky_of(P: FloatArray) -> FloatArray:
     return L
 
 
+def full_covariance(J: FloatArray, P: FloatArray) -> FloatArray:
+    """Return the covariance of vec(J) by rows, (mn, mn), from itself or from that which all rows share, (n, n)."""
+    return np.asarray(np.kron(np.eye(J.size // len(P)), P), dtype=np.float64)
+
+
+def filter_diagnostics(P: FloatArray, *, updated: bool) -> Diagnostics:
+    """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
+    return {"estimator_updated": float(updated), "jacobian_deviation": math.sqrt(P.trace() / len(P))}
+
+
 def measurement_matrix(joint_step: FloatArray, m: int) -> FloatArray:
     """Return H = I_m ⊗ Δqᵀ, (m, mn), for Δq (n,)."""
     return np.asarray(np.kron(np.eye(m), joint_step[None, :]), dtype=np.float64)
@@ -160,11 +170,8 @@ class KalmanEstimator(Estimator):
 
     def covariance(self) -> FloatArray:
         """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
-        if self._config.form == "split":
-            return np.asarray(np.kron(np.eye(self._J.shape[0]), self._P), dtype=np.float64)
-        return self._P.copy()
+        return full_covariance(self._J, self._P)
 
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
-        deviation = math.sqrt(self._P.trace() / len(self._P))
-        return {"estimator_updated": float(self._updated), "jacobian_deviation": deviation}
+        return filter_diagnostics(self._P, updated=self._updated)

@@ -93,7 +93,7 @@ class RbfEstimator(Estimator):
 
         Args:
             jacobian: Ĵ₀, (m, n); only its size is looked at. The network is itself the initial Jacobian, for all joint
-                positions; one matrix, whose joint position is not told, says less.
+                positions; one matrix without its joint position holds less.
 
         Raises:
             ValueError: `jacobian` is of another size than the network.
@@ -117,8 +117,8 @@ class RbfEstimator(Estimator):
         gradient *= self._step
         self._weights += gradient
 
-    def expect_noise(self, factor: float) -> None:
-        """Learn as fits a feature whose variance is `factor` times the one that ε is set for."""
+    def scale_epsilon(self, factor: float) -> None:
+        """Use `factor` times the configured ε, for a feature whose variance is so many times the assumed one."""
         self._epsilon = factor * self._config.epsilon
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:

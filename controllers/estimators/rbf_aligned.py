@@ -18,13 +18,13 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.map_bank import map_update, near_rotation
+from servobench.controllers.estimators.pairing import MAX_GAP, MotionHistory
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
 
-MAX_GAP = 16  # [periods] that a motion over lost frames may span; after a longer gap the past is forgotten
 MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
 MIN_JUMP_DEVIATIONS = 10.0  # [σ] above which it is no noise either
 NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), of one motion in the score of a delay
@@ -109,7 +109,7 @@ class RbfAlignedEstimator(Estimator):
         self._noise = NoiseLevel(config.feature_noise)
         self._delay = 0
         self._map, self._rotation = eye, eye
-        self._past: FloatArray | None = None  # rows [q, Σ x], a row a period, the newest last
+        self._history = MotionHistory(self._candidates, self._n, self._m)
         self._moves = 0
         self._key, self._latest = b"", np.zeros((self._m, self._n))
         self._nis = self._cusum = 0.0
@@ -135,15 +135,13 @@ class RbfAlignedEstimator(Estimator):
 
     def update(self, motion: Motion) -> None:
         """Learn map, delay and network from one motion."""
-        config, n, periods = self._config, self._n, max(1, round(motion.duration / self._period))
+        config, periods = self._config, max(1, round(motion.duration / self._period))
         if periods > MAX_GAP:
-            self._past = None
+            self._history.forget()
             return
-        past, last = self._extended_past(motion, periods), self._candidates + MAX_GAP
-        passed = (
-            past[last : last - self._candidates : -1] - past[last - periods : last - periods - self._candidates : -1]
-        )
-        x = passed[:, n:]
+        q, dq = motion.joint_position, motion.joint_step
+        self._history.append(q, dq, self._network_jacobian(q).dot(dq), periods)
+        begins, steps, x = self._history.motions(periods)
         square = np.add.reduce(x * x, axis=1)
         if config.detect_moves and self._jumped(square, motion.feature_step):
             self._expect_any_map()
@@ -153,10 +151,10 @@ class RbfAlignedEstimator(Estimator):
         if config.align or config.find_delay:
             self._learn_map(x, square, motion.feature_step)
         if config.learn and self._deviation() < config.confidence:
-            begin = past[last - self._delay - periods, :n]
-            step, seen = passed[self._delay, :n], self._rotation.T @ motion.feature_step
+            begin, step = begins[self._delay], steps[self._delay]
+            seen = self._rotation.T @ motion.feature_step
             self._key = b""
-            self._network.expect_noise(self._noise.variance / config.feature_noise**2)
+            self._network.scale_epsilon(self._noise.variance / config.feature_noise**2)
             self._network.update(Motion(begin, step, seen, motion.error, motion.duration))
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
@@ -182,19 +180,6 @@ class RbfAlignedEstimator(Estimator):
         if key != self._key:
             self._key, self._latest = key, self._network.jacobian(q)
         return self._latest
-
-    def _extended_past(self, motion: Motion, periods: int) -> FloatArray:
-        """Return the past up to now, (candidates + MAX_GAP + 1, n + m): in a gap the joints moved evenly."""
-        q, dq, n = motion.joint_position, motion.joint_step, self._n
-        if self._past is None:  # the arm was at rest
-            self._past = np.zeros((self._candidates + MAX_GAP + 1, n + self._m))
-            self._past[:, :n] = q
-        begin = np.concatenate([q, self._past[-1, n:]])
-        step = np.concatenate([dq, self._network_jacobian(q).dot(dq)])
-        share = np.arange(1, periods + 1)[:, None] / periods if periods > 1 else 1.0
-        added = np.atleast_2d(begin + step * share)
-        self._past = np.concatenate([self._past[periods:], added])
-        return self._past
 
     def _jumped(self, square: FloatArray, feature_step: FloatArray) -> bool:
         reach = math.sqrt(max(square.tolist()))

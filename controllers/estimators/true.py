@@ -1,4 +1,4 @@
-"""The estimator that is told the truth: the upper bound of every comparison, not a competitor."""
+"""The estimator that uses the true Jacobian: the upper bound of every comparison, not a competitor."""
 
 from __future__ import annotations
 
@@ -25,12 +25,10 @@ class TrueEstimator(Estimator):
         """Take the true Jacobian.
 
         Raises:
-            ValueError: nobody told it.
+            ValueError: it is not known.
         """
         if knowledge.true_jacobian is None:
-            raise ValueError(
-                "true_jacobian must be known for the estimator 'true'; this plant cannot tell it: take another"
-            )
+            raise ValueError("true_jacobian must be known for the estimator 'true'; this plant does not provide it")
         self._true_jacobian = knowledge.true_jacobian
 
     def reset(self, jacobian: FloatArray) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import cholesky_of, split_update
+from servobench.controllers.estimators.kalman import cholesky_of, filter_diagnostics, full_covariance, split_update
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import NonNegative, Positive, settings
 
@@ -168,11 +168,8 @@ class UkfEstimator(Estimator):
 
     def covariance(self) -> FloatArray:
         """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
-        if self._config.form == "split":
-            return np.asarray(np.kron(np.eye(self._J.shape[0]), self._P), dtype=np.float64)
-        return self._P.copy()
+        return full_covariance(self._J, self._P)
 
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
-        deviation = math.sqrt(self._P.trace() / len(self._P))
-        return {"estimator_updated": float(self._updated), "jacobian_deviation": deviation}
+        return filter_diagnostics(self._P, updated=self._updated)

@@ -96,7 +96,7 @@ class RbfnnBridgedLaw(Law):
     """u = dq / dt with dq as above, limited such that the feature's direction stays.
 
     Symbols: e error (m,) m; q joint position (n,) rad; Ĵ (m, n) m/rad; z, ŷ feature (m,) m; d delay of the camera,
-    periods, as the estimator tells it; lead, periods, a fraction: between two instants the reference is interpolated,
+    periods, from the estimate; lead, periods, a fraction: between two instants the reference is interpolated,
     beyond the preview it goes on as in its last period.
     """
 

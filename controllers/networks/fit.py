@@ -48,9 +48,9 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.signals import PlantSpec
 
 Progress = Callable[[float, str], None]
-JACOBIAN_SHARE = 0.4  # of the work, for the progress bar
-DIGEST_POINTS = 16  # joint positions at which a nominal model is told from another
-DIGEST_DECIMALS = 9  # so that the last bits of another machine make no other network
+JACOBIAN_SHARE = 0.4  # [1] of the work, for the progress bar
+DIGEST_POINTS = 16  # joint positions at which nominal models are compared
+DIGEST_DECIMALS = 9  # rounding, so that the last bits of another machine do not require a new training
 
 
 def train(
@@ -62,7 +62,7 @@ def train(
         config: region, sizes, grids and seed.
         nominal_jacobian: (S, n) rad -> (S, m, n).
         spec: sizes, speed limit and control period.
-        progress: told the share that is done and what is being done.
+        progress: called with the share that is done and what is being done.
 
     Returns:
         The networks with their held-out errors.
@@ -71,7 +71,7 @@ def train(
         ValueError: the region does not fit the plant, or the nominal Jacobian has another shape or is not finite.
     """
     digest = training_digest(config, nominal_jacobian, spec)
-    tell = progress if progress is not None else _no_progress
+    tell = progress if progress is not None else _ignore_progress
     jacobian, jacobian_error = _train_jacobian(config, nominal_jacobian, spec, tell)
     controller, controller_error = _train_controller(config, nominal_jacobian, spec, tell)
     tell(1.0, "done")
@@ -275,5 +275,5 @@ def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec)
     return J
 
 
-def _no_progress(share: float, what: str) -> None:
-    """Nobody watches."""
+def _ignore_progress(share: float, what: str) -> None:
+    """Do nothing with the progress."""

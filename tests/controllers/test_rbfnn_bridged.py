@@ -16,7 +16,7 @@ from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnB
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, update_step
 from servobench.controllers.networks.rbf import ControllerNetwork
 from servobench.controllers.servo import ServoController
-from servobench.plant.signals import Observation
+from servobench.plant.signals import Observation, PlantSpec
 
 TURN = Rotation.from_rotvec(np.radians(100.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
 
@@ -257,13 +257,7 @@ def test_settings_out_of_bounds_are_refused(changes, match):
 def test_what_does_not_fit_together_is_refused():
     with pytest.raises(ValueError, match="preview must be at least 1 for feedforward, got 0"):
         RbfnnBridgedLaw(RbfnnBridgedConfig(), dataclasses.replace(KNOWLEDGE, preview=0), networks())
-    fewer = dataclasses.replace(
-        SPEC,
-        joint_names=("a", "b"),
-        joint_velocity_limit=np.ones(2),
-        joint_lower=-np.ones(2),
-        joint_upper=np.ones(2),
-    )
+    fewer = PlantSpec.of_joints(("a", "b"), SPEC.feature_names, np.ones(2), -np.ones(2), np.ones(2), PERIOD)
     with pytest.raises(ValueError, match="network must be of 2 joints and 3 features, got 5 and 3"):
         RbfnnBridgedLaw(RbfnnBridgedConfig(), dataclasses.replace(KNOWLEDGE, spec=fewer), networks())
     rng = np.random.default_rng(0)
