@@ -100,7 +100,7 @@ class CircleTask:
     centre: Vector = (0.0, 0.0, 1.25)
     """[m] camera frame; (0.5, 0, 0.3) m in the base frame of the nominal robot"""
     radius: Positive = 0.3
-    """[m]"""
+    """[m] of the circle"""
     lap_time: Positive = 10.0
     """[s] 200 points a lap at the default period"""
     laps: Count = 2

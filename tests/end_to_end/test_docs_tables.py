@@ -17,7 +17,8 @@ from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
 from servobench.harness.run.episode import run_experiment
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.tasks import TASKS
 from servobench.plant.faults import RunFault
 from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import _KEYS
@@ -31,7 +32,9 @@ def config_classes():
     parts = [entry.config for entry in (*ESTIMATORS.values(), *LAWS.values())]
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
     whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
-    return {kind for kind in (*parts, *whole, InitialConfig, TrainingConfig) if dataclasses.fields(kind)}
+    tasks = [type(entry.default) for entry in TASKS.values()]
+    common = [InitialConfig, TrainingConfig, RunSettings]
+    return {kind for kind in (*parts, *whole, *tasks, *common) if dataclasses.fields(kind)}
 
 
 def test_all_settings_have_a_table_and_nothing_else_has():
