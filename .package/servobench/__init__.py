@@ -1,1 +1,48 @@
-"""A bench on which uncalibrated visual-servoing controllers are compared."""
+"""A bench on which uncalibrated visual-servoing controllers are compared.
+
+    import servobench
+
+    result = servobench.run("ukf_mfac", seed=3)
+    table = servobench.compare(["ukf_mfac", MyController], seeds=5)
+
+`run` and `compare` take controllers by name or as objects, `load` reads a results folder. A controller of your own is a
+subclass of `Controller`: `step` gets an `Observation` and the reference and returns a `Command`.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+    from servobench.harness.batch.api import Results, compare, load, run
+    from servobench.plant.signals import Command, Observation
+
+__all__ = [
+    "Command",
+    "Controller",
+    "ControllerEntry",
+    "Observation",
+    "Results",
+    "RobotKnowledge",
+    "compare",
+    "load",
+    "run",
+]
+
+_HOMES = {
+    "servobench.controllers.controller": ("Controller", "ControllerEntry", "RobotKnowledge"),
+    "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
+    "servobench.plant.signals": ("Command", "Observation"),
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import a name of the public interface when it is first used."""
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(home), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

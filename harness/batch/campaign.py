@@ -22,10 +22,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
+from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import Batch, check_batch
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.workers import Workers, open_workers
+from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, crashed_row, run_experiment
 from servobench.harness.run.request import RunRequest
@@ -53,15 +55,23 @@ class Cell:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive runs with common settings; `index` is that of the first."""
+    """Consecutive runs with common settings.
+
+    Attributes:
+        index: of the first run.
+        cells: the runs.
+        settings: overrides of the defaults.
+        entries: controllers that the registry does not know.
+    """
 
     index: int
     cells: tuple[Cell, ...]
     settings: Settings
+    entries: tuple[ControllerEntry, ...] = ()
 
     def singly(self) -> list[Chunk]:
         """Return each run as a chunk of its own."""
-        return [Chunk(self.index + i, (cell,), self.settings) for i, cell in enumerate(self.cells)]
+        return [Chunk(self.index + i, (cell,), self.settings, self.entries) for i, cell in enumerate(self.cells)]
 
 
 @dataclass(frozen=True)
@@ -72,17 +82,19 @@ class Campaign:
         cells: the runs, in the order of the table.
         settings: overrides of the defaults.
         steps: keep the table of steps too.
+        entries: controllers that the registry does not know.
     """
 
     cells: Sequence[Cell]
     settings: Settings
     steps: bool = False
+    entries: tuple[ControllerEntry, ...] = ()
 
 
-def comparison(batch: Batch, settings: Settings) -> Campaign:
+def comparison(batch: Batch, settings: Settings, entries: tuple[ControllerEntry, ...] = ()) -> Campaign:
     """Return the campaign of a comparison, with steps and, for the first seed, what the camera saw last."""
     cells = [Cell(request, picture=request.seed == min(batch.seeds)) for request in batch.requests()]
-    return Campaign(cells, settings, steps=True)
+    return Campaign(cells, settings, steps=True, entries=entries)
 
 
 class Observer:
@@ -128,8 +140,9 @@ def carry_out(
         ConfigurationError: a campaign that cannot be carried out, or a folder that cannot be used.
     """
     watcher = observer or Observer()
-    check_campaign(campaign, watcher)
-    manifest = describe_campaign(campaign)
+    with offering(campaign.entries):
+        check_campaign(campaign, watcher)
+        manifest = describe_campaign(campaign)
     if resume:
         results.read_manifest(folder)
     names = {"plants": manifest["plants"], "controllers": manifest["controllers"]}
@@ -252,7 +265,7 @@ def _missing_chunks(campaign: Campaign, done: set[int], *, single: bool) -> list
             chunks[-1].append(index)
         else:
             chunks.append([index])
-    return [Chunk(own[0], tuple(campaign.cells[i] for i in own), campaign.settings) for own in chunks]
+    return [Chunk(own[0], tuple(campaign.cells[i] for i in own), campaign.settings, campaign.entries) for own in chunks]
 
 
 def _unpack(task: bytes) -> list[RunResult]:
@@ -261,7 +274,8 @@ def _unpack(task: bytes) -> list[RunResult]:
 
 
 def _carry_out(chunk: Chunk, steps: bool, keep: Path | None) -> list[RunResult]:
-    return [_carry_out_run(cell, chunk.settings, steps, keep) for cell in chunk.cells]
+    with offering(chunk.entries):
+        return [_carry_out_run(cell, chunk.settings, steps, keep) for cell in chunk.cells]
 
 
 def _carry_out_run(cell: Cell, settings: Settings, steps: bool, keep: Path | None) -> RunResult:

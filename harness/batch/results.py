@@ -207,6 +207,11 @@ def load_steps(folder: Path, run_ids: list[str] | None = None) -> pd.DataFrame:
     return steps
 
 
+def has_steps(folder: Path) -> bool:
+    """Return whether a results folder has a table of steps."""
+    return (folder / STEPS).is_file() or bool(_part_files(folder, STEPS))
+
+
 def check_folder(folder: Path) -> None:
     """Refuse what is not a results folder of this schema.
 

@@ -6,6 +6,8 @@ A third party publishes a `PlantEntry` or `ControllerEntry` under the entry-poin
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -29,6 +31,21 @@ PLANTS = {
 MAPPED = "fmu:"
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
+
+
+_OFFERED: dict[str, ControllerEntry] = {}
+
+
+@contextlib.contextmanager
+def offering(entries: Iterable[ControllerEntry]) -> Iterator[None]:
+    """Let `find_controller` find further controllers within the context."""
+    before = dict(_OFFERED)
+    _OFFERED.update((entry.name, entry) for entry in entries)
+    try:
+        yield
+    finally:
+        _OFFERED.clear()
+        _OFFERED.update(before)
 
 
 def plant_names() -> list[str]:
@@ -72,7 +89,7 @@ def find_controller(name: str) -> ControllerEntry:
             return compose(law, estimator)
         except ValueError as error:
             raise ConfigurationError(f"controller {name!r}: {error}") from error
-    entry = METHODS.get(name) or _load(CONTROLLER_GROUP, "controller", name)
+    entry = _OFFERED.get(name) or METHODS.get(name) or _load(CONTROLLER_GROUP, "controller", name)
     if not isinstance(entry, ControllerEntry):
         raise ConfigurationError(
             f"controller {name!r} is published as {type(entry).__name__}, "

@@ -1,0 +1,185 @@
+"""The public interface: run and compare controllers, by name or as objects, and read results; see `servobench`."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import pandas as pd
+
+from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Campaign, Cell, carry_out, comparison
+from servobench.harness.batch.compare import Batch
+from servobench.harness.config.registry import controller_names, offering
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import RunResult, run_experiment
+from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.plant.settings import settings as settings_class
+
+AnyController: TypeAlias = str | type[Controller] | ControllerEntry
+Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
+
+
+class Results(NamedTuple):
+    """What a results folder holds."""
+
+    runs: pd.DataFrame
+    """a row a run"""
+    steps: pd.DataFrame | None
+    """a row a control period of each run; None if they were not kept"""
+    manifest: dict[str, Any]
+    """configuration, versions and seeds"""
+
+
+def run(
+    controller: AnyController,
+    plant: str = "kinematic",
+    *,
+    task: str = "exp1",
+    mismatch: str = "moderate",
+    seed: int = 0,
+    settings: Sections | None = None,
+) -> RunResult:
+    """Carry out one run in this process.
+
+    Args:
+        controller: a name such as "ukf_mfac" or "mfac+rls"; a subclass of `Controller`, which is constructed as
+            `cls(knowledge)` with a `RobotKnowledge`; or a `ControllerEntry`, for one with settings.
+        plant: name of the plant.
+        task: name of the task.
+        mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
+        seed: of everything random in the run.
+        settings: section -> key -> value, such as {"kinematic": {"lag": 0.1}}.
+
+    Returns:
+        The row of the table of runs (`row`) and the table of steps (`steps`); a run that fails says so in the row.
+
+    Raises:
+        ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
+    """
+    name, entries = _named([controller])
+    with offering(entries):
+        return run_experiment(RunRequest(plant, name[0], task, read_mismatch(mismatch), seed), Settings(settings or {}))
+
+
+def compare(
+    controllers: Sequence[AnyController],
+    plants: Sequence[str] = ("kinematic",),
+    tasks: Sequence[str] = ("exp1",),
+    *,
+    mismatches: Sequence[str] = ("moderate",),
+    seeds: int | Iterable[int] = 1,
+    settings: Sections | None = None,
+    out: Path | str | None = None,
+    workers: int = 1,
+    run_timeout: float | None = None,
+    resume: bool = False,
+) -> pd.DataFrame:
+    """Carry out every combination of plants, tasks, mismatches, controllers and seeds.
+
+    With several workers, a script must keep its calls below `if __name__ == "__main__":`, as with multiprocessing.
+    Controllers that cannot be pickled, or that are defined in a notebook, are carried out in this process.
+
+    Args:
+        controllers: names, classes or entries; see `run`.
+        plants: names of plants.
+        tasks: names of tasks.
+        mismatches: such as "moderate".
+        seeds: a number of seeds from 0 on, or the seeds.
+        settings: section -> key -> value.
+        out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
+        workers: number of processes.
+        run_timeout: [s] time limit of a run; None for no limit.
+        resume: carry out what is missing in `out`.
+
+    Returns:
+        The table of runs.
+
+    Raises:
+        ConfigurationError: something that cannot be used; it is a ValueError.
+    """
+    names, entries = _named(controllers)
+    chosen = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
+    batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen)
+    for what, values in (("controllers", names), ("plants", plants), ("tasks", tasks), ("mismatches", mismatches),
+                         ("seeds", chosen)):  # fmt: skip
+        if not len(values):
+            raise ConfigurationError(f"{what} must name at least one, got none")
+    place: dict[str, Any] = {"workers": workers, "run_timeout": run_timeout}
+    if not _can_travel(entries):
+        place = {"workers": 1}
+    whole = Settings(settings or {})
+    if out is not None:
+        carry_out(comparison(batch, whole, entries), Path(out), resume=resume, **place)
+        return results.load_runs(Path(out))
+    with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+        cells = [Cell(request) for request in batch.requests()]
+        carry_out(Campaign(cells, whole, entries=entries), Path(folder), **place)
+        return results.load_runs(Path(folder))
+
+
+def load(folder: Path | str) -> Results:
+    """Return the tables of a results folder, also of one whose runs were interrupted.
+
+    Raises:
+        ConfigurationError: not a results folder, or one of another schema.
+    """
+    path = Path(folder)
+    runs = results.load_runs(path)
+    steps = results.load_steps(path) if results.has_steps(path) else None
+    return Results(runs, steps, results.read_manifest(path))
+
+
+@settings_class
+class NoSettings:
+    """The settings of a controller that is given as a class: none."""
+
+
+@dataclass(frozen=True)
+class _Constructor:
+    """Builds a controller that is given as a class."""
+
+    kind: type[Controller]
+
+    def __call__(self, _settings: NoSettings, knowledge: RobotKnowledge) -> Controller:
+        construct: Any = self.kind
+        made: Controller = construct(knowledge)
+        return made
+
+
+def _named(controllers: Sequence[AnyController]) -> tuple[tuple[str, ...], tuple[ControllerEntry, ...]]:
+    """Return the names of controllers, and entries for those that are given as objects."""
+    names: list[str] = []
+    entries: list[ControllerEntry] = []
+    for given in controllers:
+        if isinstance(given, str):
+            names.append(given)
+            continue
+        if isinstance(given, ControllerEntry):
+            entry = given
+        elif isinstance(given, type) and issubclass(given, Controller):
+            summary = (inspect.getdoc(given) or given.__name__).splitlines()[0]
+            entry = ControllerEntry(given.__name__, summary, NoSettings, _Constructor(given))
+        else:
+            raise ConfigurationError(f"controller must be a name, a subclass of Controller or an entry, got {given!r}")
+        if entry.name in controller_names():
+            raise ConfigurationError(f"a controller called {entry.name!r} exists already; give yours another name")
+        names.append(entry.name)
+        entries.append(entry)
+    return tuple(names), tuple(entries)
+
+
+def _can_travel(entries: tuple[ControllerEntry, ...]) -> bool:
+    """Return whether a worker process can receive these entries."""
+    try:
+        text = pickle.dumps(entries)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return False
+    return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")

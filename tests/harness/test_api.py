@@ -1,0 +1,97 @@
+"""`import servobench` as a user's script sees it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servobench
+
+PACKAGE = Path(__file__).parents[2] / ".package"
+SHORT = {"exp1": {"duration": 0.5}}
+
+
+class Still(servobench.Controller):
+    """Commands no motion."""
+
+    def __init__(self, knowledge: servobench.RobotKnowledge) -> None:
+        self.n = knowledge.spec.n
+
+    def reset(self, observation, seed):
+        pass
+
+    def step(self, observation, reference):
+        return servobench.Command(np.zeros(self.n))
+
+    def diagnostics(self):
+        return {}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_controller_class_is_compared_with_a_named_one(workers):
+    table = servobench.compare([Still, "ukf_mfac"], seeds=2, settings=SHORT, workers=workers)
+    assert table["controller"].tolist() == ["Still", "Still", "ukf_mfac", "ukf_mfac"]
+    assert (table["status"] == "completed").all(), table["reason"].tolist()
+    effort = table.groupby("controller")["control_effort_rad"].max()
+    assert effort["Still"] == 0.0 < effort["ukf_mfac"]
+
+
+def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process():
+    class Local(Still):
+        """As Still."""
+
+    table = servobench.compare([Local], settings=SHORT, workers=2)
+    assert table["status"].tolist() == ["completed"]
+
+
+def test_a_folder_is_written_and_read(tmp_path):
+    table = servobench.compare([Still], settings=SHORT, out=tmp_path / "out")
+    found = servobench.load(tmp_path / "out")
+    assert found.runs["run_id"].tolist() == table["run_id"].tolist()
+    assert found.steps is not None
+    assert len(found.steps) == 10
+    assert found.manifest["controllers"] == ["Still"]
+
+
+def test_one_run_has_its_row_and_steps():
+    result = servobench.run(Still, seed=3, settings=SHORT)
+    assert (result.row["controller"], result.row["seed"], len(result.steps)) == ("Still", 3, 10)
+
+
+def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
+    with pytest.raises(ValueError, match="controller must be a name, a subclass of Controller or an entry, got 3"):
+        servobench.run(3)
+    taken = servobench.ControllerEntry("ukf_mfac", "", object, lambda _config, knowledge: Still(knowledge))
+    with pytest.raises(ValueError, match="a controller called 'ukf_mfac' exists already"):
+        servobench.compare([taken])
+    with pytest.raises(ValueError, match="seeds must name at least one"):
+        servobench.compare([Still], seeds=())
+
+
+def test_every_public_name_has_a_docstring_and_no_other_name_is_there():
+    assert set(servobench.__all__) <= set(dir(servobench))
+    assert all(getattr(servobench, name).__doc__ for name in servobench.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'walk'"):
+        _ = servobench.walk
+
+
+def test_importing_the_package_imports_nothing_heavy_and_folders_of_the_same_names_do_no_harm(tmp_path):
+    for name in ("plant", "controllers", "harness", "fmus"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('a foreign package')")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys, servobench\n"
+        "assert not {'numpy', 'pandas'} & set(sys.modules)\n"
+        "print(servobench.run('constant', settings={'exp1': {'duration': 0.5}}).row['status'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, str(script)], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(PACKAGE)},
+        capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    assert done.stdout.strip() == "completed", done.stderr
