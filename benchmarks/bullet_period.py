@@ -17,9 +17,9 @@ from servobench.plant.bullet.bullet_plant import (
     PHYSICS_STEP,
     BulletConfig,
     build_bullet,
-    ur5_body,
 )
 from servobench.plant.bullet.scene import Scene, view_of
+from servobench.plant.bullet.urdf import ur5_body
 from servobench.plant.checks import whole_steps
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot import ur5

@@ -18,8 +18,9 @@ import pandas as pd
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
-from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, ur5_body
+from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.bullet.urdf import ur5_body
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import PinholeCamera

@@ -22,7 +22,7 @@ from servobench.harness.run.log import Steps
 from servobench.harness.run.references import TaskKind
 from servobench.plant.checks import FloatArray
 
-SETTLING_BAND = 0.005  # [m]
+SETTLING_BAND = 0.005  # share of the feature's natural size
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
@@ -86,7 +86,7 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, f
     jacobian_error, condition = (values[~np.isnan(values)] for values in (
         steps.jacobian_error(), steps.jacobian_condition()))  # fmt: skip
     return {
-        "settling_time_s": settling_time(error, SETTLING_BAND, spec.period),
+        "settling_time_s": settling_time(error, SETTLING_BAND * spec.feature.scale, spec.period),
         "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[0], spec.period),
         "overshoot": overshoot(feature, reference[0]) if fixed else np.nan,
         "steady_state_error": float(np.mean(final)),

@@ -27,7 +27,7 @@ from servobench.plant.bullet.detection import (
     draw_detection,
     find_ball,
 )
-from servobench.plant.bullet.urdf import ArmBody
+from servobench.plant.bullet.urdf import ur5_body
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.faults import PlantDiverged
 from servobench.plant.plant import PlantEntry, PlantSetup
@@ -108,19 +108,6 @@ class Frame:
     rgb: ByteArray
     depth: FloatArray
     detection: Detection | None
-
-
-def ur5_body() -> ArmBody:
-    """Return masses, torques and looks of the UR5."""
-    return ArmBody(
-        mass=np.array(ur5.MASS),
-        centre_of_mass=np.array(ur5.CENTRE_OF_MASS),
-        inertia=np.array(ur5.INERTIA),
-        max_torque=np.array(ur5.MAX_TORQUE),
-        tube_radius=np.array(ur5.TUBE_RADIUS),
-        side_step=np.array(ur5.SIDE_STEP),
-        ball_radius=ur5.BALL_RADIUS,
-    )
 
 
 def velocity_targets(

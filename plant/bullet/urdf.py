@@ -4,7 +4,7 @@ The body frame of link i is frame i of `SerialArm` (after the rotation of joint 
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
 
 No link has a collision shape: a mismatched arm's parts may overlap at rest, and the contact solver would throw it
-apart.
+apart. Numbers are written with `repr`, so that none loses a digit.
 """
 
 from __future__ import annotations
@@ -13,17 +13,14 @@ from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.bullet.meshes import rectangles_obj
-from servobench.plant.bullet.urdf_elements import (
-    add_joint,
-    add_link,
-    draw_cylinder,
-    draw_mesh,
-    draw_sphere,
-)
 from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
+
+Colour = tuple[float, float, float, float]
 
 BASE_LINK, FLANGE_LINK, BALL_LINK = "base", "flange", "ball"
 ALUMINIUM = (0.76, 0.78, 0.80, 1.0)
@@ -33,10 +30,10 @@ RED = (0.90, 0.06, 0.05, 1.0)
 TABLE_TOP = (0.86, 0.85, 0.82, 1.0)
 TABLE_RIM = (0.48, 0.50, 0.53, 1.0)
 FLOOR_A, FLOOR_B = (0.55, 0.59, 0.63, 1.0), (0.51, 0.55, 0.59, 1.0)
-TABLE = (-0.32, -0.75, 1.15, 0.75)  # m, x and y from, x and y to
-FLOOR_DROP, TILE = 0.75, 0.4  # m, floor below the table's top; side of a floor tile
-LIGHT_PART = (0.001, (1e-6, 1e-6))  # kg, kg m², flange and ball: PyBullet takes 1 kg where nothing is given
-BASE_PART = (4.0, (0.01, 0.01))  # kg, kg m², held fast, so without effect
+TABLE = (-0.32, -0.75, 1.15, 0.75)  # [m] x and y of two opposite corners
+FLOOR_DROP, TILE = 0.75, 0.4  # [m] floor below the table's top; side of a floor tile
+LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBullet's default is 1 kg
+BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +73,19 @@ class ArmBody:
         check_number("ball_radius", self.ball_radius, above=0.0)
 
 
+def ur5_body() -> ArmBody:
+    """Return masses, torques and looks of the UR5."""
+    return ArmBody(
+        mass=np.array(ur5.MASS),
+        centre_of_mass=np.array(ur5.CENTRE_OF_MASS),
+        inertia=np.array(ur5.INERTIA),
+        max_torque=np.array(ur5.MAX_TORQUE),
+        tube_radius=np.array(ur5.TUBE_RADIUS),
+        side_step=np.array(ur5.SIDE_STEP),
+        ball_radius=ur5.BALL_RADIUS,
+    )
+
+
 def arm_urdf(arm: SerialArm, body: ArmBody, ball_mesh: str) -> str:
     """Return the URDF of an arm; its joint angles are the true ones, θ.
 
@@ -95,19 +105,19 @@ def arm_urdf(arm: SerialArm, body: ArmBody, ball_mesh: str) -> str:
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    _draw_base(add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], body.tube_radius[0])
+    _draw_base(_add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], body.tube_radius[0])
     for i, name in enumerate(arm.joint_names):
         step = arm.translation[i + 1]
         centre = rotation_from_rpy(arm.rpy[i + 1]) @ body.centre_of_mass[i] + step
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
-        link = add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre=centre, along=along)
+        link = _add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre=centre, along=along)
         _draw_link(link, step, body.tube_radius[i], body.side_step[i])
-        add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
-    add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    _draw_tool(add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, body)
-    add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
-    draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, body.ball_radius)
+        _add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
+    _add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
+    _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, body)
+    _add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
+    _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, body.ball_radius)
     return _text(robot)
 
 
@@ -117,11 +127,11 @@ def bench_files() -> dict[str, str]:
     `bench.urdf` is the one to load; it names the others.
     """
     robot = ET.Element("robot", name="bench")
-    bench = add_link(robot, "bench", *BASE_PART)
+    bench = _add_link(robot, "bench", *BASE_PART)
     x0, y0, x1, y1 = TABLE
     for x in (x0 + 0.04, x1 - 0.04):
         for y in (y0 + 0.04, y1 - 0.04):
-            draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
+            _draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
     rim = [(x0, y0, x0 + 0.02, y1), (x1 - 0.02, y0, x1, y1)]
     rim += [(x0 + 0.02, y0, x1 - 0.02, y0 + 0.02), (x0 + 0.02, y1 - 0.02, x1 - 0.02, y1)]
     top = [(x0 + 0.02, y0 + 0.02, x1 - 0.02, y1 - 0.02)]
@@ -137,7 +147,7 @@ def bench_files() -> dict[str, str]:
         ("floor_b", FLOOR_B, tiles[1], -FLOOR_DROP),
     ):
         files[f"{name}.obj"] = rectangles_obj(rectangles, height)
-        draw_mesh(bench, colour, f"{name}.obj", 1.0)
+        _draw_mesh(bench, colour, f"{name}.obj", 1.0)
     return files | {"bench.urdf": _text(robot)}
 
 
@@ -148,9 +158,9 @@ def _text(robot: ET.Element) -> str:
 
 def _draw_base(link: ET.Element, step: FloatArray, radius: float) -> None:
     """Draw the foot on the table and the stem up to the first joint."""
-    draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius)
-    draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius)
-    draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.0), step, radius)
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius)
+    _draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius)
+    _draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.0), step, radius)
 
 
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
@@ -159,18 +169,106 @@ def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -
     far_aside = abs(side) > radius
     # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
     outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
-    draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
-    draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
-    draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
-    draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
+    _draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
+    _draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
+    _draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
+    _draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
     if far_aside:
-        draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
-        draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
+        _draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
+        _draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
     else:
-        draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
+        _draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
 
 
 def _draw_tool(link: ET.Element, tool: FloatArray, body: ArmBody) -> None:
     """Draw the flange's plate and the stick that carries the ball."""
-    draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * body.tube_radius[-1])
-    draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * body.ball_radius)
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * body.tube_radius[-1])
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * body.ball_radius)
+
+
+def _numbers(values: npt.ArrayLike) -> str:
+    """Return numbers as URDF writes them, with spaces between."""
+    return " ".join(repr(value) for value in np.asarray(values, dtype=np.float64).tolist())
+
+
+def rpy_along(direction: npt.ArrayLike) -> FloatArray:
+    """Return the roll, pitch, yaw, (3,) rad, that turn the z axis into `direction` (3,)."""
+    x, y, z = np.asarray(direction, dtype=np.float64).tolist()
+    return np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
+
+
+def _add_link(
+    robot: ET.Element,
+    name: str,
+    mass: float,
+    inertia: npt.ArrayLike,
+    *,
+    centre: npt.ArrayLike = (0.0, 0.0, 0.0),
+    along: npt.ArrayLike = (0.0, 0.0, 1.0),
+) -> ET.Element:
+    """Add a link and return it.
+
+    Args:
+        robot: the URDF.
+        name: of the link.
+        mass: kg.
+        inertia: (2,), kg m², about the centre of mass: across `along` and about it.
+        centre: (3,), m, centre of mass in the body frame.
+        along: (3,), the direction about which the link is symmetric, in the body frame.
+    """
+    link = ET.SubElement(robot, "link", name=name)
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_numbers(centre), rpy=_numbers(rpy_along(along)))
+    ET.SubElement(inertial, "mass", value=repr(float(mass)))
+    across, about = (repr(value) for value in np.asarray(inertia, dtype=np.float64).tolist())
+    ET.SubElement(inertial, "inertia", ixx=across, iyy=across, izz=about, ixy="0", ixz="0", iyz="0")
+    return link
+
+
+def _add_joint(robot: ET.Element, name: str, ends: tuple[str, str], origin: FloatArray, *, turns: bool) -> None:
+    """Add a joint about z, or a fixed one.
+
+    Args:
+        robot: the URDF.
+        name: of the joint.
+        ends: names of the parent link and of the child link.
+        origin: (2, 3), the joint in the parent's frame: translation, m, and roll, pitch, yaw, rad.
+        turns: whether it turns; a turning joint has no limits, as the plant holds them.
+    """
+    joint = ET.SubElement(robot, "joint", name=name, type="continuous" if turns else "fixed")
+    ET.SubElement(joint, "parent", link=ends[0])
+    ET.SubElement(joint, "child", link=ends[1])
+    ET.SubElement(joint, "origin", xyz=_numbers(origin[0]), rpy=_numbers(origin[1]))
+    if turns:
+        ET.SubElement(joint, "axis", xyz="0 0 1")
+
+
+def _add_visual(link: ET.Element, colour: Colour, xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> ET.Element:
+    """Add a drawn part at `xyz` (3,) m, `rpy` (3,) rad of the body frame and return its empty geometry."""
+    visual = ET.SubElement(link, "visual")
+    ET.SubElement(visual, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
+    # PyBullet keeps materials by name, so every colour needs a name of its own.
+    material = ET.SubElement(visual, "material", name="rgba_" + "_".join(f"{255 * part:.0f}" for part in colour))
+    ET.SubElement(material, "color", rgba=_numbers(colour))
+    return ET.SubElement(visual, "geometry")
+
+
+def _draw_cylinder(link: ET.Element, colour: Colour, start: npt.ArrayLike, end: npt.ArrayLike, radius: float) -> None:
+    """Draw a cylinder between two points (3,) m of the body frame; nothing where they coincide."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    length = float(np.linalg.norm(b - a))
+    if length > 1e-6:
+        geometry = _add_visual(link, colour, (a + b) / 2, rpy_along(b - a))
+        ET.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(length))
+
+
+def _draw_sphere(link: ET.Element, colour: Colour, centre: npt.ArrayLike, radius: float) -> None:
+    """Draw a sphere at a point (3,) m of the body frame."""
+    geometry = _add_visual(link, colour, centre, np.zeros(3))
+    ET.SubElement(geometry, "sphere", radius=repr(float(radius)))
+
+
+def _draw_mesh(link: ET.Element, colour: Colour, file_name: str, scale: float) -> None:
+    """Draw a mesh at the body frame's origin, `scale` times as large as in its file."""
+    geometry = _add_visual(link, colour, np.zeros(3), np.zeros(3))
+    ET.SubElement(geometry, "mesh", filename=file_name, scale=_numbers([scale] * 3))

@@ -12,7 +12,7 @@ import zipfile
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
-import platformdirs
+from platformdirs import user_cache_dir
 
 
 def extract_fmu(path: Path) -> Path:
@@ -26,7 +26,7 @@ def extract_fmu(path: Path) -> Path:
         raise ValueError(f"fmu file {path} does not exist")
     status = path.stat()
     digest = _digest(path.resolve(), status.st_mtime_ns, status.st_size)
-    folder = Path(platformdirs.user_cache_dir("servobench")) / "extracted" / digest
+    folder = Path(user_cache_dir("servobench")) / "extracted" / digest
     if not folder.is_dir():
         _extract(path, folder)
     return folder

@@ -8,7 +8,7 @@ and lost frames are those of `servobench.plant.bench`.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -24,7 +24,7 @@ from servobench.plant.fmu.instance import Call, Instance, Port
 from servobench.plant.fmu.instance2 import Instance2
 from servobench.plant.fmu.instance3 import Instance3
 from servobench.plant.fmu.mapping import FmuMapping, Names, mapping_spec, read_mapping
-from servobench.plant.fmu.model_exchange import FmuModel, mapped_model
+from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.plant import PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.settings import Periods, nested, settings
@@ -46,8 +46,7 @@ class FmuState:
     """A saved state of an FMU's world.
 
     Attributes:
-        fmu: as bytes if the FMU can serialise; then any process with the same FMU can restore it. Else a handle of
-            the world that saved it.
+        fmu: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the world that saved it.
         period: number of periods since the start.
         integrated: (n,), rad, joint positions of an FMU that has none itself.
     """
@@ -105,12 +104,9 @@ class FmuWorld(World):
         self._camera = mapping.camera
         self._true_feature = self._port(mapping.true_features or mapping.features)
         self._true_jacobian = self._port(mapping.true_jacobian) if mapping.true_jacobian else None
-        self._true = self._model({}) if mapping.true_states else None
-        self._nominal = None if mapping.nominal is None else self._model(mapping.nominal)
-
-    def _model(self, parameters: Mapping[str, FloatArray]) -> FmuModel:
-        """Return the equations of the FMU, by its model-exchange side."""
-        return mapped_model(self._mapping, self.description, parameters)
+        self._true = mapped_model(mapping, self.description) if mapping.true_states else None
+        nominal = mapping.nominal
+        self._nominal = None if nominal is None else mapped_model(mapping, self.description, nominal)
 
     def _parameter(self, name: str, values: FloatArray) -> Call:
         port = Port(self.description.find(name, "parameters"))
@@ -156,11 +152,8 @@ class FmuWorld(World):
         status = self._write()
         if status:
             self._instance.check(f"writing {self._command.summary}", status)
-        if self._substeps == 1:
-            self._step(self._k * self._own_step)
-        else:
-            for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
-                self._step(i * self._own_step)
+        for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
+            self._step(i * self._own_step)
         self._k += 1
         if not self._has_joints:
             self._integrated = self._integrated + joint_velocity * self._period
@@ -219,7 +212,7 @@ class FmuWorld(World):
             ValueError: it has no such side, or the joints and features are not states and outputs of it.
         """
         if self._true is None:
-            self._true = self._model({})
+            self._true = mapped_model(self._mapping, self.description)
         return TrueModel(self._true.jacobian, self._true.symbolic)
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
@@ -263,13 +256,10 @@ class FmuWorld(World):
 
     def close(self) -> None:
         """Free the instance and unload the library."""
-        instance: Instance | None = self.__dict__.pop("_instance", None)
-        if instance is not None:
-            for state in self._states:
-                instance.free(state)
-            self._states.clear()
-            self._write = self._read = _closed
-            instance.close()
+        self._write = self._read = _closed
+        while self._states:
+            self._instance.free(self._states.pop())
+        self._instance.close()
 
 
 def open_instance(description: FmuDescription, root: Path) -> Instance:

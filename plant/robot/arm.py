@@ -114,8 +114,8 @@ class SerialArm:
             (..., n+1, 4, 4), m: entry i is the frame after joint i+1, the last one is the flange.
         """
         theta = self.joint_angle(joint_position)
-        # The joint axis goes first, so that the loop meets one joint after the other.
-        angle = np.moveaxis(theta, -1, 0)[..., None, None]
+        # The joint axis goes first, so that the loop meets one joint after the other; one pose needs no such move.
+        angle = (theta if theta.ndim == 1 else np.moveaxis(theta, -1, 0))[..., None, None]
         cos, sin = np.cos(angle), np.sin(angle) * TURN_SIGNS
         poses = np.empty((self.n + 1, *theta.shape[:-1], 4, 4))
         pose: FloatArray = self._fixed[0]
@@ -126,7 +126,7 @@ class SerialArm:
             turned[..., 2:] = pose[..., 2:]
             pose = turned @ fixed
         poses[self.n] = pose
-        return np.moveaxis(poses, 0, -3)
+        return poses if theta.ndim == 1 else np.moveaxis(poses, 0, -3)
 
     def flange_pose(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return X_BE, the flange in the base frame, (..., 4, 4), for joint positions (..., n) in rad."""

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 import pytest
 
 from kit.foreign_fmu import build_crane, describe
@@ -71,7 +70,7 @@ NAMES = {
 def cache(tmp_path, monkeypatch) -> Path:
     """The folder below which FMUs are extracted, empty for each test."""
     folder = tmp_path / "cache"
-    monkeypatch.setattr(platformdirs, "user_cache_dir", lambda *_: str(folder))
+    monkeypatch.setattr("servobench.plant.fmu.archive.user_cache_dir", lambda *_: str(folder))
     return folder
 
 
