@@ -6,21 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
-from servobench.fmus.export import ExportOptions, export_fmu
-from servobench.fmus.information import read_information
-from servobench.fmus.validate import validate_fmu
-from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.faults import FmuError
-from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import nominal_ur5
-from servobench.plant.seeds import named_seed
+from servobench.harness.cli.terminal import console
 
-console = Console()
-fmu_app = typer.Typer(help="Export the UR5 as an FMU, check FMUs, look into them.", no_args_is_help=True)
+fmu_app = typer.Typer(help="Export the UR5 as an FMU, check FMUs, show what is in them.", no_args_is_help=True)
 
 FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 
@@ -32,10 +21,18 @@ def export(
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
     platforms: Annotated[
-        str | None, typer.Option(help="By comma, such as x86_64-linux,aarch64-darwin, or all; default: this machine.")
+        str | None,
+        typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
     ] = None,
 ) -> None:
     """Export the UR5 with a mismatch as start values."""
+    from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
+    from servobench.fmus.export import ExportOptions, export_fmu
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+    from servobench.plant.robot.ur5 import nominal_ur5
+    from servobench.plant.seeds import named_seed
+
     try:
         model, _ = sample_mismatch(Mismatch.parse(mismatch), nominal_ur5(), named_seed(seed, "mismatch"))
         words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
@@ -50,6 +47,10 @@ def export(
 @fmu_app.command()
 def validate(file: FileArgument) -> None:
     """Check archive, description and, where it brings one, the reference run."""
+    from servobench.fmus.validate import validate_fmu
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.faults import FmuError
+
     try:
         found = validate_fmu(file)
     except (ValueError, FmuError) as error:
@@ -68,6 +69,11 @@ def validate(file: FileArgument) -> None:
 @fmu_app.command()
 def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
+    from rich.table import Table
+
+    from servobench.fmus.information import read_information
+    from servobench.harness.config.settings import ConfigurationError
+
     try:
         information = read_information(file)
     except ValueError as error:

@@ -8,8 +8,6 @@ from typing import Annotated, Any
 
 import typer
 
-from servobench.harness.config.settings import ConfigurationError
-
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
@@ -31,6 +29,8 @@ def split_words(text: str) -> tuple[str, ...]:
 
 def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
     """Split a comma-separated list of names, each of which `find` accepts; `all` stands for those in `known`."""
+    from servobench.harness.config.settings import ConfigurationError
+
     if text.strip() == "all":
         return tuple(known)
     names = tuple(dict.fromkeys(split_words(text)))
@@ -39,3 +39,24 @@ def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str]
     for name in names:
         find(name)
     return names
+
+
+def split_plants(text: str, option: str = "plants") -> tuple[str, ...]:
+    """Return the plants that a user named."""
+    from servobench.harness.config.registry import find_plant, plant_names
+
+    return split_names(option, text, plant_names(), find_plant)
+
+
+def split_controllers(text: str) -> tuple[str, ...]:
+    """Return the controllers that a user named."""
+    from servobench.harness.config.registry import controller_names, find_controller
+
+    return split_names("controllers", text, controller_names(), find_controller)
+
+
+def split_tasks(text: str) -> tuple[str, ...]:
+    """Return the tasks that a user named."""
+    from servobench.harness.run.tasks import find_task, task_names
+
+    return split_names("tasks", text, task_names(), find_task)

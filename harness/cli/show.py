@@ -1,8 +1,9 @@
-"""The commands `servobench statistics | report | record`: what a results folder tells."""
+"""The commands that show what there is, `plants | controllers | tasks`, and results, `statistics | report | record`."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +21,55 @@ RECORDINGS = "recordings"
 SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 
 
+NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
+
+
+def plants(name: NameArgument = None) -> None:
+    """List the plants, or show the settings of one."""
+    from servobench.harness.config.registry import find_plant, plant_names
+
+    _show("plants", name, plant_names(), find_plant, lambda entry: entry.config())
+
+
+def controllers(name: NameArgument = None) -> None:
+    """List the controllers, or show the settings of one."""
+    from servobench.controllers.parts import ESTIMATORS, LAWS
+    from servobench.harness.config.defaults import default_config
+    from servobench.harness.config.registry import controller_names, find_controller
+
+    _show("controllers", name, controller_names(), find_controller, default_config)
+    if not name:
+        console.print(f"or any law with any estimator, such as mfac+rls: laws {', '.join(LAWS)};", soft_wrap=True)
+        console.print(f"estimators {', '.join(ESTIMATORS)}", soft_wrap=True)
+
+
+def tasks(name: NameArgument = None) -> None:
+    """List the tasks, or show the settings of one."""
+    from servobench.harness.run.tasks import find_task, task_names
+
+    _show("tasks", name, task_names(), find_task, lambda entry: entry.default)
+
+
+def _show(
+    kind: str, name: str | None, names: Sequence[str], find: Callable[[str], Any], default: Callable[[Any], Any]
+) -> None:
+    """Print names with their summaries, or the settings of one with their defaults."""
+    from rich.table import Table
+
+    from servobench.harness.config.settings import ConfigurationError, flatten
+
+    table = Table("setting", "default") if name else Table(kind, "")
+    if name:
+        for key, value in flatten(default(find(name))).items():
+            table.add_row(f"{name}.{key}", str(value))
+    for known in () if name else names:
+        try:
+            table.add_row(known, find(known).summary)
+        except ConfigurationError as error:  # an extra is missing, or a plug-in is broken; the others are usable
+            table.add_row(known, str(error))
+    console.print(table)
+
+
 def statistics(
     folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
     metric: Annotated[
@@ -31,8 +81,8 @@ def statistics(
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
 ) -> None:
     """Judge the controllers of a folder: rates, medians, tails, failures, paired differences, with 95 % intervals."""
-    from servobench.harness.analysis.tables import statistics_tables  # noqa: PLC0415 - help texts do without pandas
-    from servobench.harness.batch import results  # noqa: PLC0415
+    from servobench.harness.analysis.tables import statistics_tables
+    from servobench.harness.batch import results
 
     tables = statistics_tables(results.load_runs(folder), metric, never)
     print_markdown(tables) if markdown else print_tables(tables)
@@ -48,7 +98,7 @@ def report(
 
 def make_report(folder: Path, out: Path | None = None) -> None:
     """Write the report and print its path and, if it took long, the time."""
-    from servobench.harness.pictures.report import write_report  # noqa: PLC0415 - only the extra report brings its needs
+    from servobench.harness.pictures.report import write_report
 
     began = time.monotonic()
     with console.status("making the report"):
@@ -82,8 +132,8 @@ def record(
     ] = None,
 ) -> None:
     """Show a run: film (MP4, GIF) and snapshots of the rendered arm, its camera's view and the error."""
-    from servobench.harness.config.settings import ConfigurationError, read_settings  # noqa: PLC0415 - see statistics
-    from servobench.harness.pictures.film import KINDS, find_kind, write_recording  # noqa: PLC0415
+    from servobench.harness.config.settings import ConfigurationError, read_settings
+    from servobench.harness.pictures.film import KINDS, find_kind, write_recording
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
     new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "seed": seed}
@@ -111,10 +161,10 @@ def record(
 
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
-    from servobench.harness.batch import results  # noqa: PLC0415 - see statistics
-    from servobench.harness.config.settings import ConfigurationError  # noqa: PLC0415
-    from servobench.harness.pictures.replay import logged_run  # noqa: PLC0415
-    from servobench.plant.settings import suggest  # noqa: PLC0415
+    from servobench.harness.batch import results
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.pictures.replay import logged_run
+    from servobench.plant.settings import suggest
 
     runs = results.load_runs(folder)
     names = runs["run_id"].tolist()
@@ -130,12 +180,12 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.config.settings import ConfigurationError, flatten  # noqa: PLC0415 - see statistics
-    from servobench.harness.pictures.replay import logged_run  # noqa: PLC0415
-    from servobench.harness.run.episode import run_experiment  # noqa: PLC0415
-    from servobench.harness.run.experiment import known_sections  # noqa: PLC0415
-    from servobench.harness.run.request import RunRequest, read_mismatch  # noqa: PLC0415
-    from servobench.plant.bullet.bullet_plant import BulletConfig  # noqa: PLC0415
+    from servobench.harness.config.settings import ConfigurationError, flatten
+    from servobench.harness.pictures.replay import logged_run
+    from servobench.harness.run.episode import run_experiment
+    from servobench.harness.run.experiment import known_sections
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.plant.bullet.bullet_plant import BulletConfig
 
     request = RunRequest(**asked | {"mismatch": read_mismatch(asked["mismatch"])})
     if request.seed < 0:

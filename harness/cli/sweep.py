@@ -8,11 +8,6 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from servobench.harness.analysis.tables import SWEEP_LEGEND, sweep_tables
-from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, carry_out
-from servobench.harness.batch.compare import Batch, parse_seeds
-from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.cli.options import (
     ConfigOption,
     ResumeOption,
@@ -20,30 +15,23 @@ from servobench.harness.cli.options import (
     SetOption,
     TimeoutOption,
     WorkersOption,
-    split_names,
+    split_controllers,
+    split_plants,
+    split_tasks,
     split_words,
 )
-from servobench.harness.cli.progress import watching
 from servobench.harness.cli.terminal import console, print_tables
-from servobench.harness.config.registry import (
-    controller_names,
-    find_controller,
-    find_plant,
-    plant_names,
-)
-from servobench.harness.config.settings import ConfigurationError, read_settings
-from servobench.harness.run.tasks import find_task, task_names
 
 Value = TypeVar("Value", int, float)
 
 
 def sweep(
     out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")],
-    plants: Annotated[str, typer.Option(help="Comma-separated names, or all.")] = "kinematic",
+    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic",
     controllers: Annotated[
-        str, typer.Option(help="Comma-separated names, or all.")
+        str, typer.Option(help="Comma-separated names, or 'all'.")
     ] = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
-    tasks: Annotated[str, typer.Option(help="Comma-separated names.")] = "random",
+    tasks: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "random",
     mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
     vary: Annotated[
         list[str] | None,
@@ -62,11 +50,19 @@ def sweep(
     config: ConfigOption = None,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
+    from servobench.harness.analysis.tables import SWEEP_LEGEND, sweep_tables
+    from servobench.harness.batch import results
+    from servobench.harness.batch.campaign import Campaign, carry_out
+    from servobench.harness.batch.compare import Batch, parse_seeds
+    from servobench.harness.batch.sweep import SweepPlan, parse_variation
+    from servobench.harness.cli.progress import watching
+    from servobench.harness.config.settings import read_settings
+
     plan = SweepPlan(
         Batch(
-            split_names("plants", plants, plant_names(), find_plant),
-            split_names("controllers", controllers, controller_names(), find_controller),
-            split_names("tasks", tasks, task_names(), find_task),
+            split_plants(plants),
+            split_controllers(controllers),
+            split_tasks(tasks),
             split_words(mismatch),
             parse_seeds(seeds),
         ),
@@ -85,6 +81,8 @@ def sweep(
 
 
 def _numbers(option: str, text: str, kind: Callable[[str], Value]) -> list[Value]:
+    from servobench.harness.config.settings import ConfigurationError
+
     try:
         numbers = [kind(part) for part in text.split(",") if part.strip()]
     except ValueError as error:

@@ -18,8 +18,8 @@ console = Console()
 
 def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -> None:
     """Print tables of text with their titles, and a legend below all of them."""
-    from rich.box import SIMPLE_HEAD  # noqa: PLC0415 - help texts do without
-    from rich.table import Table  # noqa: PLC0415
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
 
     for title, rows in tables:
         table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)

@@ -14,9 +14,8 @@ from pathlib import Path
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
-from servobench.harness.config.extras import missing_extra
+from servobench.harness.config.extras import check_late_imports, missing_extra
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
 
@@ -64,7 +63,10 @@ def find_plant(name: str) -> PlantEntry:
     Raises:
         ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
     """
+    check_late_imports("plant", name)
     if name.startswith(MAPPED):
+        from servobench.plant.fmu.fmu_plant import mapped_entry  # noqa: PLC0415 - only the extra fmu brings its needs
+
         try:
             return mapped_entry(Path(name.removeprefix(MAPPED)).expanduser())
         except ValueError as error:
@@ -83,6 +85,7 @@ def find_controller(name: str) -> ControllerEntry:
     Raises:
         ConfigurationError: no such controller, or a third party's that cannot be loaded.
     """
+    check_late_imports("controller", name)
     law, plus, estimator = name.partition("+")
     if plus:
         try:

@@ -89,7 +89,7 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
         with figure_style():
             metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
             figure.savefig(path, dpi=RESOLUTION, metadata=metadata)
-        figure.set_layout_engine("none")  # everything stands where it should; finding that takes most of the time
+        figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
         paths.append(path)
     return paths
 

@@ -19,6 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
+from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.panels import SETTLED
@@ -234,11 +235,10 @@ def _ffmpeg() -> Any:  # noqa: ANN401 - the optional package has no types
     try:
         ffmpeg = import_module("imageio_ffmpeg")
         ffmpeg.get_ffmpeg_exe()
-    except (ImportError, RuntimeError) as error:
-        raise ConfigurationError(
-            "mp4 and gif need ffmpeg, which the extra 'animation' brings: pip install 'servobench[animation]'; "
-            f"--kinds {SNAPSHOTS} works without it"
-        ) from error
+    except ImportError as error:
+        raise ConfigurationError(f"{missing_extra(error, 'a film')}; --kinds {SNAPSHOTS} works without it") from error
+    except RuntimeError as error:
+        raise ConfigurationError(f"no ffmpeg for mp4 and gif, --kinds {SNAPSHOTS} works without it: {error}") from error
     return ffmpeg
 
 

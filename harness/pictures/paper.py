@@ -28,7 +28,7 @@ from servobench.harness.pictures.panels import (
 )
 from servobench.harness.pictures.tracks import Tracks
 
-ROOM_IN_SPACE = (0.0, 0.0, 0.95, 0.95)  # matplotlib does not reckon with the labels of axes in space
+ROOM_IN_SPACE = (0.0, 0.0, 0.95, 0.95)  # constrained layout ignores 3-D axis labels
 
 
 def draw_moves(tasks: dict[str, Tracks], styles: Styles) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,6 @@ from servobench.plant.plant import (
 )
 from servobench.plant.robot.hand_eye import FEATURE_NAMES, HandEyeModel, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
-from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import PlantSpec
@@ -176,7 +176,12 @@ def _build_with_own_robot(
 
 
 def _equations(model: HandEyeModel) -> TrueModel:
-    return TrueModel(model.jacobian, symbolic_feature(model))
+    def symbolic(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
+        from servobench.plant.robot.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
+
+        return symbolic_feature(model)(joint_position)
+
+    return TrueModel(model.jacobian, symbolic)
 
 
 def _build_scenario(request: RunRequest, settings: Settings, setting: TaskSetting) -> Scenario:

@@ -112,7 +112,10 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
         (("run", "--mismatch", "factory=none.yaml"), "none.yaml cannot be read"),
         (("run", "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
         (("run", "--plant", "kinematic", "--view"), "--view shows the plant bullet only, got --plant kinematic"),
-        (("run", "--set", "run.period=0.007"), "period must be a whole multiple of the plant's own step"),
+        (
+            ("run", "--plant", "bullet", "--set", "run.period=0.007"),
+            "period must be a whole multiple of the plant's own step",
+        ),
         (("run", "--set", "run.period=-1"), "run.period must be above 0, got -1"),
         (("run", "--set", "bullet.sensing.feature_noise=-1"), "bullet.sensing.feature_noise must be"),
         (("run", "--set", "kinematc.lag=1"), "unknown section 'kinematc': did you mean 'kinematic'?"),

@@ -1,0 +1,192 @@
+"""The commands `servobench run | compare | train | collect`."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servobench.harness.cli.options import (
+    INTERRUPTED,
+    ConfigOption,
+    ResumeOption,
+    SchedulerOption,
+    SetOption,
+    TimeoutOption,
+    WorkersOption,
+    split_controllers,
+    split_plants,
+    split_tasks,
+    split_words,
+)
+from servobench.harness.cli.show import make_report
+from servobench.harness.cli.terminal import console, print_tables
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from servobench.harness.batch.campaign import Campaign
+
+OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
+ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
+
+
+def run(
+    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "kinematic",
+    controller: Annotated[str, typer.Option(help="Name of the controller, or of a law with --estimator.")] = "ukf_mfac",
+    estimator: Annotated[str | None, typer.Option(help="Compose the law --controller with this estimator.")] = None,
+    task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",
+    mismatch: Annotated[str, typer.Option(help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.")] = (
+        "moderate"
+    ),
+    seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
+    set_: SetOption = None,
+    config: ConfigOption = None,
+    view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
+    out: OutOption = None,
+    with_report: ReportOption = False,
+) -> None:
+    """Carry out one run."""
+    from servobench.harness.batch.campaign import comparison
+    from servobench.harness.batch.compare import Batch, parse_seeds
+    from servobench.harness.config.settings import ConfigurationError, read_settings
+
+    assignments = list(set_ or [])
+    if view:
+        if plant != "bullet":
+            raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
+        assignments.append("bullet.view=true")
+    name = f"{controller}+{estimator}" if estimator else controller
+    batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
+    _carry_out(comparison(batch, read_settings(config, assignments)), out, with_report=with_report, workers=1)
+
+
+def compare(
+    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic",
+    controllers: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "all",
+    tasks: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "exp1,exp2,exp3,exp4,circle",
+    mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
+    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "1",
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    run_timeout: TimeoutOption = None,
+    resume: ResumeOption = False,
+    set_: SetOption = None,
+    config: ConfigOption = None,
+    out: OutOption = None,
+    with_report: ReportOption = True,
+) -> None:
+    """Run every combination and compare the controllers."""
+    from servobench.harness.batch.campaign import comparison
+    from servobench.harness.batch.compare import Batch, parse_seeds
+    from servobench.harness.config.settings import ConfigurationError, read_settings
+
+    batch = Batch(
+        split_plants(plants),
+        split_controllers(controllers),
+        split_tasks(tasks),
+        split_words(mismatch),
+        parse_seeds(seeds),
+    )
+    if resume and out is None:
+        raise ConfigurationError("--resume needs --out, the folder to continue in")
+    _carry_out(
+        comparison(batch, read_settings(config, set_ or [])), out, with_report=with_report, workers=workers,
+        scheduler=scheduler, run_timeout=run_timeout, resume=resume,
+    )  # fmt: skip
+
+
+def train(
+    controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
+    set_: SetOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Train the networks of a controller on the nominal model, unless they are kept already; print their errors."""
+    from rich.table import Table
+
+    from servobench.harness.cli.progress import run_progress
+    from servobench.harness.config.settings import read_settings
+    from servobench.harness.run.experiment import known_sections, train_networks
+    from servobench.harness.run.network_cache import cache_folder
+
+    settings = read_settings(config, set_ or [])
+    settings.check_sections([*known_sections(), controller])
+    with run_progress(console) as progress:
+        bar = progress.add_task("training", total=1.0)
+        trained = train_networks(
+            controller, settings, lambda share, what: progress.update(bar, completed=share, description=what)
+        )
+        progress.update(bar, completed=1.0, description="done")
+    table = Table("network", "held-out error")
+    table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
+    table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
+    console.print(table)
+    console.print(f"kept in {cache_folder()}", soft_wrap=True)
+
+
+def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
+    """Put the finished runs of a killed batch together into its tables."""
+    from servobench.harness.batch import results
+
+    results.check_folder(folder)
+    console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
+
+
+def _carry_out(
+    campaign: Campaign,
+    out: Path | None,
+    *,
+    with_report: bool,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    run_timeout: float | None = None,
+    resume: bool = False,
+) -> None:
+    """Check everything, run everything, and leave tables, figures and a report behind."""
+    from servobench.harness.analysis.tables import SUMMARY_LEGEND, summary_tables
+    from servobench.harness.batch import results
+    from servobench.harness.batch.campaign import carry_out
+    from servobench.harness.cli.progress import ConsoleObserver
+    from servobench.harness.config.extras import missing_extra
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.pictures.draw import draw_figures
+
+    folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    interrupted = False
+    with contextlib.closing(ConsoleObserver(console)) as observer:
+        try:
+            carry_out(
+                campaign, folder, workers=workers, scheduler=scheduler, run_timeout=run_timeout, resume=resume,
+                observer=observer,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            if not folder.exists():
+                raise
+            interrupted = True
+    results.collect(folder)
+    runs = results.load_runs(folder)
+    print_tables(summary_tables(runs), SUMMARY_LEGEND)
+    _print_faults(runs)
+    with console.status("drawing the figures"):
+        figures = draw_figures(folder)
+    if out is None:
+        results.point_latest(folder)
+    console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
+    if interrupted:
+        console.print(f"interrupted: {len(runs)} of {len(campaign.cells)} runs were finished and kept")
+        sys.exit(INTERRUPTED)
+    if with_report:
+        try:
+            make_report(folder)
+        except (ConfigurationError, ImportError) as error:  # the runs are safe; `servobench report` can be called again
+            missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
+            console.print(f"no report: {missing or error}", soft_wrap=True, markup=False)
+
+
+def _print_faults(runs: pd.DataFrame) -> None:
+    for row in runs[runs["reason"] != ""].to_dict("records"):
+        console.print(f"{row['run_id']}: {row['status']}: {row['reason']}", soft_wrap=True, markup=False)

@@ -1,0 +1,174 @@
+"""The commands `servobench robustness | claims | tune`: studies of many runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servobench.harness.cli.options import (
+    INTERRUPTED,
+    ConfigOption,
+    ResumeOption,
+    SchedulerOption,
+    SetOption,
+    TimeoutOption,
+    WorkersOption,
+    split_controllers,
+    split_names,
+    split_plants,
+    split_words,
+)
+from servobench.harness.cli.terminal import console
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rich.table import Table
+
+    from servobench.harness.batch.workers import Workers
+    from servobench.harness.studies.tuning.files import TunedValues
+    from servobench.harness.studies.tuning.study import MethodStudy, TuningPlan
+
+DEFAULT_CONTROLLERS = "rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
+EXIT_DIFFERENT = 1
+
+
+def robustness(
+    out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")],
+    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
+    controllers: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = DEFAULT_CONTROLLERS,
+    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "40",
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    run_timeout: TimeoutOption = None,
+    resume: ResumeOption = False,
+    set_: SetOption = None,
+    config: ConfigOption = None,
+) -> None:
+    """Draw the robustness map: success and settling time along seven axes, each varied by itself."""
+    from servobench.harness.batch.compare import parse_seeds
+    from servobench.harness.cli.progress import watching
+    from servobench.harness.config.settings import read_settings
+    from servobench.harness.studies.robustness import make_map
+
+    settings = read_settings(config, set_ or [])
+    names = split_controllers(controllers)
+    where = split_plants(plant, "plant")[0]
+    with watching(console, out) as observer:
+        files = make_map(
+            out, where, names, parse_seeds(seeds), settings, workers=workers, scheduler=scheduler,
+            run_timeout=run_timeout, resume=resume, observer=observer,
+        )  # fmt: skip
+    console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
+
+
+def claims(
+    out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")],
+    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic,fmu",
+    seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 100,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    run_timeout: TimeoutOption = None,
+    resume: ResumeOption = False,
+    check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
+) -> None:
+    """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
+    from servobench.harness.cli.progress import watching
+    from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
+    from servobench.harness.studies.claims.table import ANSWERS, differences, read_answers
+
+    names = split_plants(plants)
+    wanted = None if check is None else read_answers(check)
+    with watching(console, out) as observer:
+        answers = reproduce(
+            out, names, seeds, workers=workers, scheduler=scheduler, run_timeout=run_timeout, resume=resume,
+            observer=observer,
+        )  # fmt: skip
+    for answer in answers:
+        console.print(
+            f"[bold]{answer.title} on {answer.plant}: {answer.verdict}[/bold]", soft_wrap=True, highlight=False
+        )
+        console.print(answer.evidence, markup=False, highlight=False)
+    console.print(f"answers in {out / ANSWERS}, figures in {out / FIGURES}", soft_wrap=True)
+    if wanted is not None:
+        lines = differences(answers, wanted)
+        console.print("\n".join(lines) or f"the same answers as in {check}", soft_wrap=True, markup=False)
+        if lines:
+            sys.exit(EXIT_DIFFERENT)
+
+
+def tune(
+    controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
+    trials: Annotated[int, typer.Option(help="Trials of each method, that of the defaults included.")] = 100,
+    seeds: Annotated[int, typer.Option(help="Moves of a trial on each plant; half as many circles are added.")] = 8,
+    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic",
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    run_timeout: TimeoutOption = None,
+    offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
+    study_seed: Annotated[int, typer.Option(help="Seed of the sampler.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
+        Path("results") / "tuning"
+    ),
+) -> None:
+    """Search for the best settings of each method, with the same budget on the same training plants."""
+    from servobench.harness.batch.results import locked
+    from servobench.harness.batch.workers import open_workers
+    from servobench.harness.studies.tuning.objective import TuningSet
+    from servobench.harness.studies.tuning.study import TuningPlan, check_study_folder, open_studies, write_outcomes
+
+    plan = TuningPlan(_split_tunable(controllers), trials, TuningSet(split_words(plants), seeds, offset), study_seed)
+    check_study_folder(out)
+    names = {"plants": plan.runs.plants, "controllers": plan.controllers}
+    with open_workers(workers, scheduler, run_timeout, **names) as place, locked(out):
+        studies = open_studies(out, plan)
+        interrupted = not _advance(studies, plan, place)
+    console.print(_tuned_table(write_outcomes(out, studies)))
+    console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
+    if interrupted:
+        console.print("interrupted; the same call continues where it stopped")
+        sys.exit(INTERRUPTED)
+
+
+def _advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> bool:
+    """Advance the studies to their end and show how far they are; return whether they got there."""
+    from rich.progress import TextColumn
+
+    from servobench.harness.cli.progress import run_progress
+    from servobench.harness.studies.tuning.study import advance
+
+    runs = len(plan.runs.runs())
+    with run_progress(console, TextColumn("runs, best {task.fields[best]}")) as progress:
+        bars = {
+            study.controller: progress.add_task(
+                study.controller, total=plan.trials * runs, completed=len(study.finished()) * runs, best="–"
+            )
+            for study in studies
+        }
+        try:
+            for finished in advance(studies, plan, workers):
+                best = "–" if finished.best is None else f"{finished.best:.4f}"
+                progress.update(bars[finished.controller], advance=1, best=best)
+        except KeyboardInterrupt:
+            return False
+    return True
+
+
+def _tuned_table(outcomes: Mapping[str, TunedValues]) -> Table:
+    from rich.table import Table
+
+    table = Table("controller", "trials", "score of defaults", "score tuned", "best trial")
+    for name, tuned in outcomes.items():
+        table.add_row(
+            name, str(tuned.trials), f"{tuned.score_of_defaults:.4f}", f"{tuned.score:.4f}", str(tuned.best_trial)
+        )
+    return table
+
+
+def _split_tunable(text: str) -> tuple[str, ...]:
+    from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
+
+    return split_names("controllers", text, tuple(SPACES), find_tunable)
