@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         path: the file; an old one is replaced.
         write: writes the content to the path that it is given.
     """
-    partial = path.with_name(f".{path.name}-{os.getpid()}")
+    partial = path.with_name(f".{path.name}-{os.getpid()}-{threading.get_ident()}")
     try:
         write(partial)
         partial.replace(path)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, Kernel
+from servobench.plant.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 1
@@ -52,14 +51,12 @@ def save_networks(networks: TrainedNetworks, path: Path) -> None:
         path: the .npz file; its folder is made where absent.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
+
+    def write(partial: Path) -> None:
+        with partial.open("wb") as file:
             np.savez(file, **_as_arrays(networks))
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+
+    write_atomically(path, write)
 
 
 def load_networks(

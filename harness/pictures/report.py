@@ -33,6 +33,7 @@ from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import folder_figures, picture_of
 from servobench.harness.pictures.interactive import interactive_paths, plotly_script
 from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.plant.files import write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
@@ -75,10 +76,8 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
         raise ConfigurationError(f"{folder} holds no finished run")
     target = path or folder / NAME
     page = _page(folder, runs)
-    partial = target.with_name(f".{target.name}")
     try:
-        partial.write_text(page, encoding="utf-8")
-        partial.replace(target)
+        write_atomically(target, lambda file: file.write_text(page, encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(f"report {target} cannot be written: {error.strerror}") from error
     return target
