@@ -10,6 +10,7 @@ import pytest
 from kit.documents import ROOT
 
 EXAMPLES = {
+    "own_controller": r"ResolvedRate +\d.*\n.*constant.*\n.*ukf_mfac",
     "fmu_in_fmpy": r"nominal: ball at \[.*\n.*off by 3°: ball at",
     "sweep_in_pandas": r"completed +18\n(.*\n)*.*constant +ukf_mfac\n",
 }
