@@ -13,8 +13,9 @@ from typing import Final
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.experiment import build_experiment, known_sections
+from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.resolved import known_sections
 
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 

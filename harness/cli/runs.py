@@ -110,8 +110,9 @@ def train(
 
     from servobench.harness.cli.progress import run_progress
     from servobench.harness.config.settings import read_settings
-    from servobench.harness.run.experiment import known_sections, train_networks
+    from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import cache_folder
+    from servobench.harness.run.resolved import known_sections
 
     settings = read_settings(config, set_ or [])
     settings.check_sections([*known_sections(), controller])

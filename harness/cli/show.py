@@ -183,8 +183,8 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     from servobench.harness.config.settings import ConfigurationError, flatten
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
-    from servobench.harness.run.experiment import known_sections
     from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolved import known_sections
     from servobench.plant.bullet.bullet_plant import BulletConfig
 
     request = RunRequest(**asked | {"mismatch": read_mismatch(asked["mismatch"])})

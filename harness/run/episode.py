@@ -11,11 +11,12 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build
 from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.threads import one_thread
 from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
@@ -53,7 +54,14 @@ def run_experiment(
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    experiment = build_experiment(request, settings, keep=keep)
+    return carry_out(resolve(request, settings), steps=steps, picture=picture, keep=keep)
+
+
+def carry_out(
+    resolved: ResolvedRun, *, steps: bool = True, picture: bool = False, keep: Path | None = None
+) -> RunResult:
+    """Carry out a run whose settings are resolved; arguments and errors as in `run_experiment`."""
+    request, experiment = resolved.request, build(resolved, keep=keep)
     plant, scenario = experiment.plant, experiment.scenario
     log = StepLog(plant.spec, experiment.periods)
     status, reason = COMPLETED, ""

@@ -14,23 +14,13 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import (
-    controller_names,
-    find_controller,
-    find_plant,
-    plant_names,
-)
+from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.tasks import (
-    Scenario,
-    TaskSetting,
-    find_task,
-    task_names,
-)
-from servobench.plant.bench import vary_sensing
+from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import (
@@ -59,7 +49,7 @@ class Experiment:
 
     @property
     def loop(self) -> LoopSettings:
-        """What the loop has to know."""
+        """The settings of the loop."""
         move = None
         if self.moved is not None:
             move = CameraMove(int(self.run.camera_moves_at * self.periods), self.moved.X_BC)
@@ -71,29 +61,28 @@ class Experiment:
         return self.run.periods(self.scenario.duration)
 
 
-def known_sections() -> list[str]:
-    """Return every section that a configuration may have."""
-    return ["run", *plant_names(), *controller_names(), *task_names()]
-
-
 def build_experiment(
     request: RunRequest, settings: Settings, *, keep: Path | None = None, progress: Progress | None = None
 ) -> Experiment:
+    """Make a run ready from a request and overrides of the defaults; see `build`."""
+    return build(resolve(request, settings), keep=keep, progress=progress)
+
+
+def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress | None = None) -> Experiment:
     """Make a run ready.
 
     Args:
-        request: what to run.
-        settings: overrides of the defaults.
+        resolved: what to run.
         keep: results folder in which trained networks are kept beside the runs.
-        progress: told how far a training of networks is.
+        progress: called with the share of a training of networks that is done.
 
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    run = settings.resolve("run", RunSettings())
+    request, run = resolved.request, resolved.run
     entry = find_plant(request.plant)
     if entry.own_robot:
-        return _build_with_own_robot(request, settings, run, entry, keep, progress)
+        return _build_with_own_robot(resolved, entry, keep, progress)
     nominal = nominal_ur5()
     try:
         true, sample = sample_mismatch(request.mismatch, nominal, named_seed(request.seed, "mismatch"))
@@ -101,12 +90,12 @@ def build_experiment(
         raise ConfigurationError(str(error)) from error
     moved = sample.moved(true)
     setting = TaskSetting(true, true.arm.n, FEATURE_NAMES, named_seed(request.seed, "task"), moved)
-    scenario = _build_scenario(request, settings, setting)
-    plant = _build_plant(request, settings, entry, PlantSetup(true, scenario.start, run.period))
+    scenario = _build_scenario(resolved, setting)
+    plant = _build_plant(resolved, entry, PlantSetup(true, scenario.start, run.period))
     try:
         source = network_source(nominal.jacobian, plant.spec, keep, progress)
         knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
-        controller = _build_controller(request, settings, knowledge, lambda: _equations(true))
+        controller = _build_controller(request.controller, resolved.controller, knowledge, lambda: _equations(true))
     except BaseException:
         plant.close()
         raise
@@ -130,8 +119,8 @@ def train_networks(controller: str, settings: Settings, progress: Progress) -> T
         trained.append(source(config))
         return trained[-1]
 
-    request = RunRequest("", controller, "", Mismatch(), 0)
-    _build_controller(request, settings, replace(knowledge, train=obtain), lambda: _equations(nominal))
+    config = settings.resolve(controller, default_config(find_controller(controller)))
+    _build_controller(controller, config, replace(knowledge, train=obtain), lambda: _equations(nominal))
     if not trained:
         raise ConfigurationError(f"controller {controller} has no networks to train")
     return trained[-1]
@@ -148,27 +137,23 @@ def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
 
 
 def _build_with_own_robot(
-    request: RunRequest,
-    settings: Settings,
-    run: RunSettings,
-    entry: PlantEntry,
-    keep: Path | None,
-    progress: Progress | None,
+    resolved: ResolvedRun, entry: PlantEntry, keep: Path | None, progress: Progress | None
 ) -> Experiment:
     """Make a run ready on a plant of whose robot only the plant itself knows anything."""
+    request, run = resolved.request, resolved.run
     if request.mismatch != Mismatch():
         raise ConfigurationError(
             f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
         )
-    plant = _build_plant(request, settings, entry, PlantSetup(None, None, run.period))
+    plant = _build_plant(resolved, entry, PlantSetup(None, None, run.period))
     try:
         spec = plant.spec
         setting = TaskSetting(None, spec.n, spec.feature_names, named_seed(request.seed, "task"))
-        scenario = _build_scenario(request, settings, setting)
+        scenario = _build_scenario(resolved, setting)
         nominal = plant.nominal_jacobian()
         source = None if nominal is None else network_source(nominal, spec, keep, progress)
         knowledge = RobotKnowledge(spec, run.preview, nominal, train=source)
-        controller = _build_controller(request, settings, knowledge, plant.true_model)
+        controller = _build_controller(request.controller, resolved.controller, knowledge, plant.true_model)
     except BaseException:
         plant.close()
         raise
@@ -184,38 +169,33 @@ def _equations(model: HandEyeModel) -> TrueModel:
     return TrueModel(model.jacobian, symbolic)
 
 
-def _build_scenario(request: RunRequest, settings: Settings, setting: TaskSetting) -> Scenario:
-    task = find_task(request.task)
-    config = settings.resolve(request.task, task.default)
+def _build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
+    name = resolved.request.task
     try:
-        return task.build(config, setting)
+        return find_task(name).build(resolved.task, setting)
     except ValueError as error:
-        raise ConfigurationError(f"task {request.task}: {error}") from error
+        raise ConfigurationError(f"task {name}: {error}") from error
 
 
-def _build_plant(request: RunRequest, settings: Settings, entry: PlantEntry, setup: PlantSetup) -> Plant:
-    config = settings.resolve(request.plant, entry.config())
+def _build_plant(resolved: ResolvedRun, entry: PlantEntry, setup: PlantSetup) -> Plant:
     try:
-        if request.noise_factor != 1.0 or request.latency_periods is not None:
-            config = vary_sensing(config, request.noise_factor, request.latency_periods)
-        return entry.build(config, setup)
+        return entry.build(resolved.plant, setup)
     except (ValueError, RunFault) as error:
-        raise ConfigurationError(f"plant {request.plant}: {error}") from error
+        raise ConfigurationError(f"plant {resolved.request.plant}: {error}") from error
 
 
 def _build_controller(
-    request: RunRequest, settings: Settings, knowledge: RobotKnowledge, tell: Callable[[], TrueModel]
+    name: str, config: object, knowledge: RobotKnowledge, true_model: Callable[[], TrueModel]
 ) -> Controller:
-    """Build a controller; only one that asks for the truth has it told. Where no model is nominal, the truth is."""
-    entry = find_controller(request.controller)
-    config = settings.resolve(request.controller, default_config(entry))
+    """Build a controller; the truth goes only to one that asks for it, as the nominal model where there is none."""
+    entry = find_controller(name)
     try:
         if entry.needs_truth:
-            true = tell()
+            true = true_model()
             nominal = knowledge.nominal_jacobian or true.jacobian
             knowledge = replace(
                 knowledge, nominal_jacobian=nominal, true_jacobian=true.jacobian, true_symbolic=true.symbolic
             )
         return entry.build(config, knowledge)
     except ValueError as error:
-        raise ConfigurationError(f"controller {request.controller}: {error}") from error
+        raise ConfigurationError(f"controller {name}: {error}") from error

@@ -20,7 +20,6 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 JOINT_UNIT = "rad"
-COMMAND_UNIT = "rad/s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +92,7 @@ class Steps:
         columns.update(_named("feature", features, unit, self.feature))
         columns.update(_named("true_feature", features, unit, self.true_feature))
         columns.update(_named("joint_position", joints, JOINT_UNIT, self.joint_position))
-        columns.update(_named("joint_velocity_command", joints, COMMAND_UNIT, self.command))
+        columns.update(_named("joint_velocity_command", joints, self.spec.command.unit, self.command))
         columns["error_norm"] = self.error_norm()
         columns["jacobian_error"] = self.jacobian_error()
         columns["jacobian_condition"] = self.jacobian_condition()

@@ -2,7 +2,7 @@
 
 | metric | meaning |
 |---|---|
-| settling_time_s | first time after which the error stays within 5 mm, for at least half a second; NaN if never |
+| settling_time_s | first time after which the error stays within the band (5 mm), for at least 0.5 s; NaN if never |
 | settling_time_5pct_s | the same for 5 % of the initial error |
 | overshoot | how far the feature passes a fixed target, as a share of the initial error; NaN when tracking |
 | steady_state_error | mean error of the last second |
@@ -22,7 +22,7 @@ from servobench.harness.run.log import Steps
 from servobench.harness.run.references import TaskKind
 from servobench.plant.checks import FloatArray
 
-SETTLING_BAND = 0.005  # share of the feature's natural size
+SETTLING_BAND = 0.005  # share of the feature's natural size: 5 mm on the UR5
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
