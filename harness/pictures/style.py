@@ -13,7 +13,7 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
-BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY, YELLOW, GREY, BLACK = (
+BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW, GREY, BLACK = (
     "#0072B2",
     "#E69F00",
     "#009E73",
@@ -68,7 +68,7 @@ class MethodStyle:
 
 
 _STYLES = {
-    "rbfnn_mfac": MethodStyle(VERMILLION, "-", "o"),
+    "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
     "rbfnn_mfac_plus": MethodStyle(WINE, "-", "*"),
     "ukf_mfac": MethodStyle(BLUE, "--", "s"),
     "ukf_mpc": MethodStyle(GREEN, "-.", "^"),
@@ -80,7 +80,7 @@ _STYLES = {
     "rls": MethodStyle(SKY, "-.", "X"),
     "cfdl_mfac": MethodStyle(YELLOW, (0, (3, 1, 1, 1)), "*"),
 }
-_OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILLION, BLUE, GREEN)
+_OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
 _OTHER_LINES = ((0, (1, 1)), (0, (4, 2)), (0, (6, 1, 1, 1)), "-", "--")
 _OTHER_MARKERS = ("<", ">", "h", "p", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
 
