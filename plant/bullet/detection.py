@@ -29,18 +29,18 @@ IntArray = npt.NDArray[np.intp]
 # OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
 # both ends 0 and 180, and one range covers purplish and orange reds.
 RED_LOWER, RED_UPPER = (111, 120, 40), (129, 255, 255)
-FULL_BOX = 0.6  # share of red pixels; a disc fills π/4 of its box
-MIN_PIXELS = 16  # fewer do not fix three coordinates under noise
+FULL_BOX = 0.6  # share of red pixels above which a box holds one patch; a disc fills π/4
+MIN_PIXELS = 16  # fewer pixels do not determine three coordinates under noise
 MIN_VISIBLE = 0.4  # share of the ball's disc that must be seen
 MAX_VISIBLE = 1.4  # a larger red patch is not the ball
 INNER_COSINE = 0.4  # of the angle between ray and surface normal, below which a pixel counts as silhouette
 OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
-OUTLIER_FLOOR = 0.002  # m, what is never an outlier
-MAX_RESIDUAL = 0.4  # of the radius, RMS beyond which the fit is implausible
-MAX_UNCERTAINTY = 0.1  # of the radius, standard error beyond which the fit says too little
-SELECTIONS = 3  # iterations that choose their depths anew
+OUTLIER_FLOOR = 0.002  # [m] a smaller deviation is no outlier
+MAX_RESIDUAL = 0.4  # RMS as a share of the radius beyond which the fit is implausible
+MAX_UNCERTAINTY = 0.1  # standard error as a share of the radius beyond which the fit is too uncertain
+SELECTION_ITERATIONS = 3  # the first iterations select the depths anew
 MAX_ITERATIONS = 10
-STEP_TOLERANCE = 1e-5  # m; what is left after such a step is far smaller
+STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
 RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
 
@@ -154,7 +154,7 @@ def find_ball(
         buffer: depth buffer, (h, w).
         camera: its intrinsics.
         radius: m, of the ball.
-        sense: what the sensor makes of the depths of the red pixels, (k,) m; None: it is perfect.
+        sense: true to measured depths of the red pixels, (k,) m each; None for a perfect sensor.
     """
     patch = find_patch(rgb)
     if patch is None:
@@ -183,8 +183,8 @@ def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: f
     """
     centre = start
     for iteration in range(MAX_ITERATIONS):
-        # Choosing anew for ever would let a pixel at the gate swing in and out, and the centre with it.
-        if iteration < SELECTIONS:
+        # Selection in every iteration could make a pixel at the gate, and so the centre, oscillate.
+        if iteration < SELECTION_ITERATIONS:
             chosen = choose_depths(rays, depth, centre, radius)
             if len(chosen) < MIN_PIXELS:
                 return None
@@ -195,9 +195,9 @@ def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: f
         normal = slope.T @ slope + RIDGE * len(e)
         step = np.linalg.solve(normal, slope.T @ e)
         length = math.sqrt(step @ step)
-        # A step beyond the radius leaves the region in which the slope says anything.
+        # The linearisation does not hold beyond a step of one radius.
         centre = centre + step * min(1.0, radius / max(length, radius))
-        if iteration >= SELECTIONS and length < STEP_TOLERANCE:
+        if iteration >= SELECTION_ITERATIONS and length < STEP_TOLERANCE:
             break
     residual = math.sqrt(e @ e / len(e))
     # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.

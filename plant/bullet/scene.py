@@ -1,4 +1,4 @@
-"""The simulated bench: the one module that calls PyBullet.
+"""The simulated scene: the one module that calls PyBullet.
 
 An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W
 is the arm's base frame B.
@@ -60,7 +60,7 @@ class Scene:
 
         Args:
             arm: the true kinematics.
-            body: masses, torques and looks.
+            body: masses, torques and appearance.
             physics_step: s.
             scenery: whether to load the table and the floor.
             window: whether to open PyBullet's window.
@@ -88,8 +88,8 @@ class Scene:
 
     def _load(self, arm: SerialArm, body: ArmBody, physics_step: float, *, scenery: bool) -> None:
         client = self._client
-        # By default the solver stops early, and gravity makes a motor at rest creep by 1 mrad/s; and PyBullet keeps
-        # every mesh it ever loaded by file name, so memory would grow from plant to plant.
+        # With the default residual threshold the solver stops early, and gravity makes a motor at rest creep by
+        # 1 mrad/s. With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
         pybullet.setPhysicsEngineParameter(
             fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
         )

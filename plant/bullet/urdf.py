@@ -3,7 +3,7 @@
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
 
-No link has a collision shape: a mismatched arm's parts may overlap at rest, and the contact solver would throw it
+No link has a collision shape: parts of a mismatched arm may overlap at rest, and the contact solver would push them
 apart. Numbers are written with `repr`, so that none loses a digit.
 """
 
@@ -38,15 +38,15 @@ BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so withou
 
 @dataclass(frozen=True, eq=False)
 class ArmBody:
-    """Masses, torques and looks of a serial arm with n joints.
+    """Masses, torques and appearance of a serial arm with n joints.
 
     Attributes:
         mass: (n,), kg.
         centre_of_mass: (n, 3), m, of link i in its DH frame, which is where joint i+1 sits.
         inertia: (n, 2), kg m², about the centre of mass: across the link and along it.
         max_torque: (n,), Nm.
-        tube_radius: (n,), m; looks only.
-        side_step: (n,), m, how far a link's tube runs beside its joints, along the joint's axis; looks only.
+        tube_radius: (n,), m; appearance only.
+        side_step: (n,), m, how far a link's tube runs beside its joints, along the joint's axis; appearance only.
         ball_radius: m.
     """
 
@@ -74,7 +74,7 @@ class ArmBody:
 
 
 def ur5_body() -> ArmBody:
-    """Return masses, torques and looks of the UR5."""
+    """Return masses, torques and appearance of the UR5."""
     return ArmBody(
         mass=np.array(ur5.MASS),
         centre_of_mass=np.array(ur5.CENTRE_OF_MASS),
@@ -91,7 +91,7 @@ def arm_urdf(arm: SerialArm, body: ArmBody, ball_mesh: str) -> str:
 
     Args:
         arm: the kinematics, mismatch included.
-        body: masses, torques and looks for the same number of joints.
+        body: masses, torques and appearance for the same number of joints.
         ball_mesh: name of a file beside the URDF that holds a mesh of the unit sphere.
 
     Returns:

@@ -35,7 +35,7 @@ STATUS_LEVELS = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR,
 
 
 class Port:
-    """Variables that are read or written together, and the buffer that they are read into or written from.
+    """Variables that are read or written together, with their buffer.
 
     Attributes:
         labels: a name for each number, for messages.
@@ -63,7 +63,7 @@ class Port:
 
 
 class MessageLog:
-    """Passes an FMU's messages on to the log and remembers the last ones for errors."""
+    """Forwards an FMU's messages to the log and keeps the last ones for errors."""
 
     def __init__(self, name: str) -> None:
         """Start empty."""
@@ -78,7 +78,7 @@ class MessageLog:
         logger.log(level, "%s: %s", self._name, text)
 
     def failure(self, function: str, status: int) -> FmuError:
-        """Return the error for a call that did not end well, with the last messages, and forget them."""
+        """Return the error of a failed call with the last messages, and forget these."""
         word = STATUS_WORDS[status] if 0 <= status < len(STATUS_WORDS) else "nothing usable"
         said = f"; the FMU said: {' | '.join(self._last)}" if self._last else ""
         self._last.clear()

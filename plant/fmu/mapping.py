@@ -99,7 +99,7 @@ class FmuMapping:
     feature_unit: str = "m"
 
     def __post_init__(self) -> None:
-        """Check what can be checked without the FMU."""
+        """Check the rules that need no FMU."""
         for name in ("inputs", "features"):
             if not getattr(self, name):
                 raise ValueError(f"{name} must name at least one variable of the FMU, got none")

@@ -2,8 +2,8 @@
 
 The camera frame has z along the optical axis, x right and y down in the image. With the focal length f in pixels and an
 image of w × h pixels, the point (x, y, z) appears at (w/2 + f x/z, h/2 + f y/z), counted from the upper left corner.
-PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), not at (u + ½, v + ½): missing that costs
-2.5 mm at 1.3 m.
+PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), not at (u + ½, v + ½); without this
+offset the error is 2.5 mm at 1.3 m.
 
 Noise models: stereo, RMS(z) = z² · subpixel / (f_native · baseline) (Intel, "Tuning D435 and D415
 for best performance"); structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012).
@@ -20,7 +20,7 @@ from annotated_types import Gt, Lt
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Count, NonNegative, Positive, settings
 
-PIXEL_CENTRE = (0.0, 1.0)  # px, where TinyRenderer samples a pixel, from its upper left corner
+PIXEL_CENTRE = (0.0, 1.0)  # [px] sampling point of TinyRenderer, from the pixel's upper left corner
 FieldOfView: TypeAlias = Annotated[float, Gt(0.0), Lt(180.0)]
 """Above 0° and below 180°."""
 

@@ -2,8 +2,8 @@
 
 θ = g ⊙ q + o,     p_B = p_flange + R_flange t,     y = R_BCᵀ (p_B − p_BC),     ∂y/∂q_i = g_i R_BCᵀ (z_i × (p_B − p_i))
 
-The core takes symbols or numbers for everything, so that one expression serves a model with its numbers bound and a
-function (or generated C code) whose geometry stays a parameter.
+The core takes symbols or numbers for everything, so that one expression serves both a model with fixed
+numbers and a function (or generated C code) whose geometry is a parameter.
 """
 
 from __future__ import annotations

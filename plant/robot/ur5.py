@@ -45,7 +45,7 @@ MAX_TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # Nm
 MAX_JOINT_SPEED = np.pi  # rad/s, the vendor's limit
 JOINT_RANGE = 2 * np.pi  # rad, each way
 
-# For the looks only: tube radii, and how far a link's tube runs beside its joints, along the joint's axis.
+# Appearance only: tube radii, and the offset of a link's tube from its joints along the joint's axis.
 TUBE_RADIUS = (0.062, 0.056, 0.047, 0.04, 0.04, 0.038)  # m
 SIDE_STEP = (0.0, 0.136, 0.0165, 0.0, 0.0, 0.0)  # m
 
@@ -90,5 +90,5 @@ def camera_pose(R_BC: FloatArray) -> FloatArray:
 
 
 def nominal_ur5() -> HandEyeModel:
-    """Return what a controller may know: the data-sheet arm under the camera as drawn."""
+    """Return the nominal robot that controllers may know: the data-sheet arm under the camera as planned."""
     return HandEyeModel(ur5_arm(), camera_pose(np.array(R_BC_DOWN)))
