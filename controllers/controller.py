@@ -37,7 +37,7 @@ class RobotKnowledge:
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
-            needs the training knows both types. None: it is run when the controller is built.
+            needs the training checks both types. None: it is run when the controller is built.
     """
 
     spec: PlantSpec
@@ -105,7 +105,7 @@ class Controller(ABC):
 
 @dataclass(frozen=True)
 class ControllerEntry:
-    """A controller as the registry knows it.
+    """A controller as the registry lists it.
 
     Attributes:
         name: the word on the command line.

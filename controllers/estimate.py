@@ -11,7 +11,7 @@ MAX_DELAY = 14  # [periods] the longest delay that an estimator may report, so t
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """What an estimator knows when the law is asked for a command.
+    """What an estimator hands to the law in each period.
 
     Attributes:
         jacobian: Ĵ, (m, n), m/rad, at the present joint position.

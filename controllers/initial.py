@@ -178,7 +178,7 @@ class ProbedJacobian(InitialJacobian):
         Q, Y = (np.diff(np.array(values), axis=0) for values in zip(*self._rests, strict=True))
         if np.linalg.svd(Q, compute_uv=False)[-1] < 0.1 * self._config.probe_step:
             raise ControllerDiverged(
-                f"probing moved the joints too little to tell a Jacobian: joint steps {Q.tolist()} rad"
+                f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
         return np.asarray(np.linalg.lstsq(Q, Y, rcond=None)[0].T)
 

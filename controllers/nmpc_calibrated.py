@@ -19,7 +19,7 @@ from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, Share, settings
 from servobench.plant.signals import Command, Observation
 
-_CONVERGED: Final = 1e-9  # rad: a smaller change of the plan ends the iterations
+_PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
 
 
 @settings
@@ -183,7 +183,7 @@ class NmpcCalibrated(Controller):
             view_margin=np.zeros(0),
         )
         plan, change, iterations = self._plan, math.inf, 0
-        while iterations < config.iterations and change > _CONVERGED:
+        while iterations < config.iterations and change > _PLAN_TOLERANCE:
             J, targets = self._linearise(start, plan, wanted)
             solution = self._program.solve(J, targets, bounds)
             if not solution.success:

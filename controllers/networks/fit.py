@@ -71,10 +71,10 @@ def train(
         ValueError: the region does not fit the plant, or the nominal Jacobian has another shape or is not finite.
     """
     digest = training_digest(config, nominal_jacobian, spec)
-    tell = progress if progress is not None else _ignore_progress
-    jacobian, jacobian_error = _train_jacobian(config, nominal_jacobian, spec, tell)
-    controller, controller_error = _train_controller(config, nominal_jacobian, spec, tell)
-    tell(1.0, "done")
+    report = progress if progress is not None else _ignore_progress
+    jacobian, jacobian_error = _train_jacobian(config, nominal_jacobian, spec, report)
+    controller, controller_error = _train_controller(config, nominal_jacobian, spec, report)
+    report(1.0, "done")
     return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, digest)
 
 
@@ -149,7 +149,7 @@ def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, 
 
 
 def _train_jacobian(
-    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, tell: Progress
+    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, report: Progress
 ) -> tuple[JacobianNetwork, float]:
     """Return the Jacobian network and its held-out error, the RMS of ‖Ĵ − J‖ over that of ‖J‖."""
     plan: JacobianTraining = config.jacobian
@@ -166,7 +166,7 @@ def _train_jacobian(
     squares: FloatArray = np.full(spec.n, np.inf)
     widths, weights = np.ones((spec.n, plan.centres)), np.zeros((spec.n, spec.m, plan.centres))
     for index, scale in enumerate(plan.width_scales):
-        tell(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
+        report(JACOBIAN_SHARE * index / len(plan.width_scales), "Jacobian network")
         theta = jacobian_features(q, centres[None], np.full((1, plan.centres), scale * spread))[:, 0]
         for W in ridge_path(theta[held:], J[held:].reshape(len(q) - held, -1), plan.regularisations):
             residual = (theta[:held] @ W).reshape(held, spec.m, spec.n) - J[:held]
@@ -179,7 +179,7 @@ def _train_jacobian(
 
 
 def _train_controller(
-    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, tell: Progress
+    config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec, report: Progress
 ) -> tuple[ControllerNetwork, float]:
     """Return the controller network and its held-out error, the RMS over joints of ψ ξ − q_cmd, rad."""
     plan: ControllerTraining = config.controller
@@ -197,7 +197,7 @@ def _train_controller(
     spread = float(np.sqrt(np.mean(np.sum((pool_xi - pool_xi.mean(axis=0)) ** 2, axis=-1))))
     best, network = np.inf, None
     for index, scale in enumerate(plan.width_scales):
-        tell(JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales), "controller network")
+        report(JACOBIAN_SHARE + (1.0 - JACOBIAN_SHARE) * index / len(plan.width_scales), "controller network")
         reach = scale * spread  # the distance at which a unit has fallen to 1/e
         widths = np.full(plan.hidden, reach if plan.kernel == "gaussian" else np.sqrt(reach))
         h = hidden_features(samples.xi, centres, widths, plan.kernel)

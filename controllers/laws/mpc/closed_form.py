@@ -26,7 +26,7 @@ from servobench.plant.checks import FloatArray, check_number
 
 _SERIES_BELOW = 0.5  # under it the series of 18 terms is exact to rounding, above it the closed form is
 _SERIES_TERMS = 18
-_SMALLEST_POWER = 1e-150
+_MIN_POWER = 1e-150  # [1] smaller weights count as 0, so that products with them do not underflow
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -79,7 +79,7 @@ def _weighted_power_integral(power: int, rate: float, horizon: float) -> float:
 def _power(alpha: float, tau: float) -> float:
     """α^τ, or 0 where it is so small that products with it would underflow."""
     value = float(alpha**tau)
-    return value if value > _SMALLEST_POWER else 0.0
+    return value if value > _MIN_POWER else 0.0
 
 
 def decay_targets(error: FloatArray, reference_step: FloatArray, rho: float) -> FloatArray:

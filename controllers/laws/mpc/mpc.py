@@ -32,7 +32,7 @@ from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, settings
 from servobench.plant.signals import Observation
 
-_ACTIVE: Final = 1e-10  # a multiplier above this counts as an active limit
+_MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
 
 
 @settings
@@ -226,7 +226,7 @@ class MpcLaw(Law):
         horizon, count = self._config.horizon, len(solution.moves)
         travel = solution.moves.sum(axis=0) * (horizon / count) if solution.success else horizon * step
         multipliers = np.concatenate([solution.bound_multiplier, solution.row_multiplier])
-        active = float(np.count_nonzero(np.abs(multipliers) > _ACTIVE)) if solution.success else math.nan
+        active = float(np.count_nonzero(np.abs(multipliers) > _MIN_MULTIPLIER)) if solution.success else math.nan
         self._diagnostics = {
             "solver_success": float(solution.success),
             "solver_iterations": solution.iterations,

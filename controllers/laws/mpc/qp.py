@@ -100,7 +100,7 @@ class QpSolution:
         bound_multiplier: (moves·n,), positive at an upper bound and negative at a lower one.
         row_multiplier: (rows,), the same for the linear rows.
         status: the solver's own word.
-        iterations: NaN where the solver does not tell.
+        iterations: NaN where the solver does not report them.
     """
 
     success: bool
