@@ -37,7 +37,7 @@ class RobotKnowledge:
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
-            needs the training checks both types. None: it is run when the controller is built.
+            needs the training defines both types. None: it is run when the controller is built.
     """
 
     spec: PlantSpec
