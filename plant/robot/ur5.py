@@ -6,6 +6,7 @@ and torques); inertia tensors by the cylinder approximation that the vendor's RO
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
@@ -89,6 +90,7 @@ def camera_pose(R_BC: FloatArray) -> FloatArray:
     return pose
 
 
+@cache
 def nominal_ur5() -> HandEyeModel:
     """Return the nominal robot that controllers may know: the data-sheet arm under the camera as planned."""
     return HandEyeModel(ur5_arm(), camera_pose(np.array(R_BC_DOWN)))
