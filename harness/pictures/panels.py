@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
+from servobench.harness.analysis.statistics import Estimate
 from servobench.harness.pictures.style import MethodStyle
 from servobench.harness.pictures.tracks import Track, Tracks, label_of
 from servobench.harness.run.metrics import SETTLING_BAND
@@ -21,6 +22,7 @@ SETTLED = f"settling band, {MILLI * SETTLING_BAND:g} mm"
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 CAMERA_TILT = -62.0  # deg; −90 looks along the optical axis, from which depth could not be seen
 NO_VALUES = "no values"
+SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
 ROW = 3  # panels
 EXACT = 1e-9  # relative error below which an estimate counts as the truth
 LEAST_DEPTH = 0.4  # of the widest axis, so that a flat path does not hide the depth axis
@@ -79,6 +81,49 @@ def draw_path(axes: Axes3D, tracks: Tracks, styles: Styles) -> None:
                           linestyle="", zorder=12, gid=ENDED)  # fmt: skip
     _draw_ends(axes, longest, reference)
     _dress_space(axes, longest.features)
+
+
+def draw_places(
+    axes: Axes,
+    places: Sequence[float],
+    values: Mapping[str, Sequence[Estimate]],
+    styles: Mapping[str, MethodStyle],
+    *,
+    joined: bool,
+) -> None:
+    """Draw an estimate with its interval for each method at each place.
+
+    Args:
+        axes: where.
+        places: abscissae, ascending; marks are spread over a part of the first distance.
+        values: method -> an estimate a place; an infinite one is left out, an infinite end leaves the picture.
+        styles: method -> style.
+        joined: connect the marks of a method by a line.
+    """
+    width = SPREAD * (places[1] - places[0] if len(places) > 1 else 1.0)
+    for k, (name, estimates) in enumerate(values.items()):
+        style = styles[name]
+        shift = width * ((k + 0.5) / len(values) - 0.5)
+        x = np.array(places, dtype=float) + shift
+        y, low, high = (np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high"))
+        known = np.isfinite(y)
+        if known.any():
+            y, top = y[known], float(np.max(y[known]))
+            below = y - np.where(np.isfinite(low), low, np.nan)[known]
+            above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y  # out of the picture
+            axes.errorbar(
+                x[known],
+                y,
+                yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0),
+                color=style.colour,
+                linestyle=style.line if joined else "none",
+                marker=style.marker or "_",
+                markersize=4.5,
+                linewidth=1.2,
+                elinewidth=1.0,
+                capsize=2.0,
+                label=name,
+            )
 
 
 def panel_grid(count: int, height: float) -> tuple[Figure, list[Axes]]:

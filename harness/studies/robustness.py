@@ -22,7 +22,7 @@ from servobench.harness.batch.campaign import Campaign, Cell, Observer, carry_ou
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.sweep import place_columns, vary
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.pictures.places import draw_places
+from servobench.harness.pictures.panels import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.request import RunRequest
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes

@@ -117,7 +117,10 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
             "period must be a whole multiple of the plant's own step",
         ),
         (("run", "--set", "run.period=-1"), "run.period must be above 0, got -1"),
-        (("run", "--set", "bullet.sensing.feature_noise=-1"), "bullet.sensing.feature_noise must be"),
+        (
+            ("run", "--plant", "bullet", "--set", "bullet.sensing.feature_noise=-1"),
+            "bullet.sensing.feature_noise must be",
+        ),
         (("run", "--set", "kinematc.lag=1"), "unknown section 'kinematc': did you mean 'kinematic'?"),
         (("run", "--set", "kinematic.lagg=1", "--plant", "kinematic"), "kinematic has no setting 'lagg'"),
         (("run", "--config", "none.toml"), "none.toml cannot be read"),

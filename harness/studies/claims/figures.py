@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.statistics import NO_ESTIMATE
-from servobench.harness.pictures.places import draw_places
+from servobench.harness.pictures.panels import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.studies.claims.measurements import Answer, Measurement
 
