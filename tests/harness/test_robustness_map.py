@@ -8,9 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from kit.command import servobench
 from servobench.harness.analysis.comparison import settled_share
-from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.studies.robustness import (
     LINES,
@@ -49,17 +47,3 @@ def test_settling_counts_from_the_move_of_the_camera():
 def test_a_table_that_is_no_map_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="holds no axis of the robustness map; make one with"):
         draw_map(pd.DataFrame({"axis": ["", ""]}), tmp_path)
-
-
-def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
-    out = tmp_path / "map"
-    arguments = (
-        "robustness", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1",
-        "--set", "random.duration=1", "--out", str(out),
-    )  # fmt: skip
-    assert servobench(monkeypatch, *arguments) == 0
-    assert "the map is in" in capsys.readouterr().out
-    assert len(results.load_runs(out / "moved")) == 5
-    assert {path.name for path in (out / "figures").iterdir()} == {
-        "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
-    }  # fmt: skip
