@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
-from kit.folders import comparison, failed_only, made_up_row, sweep
+from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
 from servobench.harness.analysis.comparison import split_conditions, split_tasks
 from servobench.harness.analysis.folder import describe_folder, other_tables
 from servobench.harness.analysis.tables import (
@@ -93,10 +93,7 @@ def test_conditions_are_told_apart_in_words(runs):
 
 @pytest.mark.parametrize(("option", "word"), [((), "quick"), (("--markdown",), "| quick | 20 | 100.0 [83.9, 100.0] |")])
 def test_the_command_prints_the_tables_of_a_folder(runs, tmp_path, monkeypatch, capsys, option, word):
-    folder = tmp_path / "out"
-    results.create_folder(folder, {})
-    results.write_rows(folder, 0, runs.to_dict("records"))
-    results.collect(folder)
+    folder = write_folder(tmp_path / "out", runs.to_dict("records"), [])
     assert servobench(monkeypatch, "statistics", str(folder), *option) == 0
     assert word in capsys.readouterr().out
 
