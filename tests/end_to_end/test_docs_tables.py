@@ -120,7 +120,12 @@ def test_every_status_is_told_and_can_occur():
         own = {kind.status} if kind.__module__.split(".")[0] == PACKAGE else set()
         return own.union(*(faults(child) for child in kind.__subclasses__()))
 
-    assert {names(row[0])[0] for row in rows} == faults(RunFault) | {"completed", "numerical_error", "crashed"}
+    assert {names(row[0])[0] for row in rows} == faults(RunFault) | {
+        "completed",
+        "numerical_error",
+        "crashed",
+        "timed_out",
+    }
 
 
 def test_the_profiles_have_the_magnitudes_of_the_code():
