@@ -13,11 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from servobench.plant.bullet.bullet_plant import (
-    PHYSICS_STEP,
-    BulletConfig,
-    build_bullet,
-)
+from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, build_bullet
 from servobench.plant.bullet.scene import Scene, view_of
 from servobench.plant.bullet.urdf import ur5_body
 from servobench.plant.checks import whole_steps

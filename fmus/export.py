@@ -20,32 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compile import (
-    CODE,
-    Platform,
-    compile_library,
-    this_platform,
-)
+from servobench.fmus.compile import CODE, Platform, compile_library, this_platform
 from servobench.fmus.generate import kinematics_source, layout_header
-from servobench.fmus.model_description import (
-    Description,
-    write_build_description,
-    write_fmi2,
-    write_fmi3,
-)
-from servobench.fmus.reference import (
-    INPUT_FILE,
-    OUTPUT_FILE,
-    input_csv,
-    output_csv,
-    reference_run,
-)
-from servobench.fmus.variables import (
-    Actuation,
-    Layout,
-    arm_groups,
-    parameters_of,
-)
+from servobench.fmus.model_description import Description, write_build_description, write_fmi2, write_fmi3
+from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
+from servobench.fmus.variables import Actuation, Layout, arm_groups, parameters_of
 from servobench.plant.checks import as_vector
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import HOME, nominal_ur5

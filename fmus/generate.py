@@ -17,13 +17,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from servobench.fmus.variables import (
-    INPUT,
-    KINEMATIC_PARAMETERS,
-    PARAMETER,
-    STATE,
-    Layout,
-)
+from servobench.fmus.variables import INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot.symbolic import SX, HandEyeGeometry, feature_and_jacobian
 

@@ -10,16 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from servobench.fmus.variables import (
-    DERIVATIVE,
-    INPUT,
-    KINEMATIC_PARAMETERS,
-    OUTPUT,
-    PARAMETER,
-    STATE,
-    Group,
-    Layout,
-)
+from servobench.fmus.variables import DERIVATIVE, INPUT, KINEMATIC_PARAMETERS, OUTPUT, PARAMETER, STATE, Group, Layout
 from servobench.plant.checks import FloatArray
 
 UNITS: dict[str, dict[str, str]] = {

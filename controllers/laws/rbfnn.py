@@ -13,12 +13,7 @@ from servobench.controllers.laws.inverses import project_to_row_space
 from servobench.controllers.laws.law import Law, Stage
 from servobench.controllers.laws.limit import largest_excess, scale_to_limit
 from servobench.controllers.laws.prediction import pushed
-from servobench.controllers.laws.roll_out import (
-    RollOut,
-    descent_direction,
-    roll_out,
-    update_step,
-)
+from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
 from servobench.plant.checks import FloatArray

@@ -29,12 +29,7 @@ import numpy as np
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
-from servobench.controllers.networks.rbf import (
-    ControllerNetwork,
-    JacobianNetwork,
-    hidden_features,
-    jacobian_features,
-)
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features, jacobian_features
 from servobench.controllers.networks.samples import (
     ControllerRegion,
     ControllerSamples,

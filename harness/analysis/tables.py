@@ -20,13 +20,7 @@ from servobench.harness.analysis.comparison import (
     split_tasks,
 )
 from servobench.harness.analysis.measures import MEASURES, Measure
-from servobench.harness.analysis.statistics import (
-    MISSING,
-    NO_ESTIMATE,
-    Estimate,
-    median_with_interval,
-    tail_mean,
-)
+from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, tail_mean
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import COMPLETED
 from servobench.plant.settings import suggest

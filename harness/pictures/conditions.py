@@ -9,13 +9,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
-from servobench.harness.pictures.panels import (
-    Styles,
-    add_legend,
-    draw_places,
-    label_rows,
-    panel_grid,
-)
+from servobench.harness.pictures.panels import Styles, add_legend, draw_places, label_rows, panel_grid
 
 MAGNITUDE = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<size>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}

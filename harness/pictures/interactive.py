@@ -10,12 +10,7 @@ from plotly.offline import get_plotlyjs
 
 from servobench.harness.batch import results
 from servobench.harness.pictures.style import MethodStyle, method_styles
-from servobench.harness.pictures.tracks import (
-    Group,
-    Tracks,
-    label_of,
-    load_groups,
-)
+from servobench.harness.pictures.tracks import Group, Tracks, label_of, load_groups
 
 MOST_POINTS = 250  # of a path; more cannot be told apart
 MOST_VIEWS = 24  # plant, mismatch and task

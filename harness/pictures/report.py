@@ -20,13 +20,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.folder import describe_folder, other_tables
-from servobench.harness.analysis.tables import (
-    cost_table,
-    failure_table,
-    runs_table,
-    settling_table,
-    tracking_table,
-)
+from servobench.harness.analysis.tables import cost_table, failure_table, runs_table, settling_table, tracking_table
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.conditions import draw_conditions

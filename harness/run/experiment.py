@@ -23,12 +23,7 @@ from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.plant import (
-    Plant,
-    PlantEntry,
-    PlantSetup,
-    TrueModel,
-)
+from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.hand_eye import FEATURE_NAMES, HandEyeModel, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5

@@ -15,23 +15,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.references import (
-    Circle,
-    FixedPoint,
-    Lemniscate,
-    Reference,
-    TaskKind,
-    line,
-    read_waypoints,
-)
+from servobench.harness.run.references import Circle, FixedPoint, Lemniscate, Reference, TaskKind, line, read_waypoints
 from servobench.plant.checks import FloatArray, as_vector, check_number
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import (
-    HOME,
-    TRAINING_LOWER,
-    TRAINING_UPPER,
-    nominal_ur5,
-)
+from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import Count, NonNegative, Number, Positive, settings, suggest
 

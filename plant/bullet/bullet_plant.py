@@ -21,12 +21,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from servobench.plant.bench import Bench, SensingConfig, World
-from servobench.plant.bullet.detection import (
-    ByteArray,
-    Detection,
-    draw_detection,
-    find_ball,
-)
+from servobench.plant.bullet.detection import ByteArray, Detection, draw_detection, find_ball
 from servobench.plant.bullet.urdf import ur5_body
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.faults import PlantDiverged

@@ -8,14 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from servobench.plant.fmu.instance import (
-    DISCARD,
-    MIN_PROGRESS,
-    Instance,
-    MessageLog,
-    Port,
-    RawCall,
-)
+from servobench.plant.fmu.instance import DISCARD, MIN_PROGRESS, Instance, MessageLog, Port, RawCall
 
 CO_SIMULATION = 1
 LAST_SUCCESSFUL_TIME = 2

@@ -14,12 +14,7 @@ from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import (
-    HOME,
-    TRAINING_LOWER,
-    TRAINING_UPPER,
-    nominal_ur5,
-)
+from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 
 PERIOD, PREVIEW = 0.05, 10
 LOWER, UPPER = np.array(TRAINING_LOWER), np.array(TRAINING_UPPER)

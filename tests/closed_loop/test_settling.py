@@ -14,14 +14,7 @@ from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.arm import arm_from_dh, rotation_from_rpy
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import (
-    DH_A,
-    DH_ALPHA,
-    DH_D,
-    JOINT_NAMES,
-    TOOL,
-    nominal_ur5,
-)
+from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, nominal_ur5
 
 PRESETS = [METHODS[name] for name in ("broyden", "calibrated", "cfdl_mfac", "constant", "rls", "ukf_mfac")]
 START = np.array([0.35, -1.69, -2.34, 0.89, 1.22, 0.0])

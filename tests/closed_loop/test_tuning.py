@@ -20,15 +20,7 @@ from servobench.harness.config.settings import ConfigurationError, flatten
 from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective, study
 from servobench.harness.studies.tuning.files import read_tuned, write_tuned
-from servobench.harness.studies.tuning.objective import (
-    CURVE,
-    MOVE,
-    Trial,
-    TuningSet,
-    evaluate,
-    run_cost,
-    score,
-)
+from servobench.harness.studies.tuning.objective import CURVE, MOVE, Trial, TuningSet, evaluate, run_cost, score
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     default_values,
@@ -36,12 +28,7 @@ from servobench.harness.studies.tuning.spaces import (
     full_settings,
     nested_settings,
 )
-from servobench.harness.studies.tuning.study import (
-    TuningPlan,
-    advance,
-    open_studies,
-    write_outcomes,
-)
+from servobench.harness.studies.tuning.study import TuningPlan, advance, open_studies, write_outcomes
 
 CORNERS = 64
 SMALL = TuningSet(seeds=4)

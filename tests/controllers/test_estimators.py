@@ -14,12 +14,7 @@ from servobench.controllers.estimators.kalman import (
     split_update,
 )
 from servobench.controllers.estimators.true import TrueConfig, TrueEstimator
-from servobench.controllers.estimators.ukf import (
-    UkfConfig,
-    UkfEstimator,
-    sigma_weights,
-    unscented_update,
-)
+from servobench.controllers.estimators.ukf import UkfConfig, UkfEstimator, sigma_weights, unscented_update
 from servobench.plant.faults import FilterDiverged
 from servobench.plant.signals import PlantSpec
 

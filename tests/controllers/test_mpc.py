@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.mpc.closed_form import (
-    constant_step,
-    free_moves,
-    horizon_integrals,
-    move_weights,
-)
+from servobench.controllers.laws.mpc.closed_form import constant_step, free_moves, horizon_integrals, move_weights
 from servobench.controllers.laws.mpc.limits import LimitedProgram
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape

@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 
 from kit.toy import KNOWLEDGE, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
-from servobench.controllers.estimators.rbf import (
-    RbfConfig,
-    RbfEstimator,
-    window_gradient,
-    window_step,
-)
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, window_gradient, window_step
 from servobench.controllers.networks.rbf import JacobianNetwork, jacobian_features
 
 

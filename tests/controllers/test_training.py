@@ -8,12 +8,7 @@ import pytest
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
-from servobench.controllers.networks.file import (
-    FORMAT,
-    TrainedNetworks,
-    load_networks,
-    save_networks,
-)
+from servobench.controllers.networks.file import FORMAT, TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.fit import (
     controller_region,
     ideal_controller_matrix,
@@ -23,18 +18,8 @@ from servobench.controllers.networks.fit import (
     train_cached,
     training_digest,
 )
-from servobench.controllers.networks.rbf import (
-    ControllerNetwork,
-    JacobianNetwork,
-    jacobian_features,
-    jacobian_output,
-)
-from servobench.controllers.networks.samples import (
-    choose_centres,
-    controller_samples,
-    pool_size,
-    unit_points,
-)
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, jacobian_features, jacobian_output
+from servobench.controllers.networks.samples import choose_centres, controller_samples, pool_size, unit_points
 from servobench.plant.signals import PlantSpec
 
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac_plus", "rbf_pid")]

@@ -10,11 +10,7 @@ import pytest
 
 from kit.plants import configure
 from servobench.plant.bench import Bench
-from servobench.plant.bullet.bullet_plant import (
-    PHYSICS_STEP,
-    BulletConfig,
-    build_bullet,
-)
+from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, build_bullet
 from servobench.plant.bullet.detection import find_patch, locate_ball
 from servobench.plant.bullet.scene import Scene, view_of
 from servobench.plant.bullet.urdf import ur5_body

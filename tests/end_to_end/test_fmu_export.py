@@ -27,13 +27,7 @@ from servobench.fmus.compile import (
     parse_platforms,
     this_platform,
 )
-from servobench.fmus.export import (
-    ExportOptions,
-    arm_layout,
-    default_actuation,
-    export_fmu,
-    fingerprint,
-)
+from servobench.fmus.export import ExportOptions, arm_layout, default_actuation, export_fmu, fingerprint
 from servobench.fmus.information import read_information
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from kit.straight_move import straight_move
-from servobench.harness.run.metrics import (
-    judge_run,
-    overshoot,
-    path_length,
-    settling_time,
-)
+from servobench.harness.run.metrics import judge_run, overshoot, path_length, settling_time
 
 PERIOD = 0.1
 

@@ -3,14 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.harness.run.references import (
-    Circle,
-    FixedPoint,
-    Lemniscate,
-    Waypoints,
-    line,
-    read_waypoints,
-)
+from servobench.harness.run.references import Circle, FixedPoint, Lemniscate, Waypoints, line, read_waypoints
 
 CENTRE = np.array([0.1, -0.2, 1.2])
 NAMES = ("x", "y", "z")

@@ -10,14 +10,7 @@ import pytest
 
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.studies.robustness import (
-    LINES,
-    MOVE,
-    draw_map,
-    map_cells,
-    moved_settings,
-    settling_median,
-)
+from servobench.harness.studies.robustness import LINES, MOVE, draw_map, map_cells, moved_settings, settling_median
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():

@@ -5,12 +5,7 @@ from typing import Literal
 
 import pytest
 
-from servobench.harness.config.settings import (
-    ConfigurationError,
-    Settings,
-    flatten,
-    read_settings,
-)
+from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
 from servobench.plant.checks import check_number
 from servobench.plant.settings import Positive, nested, settings
 

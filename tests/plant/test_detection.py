@@ -3,13 +3,7 @@ import colorsys
 import numpy as np
 import pytest
 
-from servobench.plant.bullet.detection import (
-    Detection,
-    draw_detection,
-    find_patch,
-    fit_sphere,
-    locate_ball,
-)
+from servobench.plant.bullet.detection import Detection, draw_detection, find_patch, fit_sphere, locate_ball
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
 
 CAMERA = PinholeCamera()

@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from servobench.plant.robot.mismatch import (
-    MAX_TILT,
-    Magnitude,
-    Mismatch,
-    parse_magnitudes,
-    sample_mismatch,
-)
+from servobench.plant.robot.mismatch import MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
 
 POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))

@@ -7,12 +7,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.laws.mpc.qp import (
-    QpBounds,
-    QpProgram,
-    QpShape,
-    QpSolution,
-)
+from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, QpSolution
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import PlantSpec
 

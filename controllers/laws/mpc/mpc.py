@@ -22,11 +22,7 @@ from servobench.controllers.laws.mpc.closed_form import (
     preview_weights,
 )
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
-from servobench.controllers.laws.mpc.qp import (
-    QpBounds,
-    QpShape,
-    QpSolution,
-)
+from servobench.controllers.laws.mpc.qp import QpBounds, QpShape, QpSolution
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, settings

@@ -25,12 +25,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import compare_pairs, settling_times
-from servobench.harness.analysis.statistics import (
-    holm,
-    median_with_interval,
-    signed_rank_p_value,
-    success_rate,
-)
+from servobench.harness.analysis.statistics import holm, median_with_interval, signed_rank_p_value, success_rate
 from servobench.harness.run.episode import COMPLETED
 from servobench.harness.studies.claims.measurements import (
     DURATION,

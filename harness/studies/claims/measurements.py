@@ -17,12 +17,7 @@ from servobench.harness.analysis.statistics import (
     signed_rank_p_value,
 )
 from servobench.harness.run.episode import COMPLETED
-from servobench.harness.studies.claims.studies import (
-    CIRCLE,
-    MOVES,
-    OTHERS,
-    PROPOSED,
-)
+from servobench.harness.studies.claims.studies import CIRCLE, MOVES, OTHERS, PROPOSED
 
 LEVEL: Final = 0.05
 DURATION: Final = 10.0  # s, of a move

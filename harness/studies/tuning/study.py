@@ -33,12 +33,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings, fla
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.files import TunedValues, write_tuned
-from servobench.harness.studies.tuning.objective import (
-    Trial,
-    TuningSet,
-    evaluate,
-    score,
-)
+from servobench.harness.studies.tuning.objective import Trial, TuningSet, evaluate, score
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     default_values,
