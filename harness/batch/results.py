@@ -129,7 +129,7 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult]) -> None:
 
 
 def _write_picture(path: Path, picture: ImageArray) -> None:
-    import cv2  # noqa: PLC0415 - only the extra bullet brings it
+    import cv2  # noqa: PLC0415 - only pictures of cameras need it
 
     path.parent.mkdir(exist_ok=True)
     large = cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)

@@ -36,7 +36,7 @@ ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also m
 
 
 def run(
-    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "kinematic",
+    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "bullet",
     controller: Annotated[str, typer.Option(help="Name of the controller, or of a law with --estimator.")] = "ukf_mfac",
     estimator: Annotated[str | None, typer.Option(help="Compose the law --controller with this estimator.")] = None,
     task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",

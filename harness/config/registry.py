@@ -14,7 +14,6 @@ from pathlib import Path
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
-from servobench.harness.config.extras import check_late_imports, missing_extra
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
@@ -63,7 +62,6 @@ def find_plant(name: str) -> PlantEntry:
     Raises:
         ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
     """
-    check_late_imports("plant", name)
     if name.startswith(MAPPED):
         from servobench.plant.fmu.fmu_plant import mapped_entry  # noqa: PLC0415 - only the extra fmu brings its needs
 
@@ -85,7 +83,6 @@ def find_controller(name: str) -> ControllerEntry:
     Raises:
         ConfigurationError: no such controller, or a third party's that cannot be loaded.
     """
-    check_late_imports("controller", name)
     law, plus, estimator = name.partition("+")
     if plus:
         try:
@@ -119,7 +116,4 @@ def _load(group: str, kind: str, name: str) -> object:
     try:
         return points[name].load()
     except (ImportError, AttributeError) as error:
-        missing = missing_extra(error, f"{kind} {name!r}") if isinstance(error, ImportError) else None
-        raise ConfigurationError(
-            missing or f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}"
-        ) from error
+        raise ConfigurationError(f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}") from error

@@ -10,8 +10,8 @@ import pytest
 from kit.folders import comparison
 from servobench.harness.config.extras import EXTRAS
 
-HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", *EXTRAS)
-QUICK = ("run", "--set", "exp2.duration=0.5", "--out", "out")
+HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", "pybullet", "casadi", "fmpy", "cv2", *EXTRAS)
+QUICK = ("run", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", "out")
 
 
 def servobench_without(blocked, arguments, folder, then="pass"):
@@ -53,11 +53,6 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
 @pytest.mark.parametrize(
     ("module", "extra", "arguments"),
     [
-        ("pybullet", "bullet", (*QUICK, "--plant", "bullet")),
-        ("cv2", "bullet", (*QUICK, "--plant", "bullet")),
-        ("fmpy", "fmu", (*QUICK, "--plant", "fmu")),
-        ("casadi", "mpc", (*QUICK, "--controller", "ukf_mpc")),
-        ("casadi", "mpc", (*QUICK, "--controller", "nmpc_calibrated")),
         ("jinja2", "report", ("report", "made")),
         ("plotly", "report", ("report", "made")),
         ("itables", "report", ("report", "made")),

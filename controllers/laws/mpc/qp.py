@@ -138,7 +138,7 @@ class QpProgram:
 
     def reset(self) -> None:
         """Forget the warm start; the solver is made anew because it may keep a working set of its own."""
-        import casadi  # noqa: PLC0415 - only the extra mpc brings it
+        import casadi  # noqa: PLC0415 - other methods start without it
 
         problem = {"x": self.x, "p": self.p, "f": self.objective, "g": self.rows}
         options = {"error_on_fail": False, "print_time": False, **_SOLVER_OPTIONS[self._solver]}
@@ -227,7 +227,7 @@ def _repeat(row: FloatArray, count: int) -> FloatArray:
 
 def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
     """Return variables, parameters, criterion and rows as SX expressions."""
-    import casadi  # noqa: PLC0415 - only the extra mpc brings it
+    import casadi  # noqa: PLC0415 - other methods start without it
 
     blocks = shape.horizon if shape.varying_jacobian else 1
     J = [casadi.SX.sym(f"J{t}", shape.m, shape.n) for t in range(blocks)]
