@@ -9,7 +9,7 @@ with the command delay d and the latency l in control periods.
 from __future__ import annotations
 
 import copy
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ import numpy as np
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FeatureLost
-from servobench.plant.plant import ImageArray, Plant, TrueModel
+from servobench.plant.plant import Abilities, ImageArray, Plant, TrueModel
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import NonNegative, Periods, ShareBelowOne, settings
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth, trusted_observation
@@ -61,16 +61,11 @@ def vary_sensing(config: Config, noise_factor: float, latency_periods: int | Non
     return changed
 
 
-class World(ABC):
+class World(Abilities):
     """A robot and its camera, which only advance and see; `Bench` makes a plant of it.
 
     Arrays that a world returns are fresh or never changed again, finite, float64 and read-only.
     """
-
-    @property
-    @abstractmethod
-    def spec(self) -> PlantSpec:
-        """Sizes, names, limits and period."""
 
     @abstractmethod
     def reset(self, seed: int) -> FloatArray:
@@ -97,38 +92,6 @@ class World(ABC):
     def why_unseen(self) -> str:
         """Return why `see` found nothing, with evidence, for an error message."""
         return "the feature is not visible at the start"
-
-    @abstractmethod
-    def truth(self) -> Truth:
-        """See `Plant.truth`."""
-
-    def save(self) -> Any:  # noqa: ANN401 - each world has a state of its own
-        """See `Plant.save`."""
-        return copy.deepcopy(vars(self))
-
-    def restore(self, state: Any) -> None:  # noqa: ANN401 - what `save` returned
-        """See `Plant.restore`."""
-        vars(self).update(copy.deepcopy(state))
-
-    def true_model(self) -> TrueModel:
-        """See `Plant.true_model`."""
-        raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
-
-    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
-        """See `Plant.nominal_jacobian`."""
-        return None
-
-    def picture(self) -> ImageArray | None:
-        """See `Plant.picture`."""
-        return None
-
-    def move_camera(self, X_BC: FloatArray) -> None:
-        """See `Plant.move_camera`."""
-        raise ValueError("the plant has no camera that could be moved")
-
-    @abstractmethod
-    def close(self) -> None:
-        """See `Plant.close`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,42 +36,13 @@ class TrueModel:
     symbolic: Callable[[Any], Any]
 
 
-class Plant(ABC):
-    """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
+class Abilities(ABC):
+    """What a plant and a world can do beside moving; what neither is bound to know has a default."""
 
     @property
     @abstractmethod
     def spec(self) -> PlantSpec:
         """Sizes, names, limits and period."""
-
-    @abstractmethod
-    def reset(self, seed: int) -> Observation:
-        """Return to the start at time 0 and draw all randomness from `seed`.
-
-        Args:
-            seed: non-negative; the same seed gives the same run, bit for bit.
-
-        Returns:
-            The observation at time 0.
-
-        Raises:
-            FeatureLost: the feature cannot be seen from the start.
-        """
-
-    @abstractmethod
-    def step(self, command: Command) -> Observation:
-        """Apply `command` for one period.
-
-        Args:
-            command: joint velocities, shape (n,), rad/s; beyond the limit they are clipped.
-
-        Returns:
-            The observation at the end of the period.
-
-        Raises:
-            ValueError: a command of the wrong size.
-            PlantDiverged: the state is no longer finite.
-        """
 
     @abstractmethod
     def truth(self) -> Truth:
@@ -126,6 +97,39 @@ class Plant(ABC):
     @abstractmethod
     def close(self) -> None:
         """Free all resources of the plant; calling it twice is allowed."""
+
+
+class Plant(Abilities):
+    """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
+
+    @abstractmethod
+    def reset(self, seed: int) -> Observation:
+        """Return to the start at time 0 and draw all randomness from `seed`.
+
+        Args:
+            seed: non-negative; the same seed gives the same run, bit for bit.
+
+        Returns:
+            The observation at time 0.
+
+        Raises:
+            FeatureLost: the feature cannot be seen from the start.
+        """
+
+    @abstractmethod
+    def step(self, command: Command) -> Observation:
+        """Apply `command` for one period.
+
+        Args:
+            command: joint velocities, shape (n,), rad/s; beyond the limit they are clipped.
+
+        Returns:
+            The observation at the end of the period.
+
+        Raises:
+            ValueError: a command of the wrong size.
+            PlantDiverged: the state is no longer finite.
+        """
 
 
 @dataclass(frozen=True)
