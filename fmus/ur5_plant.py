@@ -15,7 +15,7 @@ from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.checks import as_vector
 from servobench.plant.fmu.fmu_plant import build_fmu
-from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import FEATURE_NAMES
 from servobench.plant.settings import NonNegative, Periods, Positive, nested, settings
@@ -64,19 +64,16 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
     parameters = parameters_of(model, actuation)
     del parameters["home"]
     return FmuMapping(
-        path=path,
+        file=path,
         inputs=("joint_velocity_command",),
         joints=("joint_position",),
         features=("ball_position",),
-        true_jacobian=("jacobian",),
+        truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
         camera=("camera_position", "camera_rpy"),
         parameters=parameters,
-        max_joint_speed=config.max_joint_speed,
-        joint_lower=-config.joint_range,
-        joint_upper=config.joint_range,
-        joint_names=model.arm.joint_names,
-        feature_names=FEATURE_NAMES,
+        limits=JointLimits(config.max_joint_speed, -config.joint_range, config.joint_range),
+        names=LogNames(model.arm.joint_names, FEATURE_NAMES),
     )
 
 

@@ -43,6 +43,7 @@ Periods: TypeAlias = Annotated[int, Ge(0)]
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")
 
+MAX_LISTED = 40  # names in an error message
 _BOUNDS = {
     "greater_than": ("gt", "above"),
     "greater_than_equal": ("ge", "at least"),
@@ -56,6 +57,8 @@ _WANTED = {
     "bool_type": "true or false",
     "string_type": "text",
     "tuple_type": "a list",
+    "mapping_type": "a section",
+    "dict_type": "a section",
 }
 
 
@@ -105,10 +108,9 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
         if key not in known:
             raise ValueError(f"{name} has no setting {key!r}: {suggest(key, known) if known else 'it has none'}")
         present = getattr(default, key)
-        if is_dataclass(present) != isinstance(value, Mapping):
-            kind = "a section of its own" if is_dataclass(present) else "a plain value"
-            raise ValueError(f"{name}.{key} is {kind}, got {value!r}")
         if is_dataclass(present):
+            if not isinstance(value, Mapping):
+                raise ValueError(f"{name}.{key} is a section of its own, got {value!r}")
             changes[key] = override(f"{name}.{key}", present, value)
         else:
             changes[key] = _convert(f"{name}.{key}", _adapters(cast(Any, type(default)))[key], value)
@@ -119,11 +121,12 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """Return what to say after an unknown word: the nearest known one, then all of them."""
+    """Return what to say after an unknown word: the nearest known one, then all of them, or the first of many."""
     names = sorted(known)
     nearest = difflib.get_close_matches(word, names, n=1)
     hint = f"did you mean {nearest[0]!r}? " if nearest else ""
-    return f"{hint}valid: {', '.join(names)}"
+    more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+    return f"{hint}valid: {', '.join(names[:MAX_LISTED])}{more}"
 
 
 def _convert(name: str, adapter: TypeAdapter[Any], value: object) -> Any:  # noqa: ANN401 - the adapter decides

@@ -6,7 +6,6 @@ that one mapping serves both versions of a model.
 
 from __future__ import annotations
 
-import difflib
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
@@ -16,8 +15,9 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from servobench.plant.settings import suggest
+
 REAL_TYPES = ("Real", "Float64")
-MAX_LISTED = 40  # names in an error message
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,7 @@ class FmuDescription:
         token: GUID or instantiation token.
         can_save: states can be saved and restored.
         can_serialise: saved states can be turned into bytes.
+        once_per_process: its library bears one instance only.
         variables: the real ones, in order.
         other_types: type by name of all others.
     """
@@ -64,6 +65,7 @@ class FmuDescription:
     token: str
     can_save: bool
     can_serialise: bool
+    once_per_process: bool
     variables: tuple[Variable, ...]
     other_types: Mapping[str, str]
 
@@ -103,11 +105,7 @@ class FmuDescription:
                 f"{role} names {name!r}, which is of type {self.other_types[name]}; wanted a real variable"
             )
         known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
-        nearest = difflib.get_close_matches(name, [*known, *self._by_name], n=1)
-        hint = f"did you mean {nearest[0]!r}? " if nearest else ""
-        more = f" and {len(known) - MAX_LISTED} more" if len(known) > MAX_LISTED else ""
-        listed = ", ".join(sorted(known)[:MAX_LISTED])
-        raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have; {hint}it has: {listed}{more}")
+        raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}")
 
     def select(self, names: Iterable[str], role: str) -> tuple[Variable, ...]:
         """Return the variables that `names` stand for, in order."""
@@ -141,6 +139,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         token=str(description.guid if version.startswith("2") else description.instantiationToken),
         can_save=bool(interface.canGetAndSetFMUstate),
         can_serialise=bool(interface.canSerializeFMUstate),
+        once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
         variables=tuple(Variable(v.name, v.valueReference, _size(v, path), v.causality or "local") for v in reals),
         other_types={v.name: v.type for v in description.modelVariables if v.type not in REAL_TYPES},
     )

@@ -76,8 +76,8 @@ class FmuWorld(World):
         self._own_step, self._period = mapping.period or period, period
         self._states: list[ctypes.c_void_p] = []
         self._mapping = mapping
-        root = extract_fmu(mapping.path)
-        self.description = read_description(mapping.path, root)
+        root = extract_fmu(mapping.file)
+        self.description = read_description(mapping.file, root)
         self._spec = mapping_spec(mapping, self.description, period)
         self._has_start = start is not None
         self._start = as_vector("start", np.zeros(self._spec.n) if start is None else start, self._spec.n)
@@ -102,9 +102,9 @@ class FmuWorld(World):
         if mapping.home is not None and self._has_start:
             self._parameters.append(self._parameter(mapping.home, self._start))
         self._camera = mapping.camera
-        self._true_feature = self._port(mapping.true_features or mapping.features)
-        self._true_jacobian = self._port(mapping.true_jacobian) if mapping.true_jacobian else None
-        self._true = mapped_model(mapping, self.description) if mapping.true_states else None
+        self._true_feature = self._port(mapping.truth.features or mapping.features)
+        self._true_jacobian = self._port(mapping.truth.jacobian) if mapping.truth.jacobian else None
+        self._true = mapped_model(mapping, self.description) if mapping.truth.states else None
         nominal = mapping.nominal
         self._nominal = None if nominal is None else mapped_model(mapping, self.description, nominal)
 
@@ -296,5 +296,5 @@ def mapped_entry(path: Path) -> PlantEntry:
     def build(config: FmuConfig, setup: PlantSetup) -> Bench:
         return build_fmu(mapping, setup, config.command_delay_periods, config.sensing)
 
-    summary = f"the FMU {mapping.path.name}, as mapped by {path.name}"
+    summary = f"the FMU {mapping.file.name}, as mapped by {path.name}"
     return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True)

@@ -9,13 +9,15 @@ from __future__ import annotations
 import ctypes
 import logging
 import platform
+import shutil
 import sys
+import tempfile
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -40,16 +42,16 @@ class Port:
     Attributes:
         labels: a name for each number, for messages.
         values: (size,), the buffer.
-        references: value references as ctypes array.
-        count: how many references.
+        variables: value references and their number, for C.
     """
 
     def __init__(self, variables: Sequence[Variable]) -> None:
         """Prepare the buffer."""
         self.labels = tuple(label for variable in variables for label in variable.labels())
         self.values: FloatArray = np.zeros(total_size(variables))
-        self.count = len(variables)
-        self.references = (ctypes.c_uint32 * self.count)(*(variable.reference for variable in variables))
+        count = len(variables)
+        references = (ctypes.c_uint32 * count)(*(variable.reference for variable in variables))
+        self.variables = references, ctypes.c_size_t(count)
 
     @property
     def summary(self) -> str:
@@ -77,16 +79,35 @@ class MessageLog:
         level = STATUS_LEVELS[status] if 0 <= status < len(STATUS_LEVELS) else logging.ERROR
         logger.log(level, "%s: %s", self._name, text)
 
-    def failure(self, function: str, status: int) -> FmuError:
-        """Return the error of a failed call with the last messages, and forget these."""
-        word = STATUS_WORDS[status] if 0 <= status < len(STATUS_WORDS) else "nothing usable"
+    def failure(self, function: str, outcome: int | str) -> FmuError:
+        """Return the error of a call that returned a bad status, or what else the words say, with the last messages.
+
+        The messages are forgotten.
+        """
+        word = outcome
+        if isinstance(outcome, int):
+            word = STATUS_WORDS[outcome] if 0 <= outcome < len(STATUS_WORDS) else "nothing usable"
         said = f"; the FMU said: {' | '.join(self._last)}" if self._last else ""
         self._last.clear()
         return FmuError(f"{self._name}: {function} returned {word}{said}")
 
 
 class Instance(ABC):
-    """One instance of a co-simulation FMU."""
+    """One instance of a co-simulation FMU.
+
+    Attributes:
+        prefix: of the names of all functions in the library.
+        real: what the functions that read and write real numbers call these.
+        state: what the functions for states call these.
+        deserialise: the verb of the function that reads a state from bytes.
+        early: word for a step that ended early.
+    """
+
+    prefix: ClassVar[str]
+    real: ClassVar[str]
+    state: ClassVar[str]
+    deserialise: ClassVar[str]
+    early: ClassVar[str]
 
     def __init__(self, description: FmuDescription, root: Path) -> None:
         """Load the library and make an instance.
@@ -118,20 +139,58 @@ class Instance(ABC):
         """Go through initialisation, to begin at `time`."""
 
     @abstractmethod
-    def reset(self) -> None:
-        """Return to the state after instantiation."""
+    def _taker(self, step: ctypes.c_double) -> Callable[[float], float | None]:
+        """Return a function that takes one step from a time, s, and returns where it ended if it ended early.
 
-    @abstractmethod
-    def raw_reader(self, port: Port) -> RawCall:
-        """Return a function that reads the port's variables into its buffer, for the inner loop."""
+        It reads the size of the step from `step` at every call.
+        """
 
-    @abstractmethod
-    def raw_writer(self, port: Port) -> RawCall:
-        """Return a function that writes the port's buffer into its variables, for the inner loop."""
-
-    @abstractmethod
     def stepper(self, step: float) -> Callable[[float], None]:
         """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+        take = self._taker(ctypes.c_double(step))
+
+        def advance(time: float) -> None:
+            reached = take(time)
+            if reached is not None:
+                self._resume(reached, time, step)
+
+        return advance
+
+    def _resume(self, reached: float | None, time: float, step: float) -> None:
+        """Resume a step that ended early, until the whole step is done.
+
+        Raises:
+            FmuError: it failed, or made no progress.
+        """
+        end, least, rest = time + step, MIN_PROGRESS * step, ctypes.c_double()
+        take = self._taker(rest)
+        while reached is not None:
+            if not reached > time + least:
+                raise self.log.failure(f"{self.prefix}DoStep", f"{self.early} at {reached:.6g} s, no further")
+            if reached > end - least:
+                return
+            time, rest.value = reached, end - reached
+            reached = take(time)
+
+    def reset(self) -> None:
+        """Return to the state after instantiation."""
+        self.call("Reset")
+
+    @abstractmethod
+    def _buffer(self, port: Port) -> tuple[Any, ...]:
+        """Return the arguments that pass a port's buffer to C."""
+
+    def raw_reader(self, port: Port) -> RawCall:
+        """Return a function that reads the port's variables into its buffer, for the inner loop."""
+        return self._access("Get", port)
+
+    def raw_writer(self, port: Port) -> RawCall:
+        """Return a function that writes the port's buffer into its variables, for the inner loop."""
+        return self._access("Set", port)
+
+    def _access(self, verb: str, port: Port) -> RawCall:
+        function = self.function(f"{verb}{self.real}")
+        return partial(function, self._component, *port.variables, *self._buffer(port))
 
     def reader(self, port: Port) -> Call:
         """Return a function that reads the port's variables into its buffer and checks the status."""
@@ -144,38 +203,45 @@ class Instance(ABC):
     def _checked(self, what: str, call: RawCall) -> Call:
         return lambda: self.check(what, call())
 
-    @abstractmethod
-    def save(self) -> ctypes.c_void_p:
-        """Return the present state; it has to be given to `free`."""
-
-    @abstractmethod
-    def restore(self, state: ctypes.c_void_p) -> None:
-        """Return to a saved state."""
-
-    @abstractmethod
-    def free(self, state: ctypes.c_void_p) -> None:
-        """Free a saved state."""
-
-    @abstractmethod
-    def to_bytes(self, state: ctypes.c_void_p) -> bytes:
-        """Return a saved state as bytes that another process understands."""
-
-    @abstractmethod
-    def from_bytes(self, content: bytes) -> ctypes.c_void_p:
-        """Return a state from bytes; it has to be given to `free`."""
-
-    @abstractmethod
     def derivative(self, unknowns: Port, knowns: Port) -> None:
         """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
+        buffers = (*self._buffer(knowns), *self._buffer(unknowns))
+        self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
 
-    @abstractmethod
-    def _free_instance(self) -> None:
-        """Free the instance."""
+    def save(self) -> ctypes.c_void_p:
+        """Return the present state; it has to be given to `free`."""
+        state = ctypes.c_void_p()
+        self.call(f"Get{self.state}", ctypes.byref(state))
+        return state
+
+    def restore(self, state: ctypes.c_void_p) -> None:
+        """Return to a saved state."""
+        self.call(f"Set{self.state}", state)
+
+    def free(self, state: ctypes.c_void_p) -> None:
+        """Free a saved state."""
+        self.call(f"Free{self.state}", ctypes.byref(state))
+
+    def to_bytes(self, state: ctypes.c_void_p) -> bytes:
+        """Return a saved state as bytes that another process understands."""
+        size = ctypes.c_size_t()
+        self.call(f"Serialized{self.state}Size", state, ctypes.byref(size))
+        content = (ctypes.c_char * size.value)()
+        self.call(f"Serialize{self.state}", state, content, size)
+        return bytes(content)
+
+    def from_bytes(self, content: bytes) -> ctypes.c_void_p:
+        """Return a state from bytes; it has to be given to `free`."""
+        state = ctypes.c_void_p()
+        self.call(f"{self.deserialise}{self.state}", content, ctypes.c_size_t(len(content)), ctypes.byref(state))
+        return state
 
     def close(self) -> None:
         """Free the instance and unload the library; calling it twice is allowed."""
         if self._component.value:
-            self._free_instance()
+            release = self.function("FreeInstance")
+            release.restype = None
+            release(self._component)
             self._component = ctypes.c_void_p()
         if self._library is not None:
             unload_library(self._library)
@@ -190,24 +256,21 @@ class Instance(ABC):
         if status > WARNING or status < OK:
             raise self.log.failure(function, status)
 
-    def call(self, function: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
+    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
         """Call a function of the library on the instance and check its status; not for the inner loop."""
-        self.check(function, self.function(function)(self._component, *arguments))
+        self.check(f"{self.prefix}{name}", self.function(name)(self._component, *arguments))
 
     def function(self, name: str) -> Any:  # noqa: ANN401 - a ctypes function
-        """Return a function of the library.
+        """Return a function of the library by its name without prefix.
 
         Raises:
             ValueError: the library does not have it.
         """
         try:
-            return getattr(self._library, name)
+            return getattr(self._library, f"{self.prefix}{name}")
         except AttributeError as error:
-            raise ValueError(f"the library in {self.description.path.name} does not export {name}") from error
-
-    def prebuilt(self, name: str, *arguments: Any) -> RawCall:  # noqa: ANN401 - what C takes
-        """Return a function that calls `name` on the instance with arguments that are converted now."""
-        return partial(self.function(name), self._component, *arguments)
+            file = self.description.path.name
+            raise ValueError(f"the library in {file} does not export {self.prefix}{name}") from error
 
 
 def library_folders(version: int) -> tuple[str, ...]:
@@ -229,7 +292,7 @@ def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN40
         file = root / "binaries" / folder / f"{description.identifier}{suffix}"
         if file.is_file():
             try:
-                return ctypes.CDLL(str(file))
+                return ctypes.CDLL(str(file)) if not description.once_per_process else _load_copy(file)
             except OSError as error:
                 raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
     binaries = root / "binaries"
@@ -238,6 +301,12 @@ def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN40
         f"fmu file {description.path} has no library for this machine; "
         f"wanted {library_folders(description.version)[0]}, it has: {', '.join(there) or 'none'}"
     )
+
+
+def _load_copy(file: Path) -> ctypes.CDLL:
+    """Load a copy of a library and of what lies beside it, so that it shares no variables with another instance."""
+    with tempfile.TemporaryDirectory(prefix="servobench-", ignore_cleanup_errors=True) as folder:
+        return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
 
 
 def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library

@@ -6,6 +6,7 @@ features = ["hook"]                # an array, or all of hook[1], hook[2], ...
 joints = ["q"]                     # optional; without them commands are integrated
 home = "q0"                        # optional: the parameter that takes the joint positions at the start
 start = [0.3, 1.2]                 # optional: these joint positions, rad; needs a home, or that there are no joints
+camera = ["p", "rpy"]              # optional: parameters that take the camera's position, m, and its roll, pitch, yaw
 period = 0.01                      # optional: the FMU's own step, s
 
 [parameters]
@@ -34,80 +35,116 @@ feature_unit = "m"
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+from annotated_types import MinLen
+from pydantic import BeforeValidator
+from pydantic_core import PydanticCustomError
 
-from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.checks import FloatArray
 from servobench.plant.fmu.description import FmuDescription, total_size
-from servobench.plant.settings import suggest
+from servobench.plant.settings import Number, Positive, nested, override, settings
 from servobench.plant.signals import PlantSpec
 
-Names: TypeAlias = tuple[str, ...]
+
+def _as_names(value: Any) -> Any:  # noqa: ANN401 - what a file holds
+    return (value,) if isinstance(value, str) else value
 
 
-@dataclass(frozen=True)
-class FmuMapping:
-    """The roles of an FMU's variables.
+def _as_path(value: Any) -> Any:  # noqa: ANN401 - what a file holds
+    return Path(value) if isinstance(value, str) else value
 
-    A name stands for a scalar, an array, or all of `name[1]`, `name[2]`, …
 
-    Attributes:
-        path: the .fmu file.
-        inputs: joint velocity commands, rad/s; they give n.
-        features: what is measured; they give m.
-        joints: joint positions, rad; without them commands are integrated from the start.
-        true_features: the features without any noise of the FMU's own; without them, the features.
-        true_jacobian: ∂feature/∂joint, row-major (m, n); without it, the plant asks the model-exchange side if
-            `true_states` are named, and cannot tell otherwise.
-        true_states: states of the model-exchange side that are the joint positions; without them, the joints.
-        home: a parameter that takes the joint positions at the start, if there is one.
-        camera: two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame.
-        start: (n,), rad, at time 0, for an FMU with a home or without joints; None for the FMU's own.
-        parameters: values by name, set before every run.
-        nominal: the values that controllers believe, where they differ; None: there is no nominal model.
-        period: the FMU's step, s; None for the control period.
-        max_joint_speed: rad/s; commands are clipped to it.
-        joint_lower: rad, of all joints.
-        joint_upper: rad, of all joints.
-        joint_names: for the log; None for joint_1, joint_2, …
-        feature_names: for the log; None for feature_1, feature_2, …
-        feature_unit: unit of the features.
-    """
+def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
+    if isinstance(value, np.ndarray):
+        return value.astype(np.float64)
+    entries = value if isinstance(value, list | tuple) else [value]
+    if not all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries):
+        raise PydanticCustomError("numbers", "a number or a list of numbers")
+    return np.array(value, dtype=np.float64)
 
-    path: Path
-    inputs: Names
-    features: Names
-    joints: Names = ()
-    true_features: Names = ()
-    true_jacobian: Names = ()
-    true_states: Names = ()
-    home: str | None = None
-    camera: tuple[str, str] | None = None
-    start: FloatArray | None = None
-    parameters: Mapping[str, FloatArray] = field(default_factory=dict)
-    nominal: Mapping[str, FloatArray] | None = None
-    period: float | None = None
-    max_joint_speed: float = 1.0
-    joint_lower: float = -2 * np.pi
-    joint_upper: float = 2 * np.pi
-    joint_names: Names | None = None
-    feature_names: Names | None = None
+
+Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
+"""One name or several; a name stands for a scalar, an array, or all of `name[1]`, `name[2]`, …"""
+Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
+"""A number, or an array of numbers with one axis."""
+
+
+@settings
+class TruthMapping:
+    """What tells the truth, for the log and for upper bounds."""
+
+    features: Names = ()
+    """Features without noise; without them, `features`."""
+    jacobian: Names = ()
+    """∂feature/∂joint, row-major (m, n); without it, the plant asks the model-exchange side if `states` are named."""
+    states: Names = ()
+    """States of the model-exchange side that are the joint positions; without them, the joints."""
+
+
+@settings
+class JointLimits:
+    """Limits of all joints."""
+
+    max_joint_speed: Positive = 1.0
+    """[rad/s] commands are clipped to it."""
+    joint_lower: Number = -2 * np.pi
+    """[rad]"""
+    joint_upper: Number = 2 * np.pi
+    """[rad]"""
+
+
+@settings
+class LogNames:
+    """Names for the log."""
+
+    joints: Names | None = None
+    """None for joint_1, joint_2, …"""
+    features: Names | None = None
+    """None for feature_1, feature_2, …"""
     feature_unit: str = "m"
+    """Unit of the features."""
+
+
+@settings
+class FmuMapping:
+    """The roles of an FMU's variables."""
+
+    file: Annotated[Path, BeforeValidator(_as_path)]
+    """The .fmu file."""
+    inputs: Annotated[Names, MinLen(1)]
+    """Joint velocity commands, rad/s; they give n."""
+    features: Annotated[Names, MinLen(1)]
+    """What the controller sees; they give m."""
+    joints: Names = ()
+    """Joint positions, rad; without them, commands are integrated."""
+    truth: TruthMapping = nested(TruthMapping)
+    """For evaluation only."""
+    home: str | None = None
+    """A parameter that takes the joint positions at the start, if there is one."""
+    camera: tuple[str, str] | None = None
+    """Two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame."""
+    start: Numbers | None = None
+    """(n,) [rad] at time 0, for an FMU with a home or without joints; None for the FMU's own."""
+    parameters: Mapping[str, Numbers] = nested(dict)
+    """Values by name, set before every run."""
+    nominal: Mapping[str, Numbers] | None = None
+    """The values that controllers believe, where they differ; None: there is no nominal model."""
+    period: Positive | None = None
+    """[s] the FMU's step; None for the control period."""
+    limits: JointLimits = nested(JointLimits)
+    """Limits of the joints."""
+    names: LogNames = nested(LogNames)
+    """Names for the log."""
 
     def __post_init__(self) -> None:
-        """Check the rules that need no FMU."""
-        for name in ("inputs", "features"):
-            if not getattr(self, name):
-                raise ValueError(f"{name} must name at least one variable of the FMU, got none")
-        check_number("max_joint_speed", self.max_joint_speed, above=0.0)
+        """Check that something takes the start."""
         if self.start is not None and self.joints and self.home is None:
             raise ValueError("start needs home, the parameter that takes it: the FMU tells its joints itself")
-        if self.period is not None:
-            check_number("period", self.period, above=0.0)
 
 
 def read_mapping(path: Path) -> FmuMapping:
@@ -122,90 +159,11 @@ def read_mapping(path: Path) -> FmuMapping:
         raise ValueError(f"mapping {path} cannot be read: {error}") from error
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"mapping {path} is not valid TOML: {error}") from error
-    try:
-        arguments = _arguments(table)
-        arguments["path"] = path.parent / arguments["path"]
-        return FmuMapping(**arguments)
-    except ValueError as error:
-        raise ValueError(f"mapping {path}: {error}") from error
-
-
-def _arguments(table: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `FmuMapping` that a TOML table holds."""
-    arguments: dict[str, Any] = {}
-    for section in _SECTIONS:
-        if section in table:
-            values = table.pop(section)
-            if not isinstance(values, dict):
-                raise ValueError(f"{section} must be a section, [{section}]")
-            arguments[section] = {name: _numbers(name, value) for name, value in values.items()}
-    for key, value in _flatten(table):
-        if key not in _KEYS:
-            raise ValueError(f"unknown key {key!r}; {suggest(key, [*_KEYS, *_SECTIONS])}")
-        argument, convert = _KEYS[key]
-        arguments[argument] = convert(key, value)
     for key in ("file", "inputs", "features"):
-        if _KEYS[key][0] not in arguments:
-            raise ValueError(f"the key {key!r} is missing")
-    return arguments
-
-
-def _flatten(table: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{inner}", item) for inner, item in value.items())
-        else:
-            yield key, value
-
-
-def _text(key: str, value: object) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{key} must be text, got {value!r}")  # noqa: TRY004
-    return value
-
-
-def _path(key: str, value: object) -> Path:
-    return Path(_text(key, value))
-
-
-def _names(key: str, value: object) -> Names:
-    names = [value] if isinstance(value, str) else value
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError(f"{key} must be a name or a list of names, got {value!r}")
-    return tuple(names)
-
-
-def _number(key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"{key} must be a number, got {value!r}")  # noqa: TRY004
-    return float(value)
-
-
-def _numbers(key: str, value: object) -> FloatArray:
-    if isinstance(value, list):
-        return np.array([_number(key, item) for item in value])
-    return np.array(_number(key, value))
-
-
-_SECTIONS = ("parameters", "nominal")  # in which any name may stand
-_KEYS: dict[str, tuple[str, Callable[[str, object], Any]]] = {
-    "file": ("path", _path),
-    "inputs": ("inputs", _names),
-    "features": ("features", _names),
-    "joints": ("joints", _names),
-    "home": ("home", _text),
-    "start": ("start", _numbers),
-    "period": ("period", _number),
-    "truth.features": ("true_features", _names),
-    "truth.jacobian": ("true_jacobian", _names),
-    "truth.states": ("true_states", _names),
-    "limits.max_joint_speed": ("max_joint_speed", _number),
-    "limits.joint_lower": ("joint_lower", _number),
-    "limits.joint_upper": ("joint_upper", _number),
-    "names.joints": ("joint_names", _names),
-    "names.features": ("feature_names", _names),
-    "names.feature_unit": ("feature_unit", _text),
-}
+        if key not in table:
+            raise ValueError(f"mapping {path}: the key {key!r} is missing")
+    mapping = override(f"mapping {path}", FmuMapping(path, ("to be given",), ("to be given",)), table)
+    return replace(mapping, file=path.parent / mapping.file)
 
 
 def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float) -> PlantSpec:
@@ -219,20 +177,24 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         if variable.causality != "input":
             raise ValueError(f"inputs names {variable.name!r}, which is of causality {variable.causality}")
     n, m = total_size(inputs), total_size(features)
-    wanted = {"joints": n, "true_features": m, "true_jacobian": n * m, "true_states": n}
-    for name, size in wanted.items():
-        names: Names = getattr(mapping, name)
+    truth = mapping.truth
+    for name, names, size in (
+        ("joints", mapping.joints, n),
+        ("truth.features", truth.features, m),
+        ("truth.jacobian", truth.jacobian, n * m),
+        ("truth.states", truth.states, n),
+    ):
         came = total_size(description.select(names, name))
         if names and came != size:
             raise ValueError(f"{name} must name {size} numbers for {n} inputs and {m} features, got {came}")
     return PlantSpec.of_joints(
-        _labels("joint", mapping.joint_names, n),
-        _labels("feature", mapping.feature_names, m),
-        np.full(n, mapping.max_joint_speed),
-        np.full(n, mapping.joint_lower),
-        np.full(n, mapping.joint_upper),
+        _labels("joint", mapping.names.joints, n),
+        _labels("feature", mapping.names.features, m),
+        np.full(n, mapping.limits.max_joint_speed),
+        np.full(n, mapping.limits.joint_lower),
+        np.full(n, mapping.limits.joint_upper),
         period,
-        mapping.feature_unit,
+        mapping.names.feature_unit,
     )
 
 
@@ -240,5 +202,5 @@ def _labels(kind: str, names: Names | None, count: int) -> Names:
     if names is None:
         return tuple(f"{kind}_{i + 1}" for i in range(count))
     if len(names) != count:
-        raise ValueError(f"{kind}_names must hold {count} names, got {len(names)}")
+        raise ValueError(f"names.{kind}s must hold {count} names, got {len(names)}")
     return names

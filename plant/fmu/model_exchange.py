@@ -86,7 +86,7 @@ def mapped_model(
     Raises:
         ValueError: see `FmuModel`; also a mapping that names neither joints nor states.
     """
-    states = mapping.true_states or mapping.joints
+    states = mapping.truth.states or mapping.joints
     if not states:
         raise ValueError("truth.states must name the states of the FMU that are the joint positions, got none")
     values: dict[str, float] = {}
@@ -96,9 +96,9 @@ def mapped_model(
             raise ValueError(f"parameter {name!r} must have {len(variables)} values, got {np.size(value)}")
         scalars = np.broadcast_to(value, (len(variables),)).tolist()
         values |= {variable.name: scalar for variable, scalar in zip(variables, scalars, strict=True)}
-    joints = description.select(states, "truth.states" if mapping.true_states else "joints")
-    features = description.select(mapping.true_features or mapping.features, "features")
-    return FmuModel(mapping.path, [each.name for each in joints], [each.name for each in features], values)
+    joints = description.select(states, "truth.states" if mapping.truth.states else "joints")
+    features = description.select(mapping.truth.features or mapping.features, "features")
+    return FmuModel(mapping.file, [each.name for each in joints], [each.name for each in features], values)
 
 
 def _feature_function(

@@ -110,7 +110,7 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
             3,
             {},
             "[truth]\njacobian = 'wheel'\n",
-            "true_jacobian must name 4 numbers for 2 inputs and 2 features, got 2",
+            "truth.jacobian must name 4 numbers for 2 inputs and 2 features, got 2",
         ),
         (3, {}, "[parameters]\narm = [1.0, 2.0, 3.0]\n", "parameter 'arm' must have 2 values, got 3"),
     ],

@@ -17,7 +17,7 @@ from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.fmu_plant import FmuConfig, FmuWorld, mapped_entry
-from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
@@ -76,7 +76,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 
 def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> Bench:
     path = build_crane(tmp_path / "crane.fmu", version)
-    arguments = {"path": path, "max_joint_speed": 2.0, **NAMES[version], **changes}
+    arguments = {"file": path, "limits": JointLimits(2.0), **NAMES[version], **changes}
     plant = Bench(FmuWorld(FmuMapping(**arguments), START, PERIOD), config.command_delay_periods, config.sensing)
     plant.reset(0)
     return plant
@@ -187,13 +187,13 @@ def test_misbehaviour_at_run_time_is_an_fmu_error(tmp_path, version, quirk, mess
         ({"inputs": ("pusch.slew", "push.luff")}, r"inputs names 'pusch.slew'.*did you mean 'push.slew'.*wheel.slew"),
         ({"inputs": ("place.slew", "place.luff")}, "causality output"),
         ({"joints": ("wheel.slew",)}, "joints must name 2 numbers for 2 inputs and 2 features, got 1"),
-        ({"true_jacobian": ("place.slew",)}, "true_jacobian must name 4 numbers"),
+        ({"truth": TruthMapping(jacobian=("place.slew",))}, "truth.jacobian must name 4 numbers"),
         ({"home": "gear"}, "type Integer; wanted a real variable"),
         ({"parameters": {"arm.slew": np.array([1.0, 2.0])}}, "parameter 'arm.slew' must have 1 values, got 2"),
-        ({"joint_names": ("slew",)}, "joint_names must hold 2 names, got 1"),
+        ({"names": LogNames(("slew",))}, "names.joints must hold 2 names, got 1"),
         ({"period": 0.03}, "whole multiple of the plant's own step of 0.03 s"),
-        ({"inputs": ()}, "inputs must name at least one variable"),
-        ({"max_joint_speed": 0.0}, "max_joint_speed must be above 0"),
+        ({"inputs": ()}, "inputs must be of length 1 or more"),
+        ({"period": 0.0}, "period must be above 0"),
     ],
 )
 def test_a_mapping_that_does_not_fit_is_one_clear_error(tmp_path, changes, message):
@@ -322,6 +322,20 @@ def test_a_second_plant_of_an_fmu_reads_neither_archive_nor_description(tmp_path
     monkeypatch.setattr("fmpy.read_model_description", None)
     second = FmuWorld(FmuMapping(path, **NAMES[2]), START, PERIOD)
     assert second.description is first.description
+    first.close(), second.close()
+
+
+@pytest.mark.parametrize("only_once", [False, True])
+def test_an_fmu_that_bears_one_instance_a_process_gets_a_library_for_each(tmp_path, only_once):
+    # The crane keeps its callbacks in a static variable, so in one library the second instance gets the messages.
+    flag = f'canBeInstantiatedOnlyOncePerProcess="{str(only_once).lower()}"'
+    description = rewritten(2, "<CoSimulation", f"<CoSimulation {flag}")
+    path = build_crane(tmp_path / "crane.fmu", 2, description=description)
+    mapping = FmuMapping(path, **NAMES[2], parameters={"quirk": np.array(1.0)})
+    first, second = FmuWorld(mapping, START, PERIOD), FmuWorld(mapping, START, PERIOD)
+    with pytest.raises(FmuError) as caught:
+        first.advance(np.zeros(2))
+    assert ("too heavy at noon" in str(caught.value)) == only_once
     first.close(), second.close()
 
 

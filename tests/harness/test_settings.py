@@ -93,7 +93,7 @@ def test_flatten_names_every_leaf():
         ("outer.point=[true]", r"outer.point.0 must be a number, got True"),
         ("outer.point=1", r"outer.point must be a list, got 1"),
         ("outer.inner=1", r"outer.inner is a section of its own, got 1"),
-        ("outer.count.x=1", r"outer.count is a plain value"),
+        ("outer.count.x=1", r"outer.count must be a whole number, got {'x': 1}"),
         ("outer.inner.kind=three", r"outer.inner.kind must be one of one, two, got 'three'"),
         ("outer=1", r"--set needs section.key=value"),
         ("outer.count", r"--set needs section.key=value"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.fmu.mapping import read_mapping
+from servobench.plant.fmu.mapping import JointLimits, LogNames, TruthMapping, read_mapping
 
 WHOLE = """
 file = "crane.fmu"
@@ -43,20 +43,15 @@ def written(tmp_path, text):
 
 def test_every_key_arrives(tmp_path):
     mapping = read_mapping(written(tmp_path, WHOLE))
-    assert mapping.path == tmp_path / "crane.fmu"
+    assert mapping.file == tmp_path / "crane.fmu"
     assert (mapping.inputs, mapping.features, mapping.joints) == (("v[1]", "v[2]"), ("hook",), ("q",))
-    assert (mapping.home, mapping.period, mapping.true_features, mapping.true_jacobian) == (
-        "q0",
-        0.01,
-        ("hook",),
-        ("J",),
-    )
-    assert (mapping.max_joint_speed, mapping.joint_lower, mapping.joint_upper) == (2.0, -3.1, 3.2)
-    assert (mapping.joint_names, mapping.feature_names, mapping.feature_unit) == (("slew", "luff"), ("x", "y"), "mm")
+    assert (mapping.home, mapping.period) == ("q0", 0.01)
+    assert mapping.truth == TruthMapping(("hook",), ("J",), ("s",))
+    assert mapping.limits == JointLimits(2.0, -3.1, 3.2)
+    assert mapping.names == LogNames(("slew", "luff"), ("x", "y"), "mm")
     np.testing.assert_array_equal(mapping.parameters["gains"], [1.0, 2.0])
     assert mapping.parameters["mass"] == 12.0
     assert mapping.nominal == {"gains": 3.0}
-    assert mapping.true_states == ("s",)
     assert mapping.start.tolist() == [0.3, 1.2]
     assert read_mapping(written(tmp_path, WHOLE.replace("[nominal]\ngains = 3.0", ""))).nominal is None
 
@@ -66,15 +61,16 @@ def test_every_key_arrives(tmp_path):
     [
         ('file = "crane.fmu"', "", "the key 'file' is missing"),
         ('features = "hook"', "", "the key 'features' is missing"),
-        ('home = "q0"', 'hoem = "q0"', r"unknown key 'hoem'; did you mean 'home'\? valid: features, file"),
-        ("joint_lower", "joint_low", "unknown key 'limits.joint_low'; did you mean 'limits.joint_lower'"),
+        ('home = "q0"', 'hoem = "q0"', r"no setting 'hoem': did you mean 'home'\? valid: camera, features, file"),
+        ("joint_lower", "joint_low", "limits has no setting 'joint_low': did you mean 'joint_lower'"),
         ('home = "q0"', "home = 3", "home must be text, got 3"),
-        ('joints = ["q"]', "joints = [1]", r"joints must be a name or a list of names, got \[1\]"),
-        ("gains = 3.0", "gains = 'large'", "gains must be a number, got 'large'"),
+        ('joints = ["q"]', "joints = [1]", "joints.0 must be text, got 1"),
+        ("gains = 3.0", "gains = 'large'", "nominal.gains must be a number or a list of numbers, got 'large'"),
         ('home = "q0"', "", "start needs home, the parameter that takes it"),
         ("period = 0.01", 'period = "short"', "period must be a number, got 'short'"),
         ("period = 0.01", "period = 0.0", "period must be above 0, got 0.0"),
-        ("mass = 12", 'mass = "heavy"', "mass must be a number, got 'heavy'"),
+        ("mass = 12", 'mass = "heavy"', "parameters.mass must be a number or a list of numbers, got 'heavy'"),
+        ("gains = 3.0", "gains = [1.0, true]", "nominal.gains must be a number or a list of numbers"),
         ("max_joint_speed = 2", "max_joint_speed = -2", "max_joint_speed must be above 0"),
         ("[parameters]\nmass = 12\ngains = [1.0, 2.0]", "parameters = 1", "parameters must be a section"),
         ("period = 0.01", "period = ", "is not valid TOML"),
