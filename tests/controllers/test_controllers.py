@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kit.toy import plant_spec
 from servobench.controllers import nmpc_calibrated
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig
@@ -21,7 +22,7 @@ from servobench.controllers.networks.fit import train
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
 from servobench.harness.config.defaults import default_config
-from servobench.plant.signals import Observation, PlantSpec
+from servobench.plant.signals import Observation
 
 PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [compose(law, "kalman") for law in LAWS]
 COMPOSED = [pytest.param(entry, id=entry.name) for entry in dict.fromkeys([*METHODS.values(), *PAIRS])]
@@ -33,8 +34,7 @@ SMALL = {"samples": 40, "width_scales": (1.0,), "regularisations": (1e-6,)}
 def robot(n, m, seed):
     """What may be known about a made-up robot y = A sin(B q) of any size; its true Jacobian has other numbers."""
     rng = np.random.default_rng(seed)
-    names = tuple(f"j{i}" for i in range(n)), tuple(f"y{i}" for i in range(m))
-    spec = PlantSpec.of_joints(*names, rng.uniform(0.1, 3.0, n), np.full(n, -6.0), np.full(n, 6.0), 0.05)
+    spec = plant_spec(n, m, rng.uniform(0.1, 3.0, n))
     A, B = rng.normal(size=(m, n)), rng.normal(size=n)
 
     def nominal_jacobian(q):
@@ -87,11 +87,13 @@ def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n,
 
 
 @pytest.mark.parametrize("source", ["nominal", "probe"])
-@pytest.mark.parametrize("entry", COMPOSED)
+@pytest.mark.parametrize("entry", ALL)
 def test_reset_forgets_everything(entry, source):
-    knowledge = robot(5, 3, 7)
-    initial = InitialConfig(source=source, probe_step=1e-3, settle_periods=1, average_periods=1)
-    controller = entry.build(dataclasses.replace(default_config(entry), initial=initial), knowledge)
+    knowledge, config = robot(5, 3, 7), default_config(entry)
+    if hasattr(config, "initial"):
+        initial = InitialConfig(source=source, probe_step=1e-3, settle_periods=1, average_periods=1)
+        config = dataclasses.replace(config, initial=initial)
+    controller = entry.build(config, knowledge)
     steps = 40 if source == "probe" else 12
     first = random_run(controller, knowledge.spec, 1, 0.5, steps)
     random_run(controller, knowledge.spec, 2, 0.5, steps // 2)

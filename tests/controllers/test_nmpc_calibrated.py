@@ -3,20 +3,19 @@ import math
 import casadi
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
+from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.controllers.nmpc_calibrated import ENTRY, NmpcCalibrated, NmpcCalibratedConfig
+from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
 from servobench.plant.faults import SolverFailed
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import nominal_ur5
-from servobench.plant.signals import Observation, PlantSpec
+from servobench.plant.signals import Observation
 
 MODEL = nominal_ur5()
 SYMBOLIC = symbolic_feature(MODEL)
@@ -32,11 +31,6 @@ def make(**changes):
     return NmpcCalibrated(NmpcCalibratedConfig(**changes), knowledge())
 
 
-def small_spec(n, m, speed=1.0, reach=6.0):
-    names = [tuple(f"{word}_{i}" for i in range(size)) for word, size in (("joint", n), ("feature", m))]
-    return PlantSpec.of_joints(*names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), 0.05)
-
-
 def hold(target, preview=12):
     return np.tile(np.asarray(target, dtype=float), (preview + 1, 1))
 
@@ -44,7 +38,7 @@ def hold(target, preview=12):
 def test_first_step_by_hand():
     # h(q) = sin q at q = 0, H = 1, β = ½, q = 1e-9: sin(dq) = ½·0.4, so dq = asin 0.2.
     config = NmpcCalibratedConfig(horizon=1, delay_periods=0, rho=math.log(2.0), move_weight=1e-9, iterations=20)
-    controller = NmpcCalibrated(config, knowledge(small_spec(1, 1, speed=10.0), casadi.sin))
+    controller = NmpcCalibrated(config, knowledge(plant_spec(1, 1, speed=10.0), casadi.sin))
     command = controller.step(Observation(0.0, [0.0], [0.0]), hold([0.4]))
     np.testing.assert_allclose(command.joint_velocity * 0.05, [math.asin(0.2)], rtol=1e-7)
 
@@ -52,7 +46,7 @@ def test_first_step_by_hand():
 def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
     rng = np.random.default_rng(0)
     J, offset = rng.normal(size=(2, 4)), rng.normal(size=2)
-    spec = small_spec(4, 2)
+    spec = plant_spec(4, 2)
     common = {"horizon": 6, "rho": 0.4, "move_weight": 0.05, "delay_periods": 2, "joint_acceleration_limit": 8.0}
     law = MpcLaw(MpcConfig(**common), RobotKnowledge(spec, 12))
     controller = NmpcCalibrated(
@@ -85,6 +79,7 @@ def test_the_plan_minimises_the_nonlinear_criterion():
     solver = casadi.nlpsol("oracle", "ipopt", {"x": casadi.vec(dq), "f": cost}, quiet)
     best = np.asarray(solver(x0=np.zeros(24), lbx=-0.05, ubx=0.05)["x"])[:6, 0]
     np.testing.assert_allclose(command.joint_velocity * 0.05, best, atol=1e-5)
+    np.testing.assert_allclose(controller.estimated_jacobian(), MODEL.jacobian(START), atol=1e-12)
 
 
 def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
@@ -115,7 +110,7 @@ def test_a_disturbance_of_the_camera_is_followed_only_with_a_gain():
 
 def infeasible(fallback):
     """A joint at full speed right before its limit cannot brake in time at so low an acceleration."""
-    spec = small_spec(1, 1, reach=1.0)
+    spec = plant_spec(1, 1, reach=1.0)
     config = NmpcCalibratedConfig(delay_periods=0, joint_acceleration_limit=0.5, fallback=fallback)
     controller = NmpcCalibrated(config, knowledge(spec, lambda q: 1.0 * q))
     for _ in range(40):
@@ -136,61 +131,6 @@ def test_without_a_solution_and_fallback_it_is_a_named_failure():
     controller, observation = infeasible("raise")
     with pytest.raises(SolverFailed, match="daqp found no solution within the limits"):
         controller.step(observation, hold([5.0]))
-
-
-def test_reset_forgets_everything_bit_for_bit():
-    used, fresh = (make(joint_acceleration_limit=5.0, disturbance_gain=0.1) for _ in range(2))
-    y = MODEL.feature(START)
-    for k in range(4):
-        used.step(Observation(0.0, START + 0.1 * k, y), hold(y + np.array([0.3, 0.1 * k, 0.0])))
-    used.reset(Observation(0.0, START, y), 1)
-    assert used.diagnostics() == {}
-    assert used.estimated_jacobian() is None
-    for k in range(4):
-        observation = Observation(0.0, START + 0.01 * k, y)
-        commands = [c.step(observation, hold(y + np.array([0.1, 0.0, -0.1]))).joint_velocity for c in (used, fresh)]
-        np.testing.assert_array_equal(*commands)
-    np.testing.assert_allclose(used.estimated_jacobian(), MODEL.jacobian(START + 0.03), atol=1e-12)
-
-
-@settings(max_examples=25, deadline=None)
-@given(n=st.integers(2, 8), m=st.integers(1, 4), seed=st.integers(0, 2**32))
-def test_commands_are_finite_and_within_the_limits_for_any_size(n, m, seed):
-    rng = np.random.default_rng(seed)
-    A, B = (casadi.DM(rng.normal(size=(m, n))) for _ in range(2))
-    spec = small_spec(n, m, speed=float(rng.uniform(0.1, 3.0)))
-    config = NmpcCalibratedConfig(horizon=3, iterations=2, joint_acceleration_limit=8.0)
-    controller = NmpcCalibrated(config, knowledge(spec, lambda q: A @ casadi.sin(q) + B @ casadi.cos(q)))
-    for _ in range(3):
-        observation = Observation(0.0, rng.uniform(-7.0, 7.0, n), rng.normal(size=m))
-        velocity = controller.step(observation, 10.0 ** rng.uniform(-3, 3) * rng.normal(size=(13, m))).joint_velocity
-        assert np.isfinite(velocity).all()
-        assert (np.abs(velocity) <= spec.joint_velocity_limit).all()
-
-
-def test_its_entry_asks_for_the_truth():
-    assert ENTRY.needs_truth
-    assert isinstance(ENTRY.build(ENTRY.config(), knowledge()), NmpcCalibrated)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"horizon": 0}, "horizon must be at least 1, got 0"),
-        ({"delay_periods": -1}, "delay_periods must be at least 0, got -1"),
-        ({"rho": 0.0}, "rho must be above 0, got 0.0"),
-        ({"move_weight": 0.0}, "move_weight must be above 0, got 0.0"),
-        ({"terminal_weight": -1.0}, "terminal_weight must be at least 0, got -1.0"),
-        ({"iterations": 0}, "iterations must be at least 1, got 0"),
-        ({"disturbance_gain": 1.5}, "disturbance_gain must be at most 1, got 1.5"),
-        ({"joint_acceleration_limit": -1.0}, "joint_acceleration_limit must be above 0, got -1.0"),
-        ({"solver": "ipopt"}, "solver must be one of daqp, qpoases, got 'ipopt'"),
-        ({"fallback": "closed_form"}, "fallback must be one of hold, raise, got 'closed_form'"),
-    ],
-)
-def test_a_bad_setting_is_named(changes, message):
-    with pytest.raises(ValueError, match=message):
-        NmpcCalibratedConfig(**changes)
 
 
 def test_knowledge_that_does_not_suffice_is_named():

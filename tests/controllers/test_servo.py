@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from kit.toy import plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.constant import ConstantEstimator
@@ -14,11 +15,9 @@ from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.prediction import Prediction, Predictor
 from servobench.controllers.servo import ServoController
 from servobench.plant.faults import ControllerDiverged
-from servobench.plant.signals import Observation, PlantSpec
 
-SPEC = PlantSpec.of_joints(("a", "b", "c"), ("x", "y"), np.ones(3), -np.ones(3), np.ones(3), 0.05)
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
-KNOWLEDGE = RobotKnowledge(SPEC, 1, nominal_jacobian=lambda q: J0)
+KNOWLEDGE = RobotKnowledge(plant_spec(3, 2, reach=1.0), 1, nominal_jacobian=lambda q: J0)
 
 
 class Recorder(Estimator):
@@ -54,19 +53,15 @@ def servo(estimator, law=None, predictor=None):
     return ServoController(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE, predictor)
 
 
-def seen(k, q, y, valid=True):
-    return Observation(k * 0.05, np.asarray(q, dtype=float), np.asarray(y, dtype=float), valid)
-
-
 def test_a_motion_spans_the_gap_that_lost_frames_leave():
     estimator = Recorder()
     controller, reference = servo(estimator), np.full((2, 2), 0.3)
-    first = seen(0, [0.0, 0.0, 0.0], [0.1, 0.1])
+    first = seen([0.0, 0.0, 0.0], [0.1, 0.1])
     controller.reset(first, 0)
     controller.step(first, reference)
-    controller.step(seen(1, [0.01, 0.0, 0.0], [0.1, 0.1], valid=False), reference)
-    controller.step(seen(2, [0.02, 0.0, 0.0], [0.1, 0.1], valid=False), reference)
-    controller.step(seen(3, [0.03, 0.0, 0.01], [0.12, 0.11]), reference)
+    controller.step(seen([0.01, 0.0, 0.0], [0.1, 0.1], valid=False, k=1), reference)
+    controller.step(seen([0.02, 0.0, 0.0], [0.1, 0.1], valid=False, k=2), reference)
+    controller.step(seen([0.03, 0.0, 0.01], [0.12, 0.11], k=3), reference)
     (motion,) = estimator.motions
     np.testing.assert_array_equal(motion.joint_position, [0.0, 0.0, 0.0])
     np.testing.assert_allclose(motion.joint_step, [0.03, 0.0, 0.01])
@@ -80,11 +75,11 @@ def test_a_motion_spans_the_gap_that_lost_frames_leave():
 def test_nothing_is_learnt_before_a_second_valid_feature():
     estimator = Recorder()
     controller, reference = servo(estimator), np.zeros((2, 2))
-    first = seen(0, np.zeros(3), np.zeros(2), valid=False)
+    first = seen(np.zeros(3), np.zeros(2), valid=False)
     controller.reset(first, 0)
     assert controller.estimated_jacobian() is None
     controller.step(first, reference)
-    controller.step(seen(1, np.ones(3) * 0.01, np.ones(2) * 0.01), reference)
+    controller.step(seen(np.ones(3) * 0.01, np.ones(2) * 0.01, k=1), reference)
     assert estimator.motions == []
     assert np.isnan(controller.diagnostics()["jacobian_prediction_error"])
     np.testing.assert_array_equal(controller.estimated_jacobian(), J0)
@@ -92,7 +87,7 @@ def test_nothing_is_learnt_before_a_second_valid_feature():
 
 def test_the_first_step_equals_the_law_at_the_first_jacobian():
     controller, law = servo(ConstantEstimator()), MfacLaw(MfacConfig(), KNOWLEDGE)
-    first, reference = seen(0, np.zeros(3), [0.1, 0.0]), np.full((2, 2), 0.12)
+    first, reference = seen(np.zeros(3), [0.1, 0.0]), np.full((2, 2), 0.12)
     controller.reset(first, 0)
     expected = law.command(Estimate(J0), first, reference)
     np.testing.assert_array_equal(controller.step(first, reference).joint_velocity, expected)
@@ -100,14 +95,14 @@ def test_the_first_step_equals_the_law_at_the_first_jacobian():
 
 
 def test_a_command_that_is_not_finite_is_a_named_fault():
-    controller, first = servo(ConstantEstimator(), Broken()), seen(0, np.zeros(3), np.zeros(2))
+    controller, first = servo(ConstantEstimator(), Broken()), seen(np.zeros(3), np.zeros(2))
     controller.reset(first, 0)
     with pytest.raises(ControllerDiverged, match="joint_velocity is not finite at 0 s"):
         controller.step(first, np.zeros((2, 2)))
 
 
 def test_an_estimate_that_is_not_finite_is_a_named_fault():
-    estimator, first = Recorder(), seen(0, np.zeros(3), np.zeros(2))
+    estimator, first = Recorder(), seen(np.zeros(3), np.zeros(2))
     controller = servo(estimator)
     controller.reset(first, 0)
     controller.step(first, np.zeros((2, 2)))
@@ -117,12 +112,12 @@ def test_an_estimate_that_is_not_finite_is_a_named_fault():
 
 
 def test_observations_and_references_of_the_wrong_size_are_refused():
-    controller, first = servo(ConstantEstimator()), seen(0, np.zeros(3), np.zeros(2))
+    controller, first = servo(ConstantEstimator()), seen(np.zeros(3), np.zeros(2))
     controller.reset(first, 0)
     with pytest.raises(ValueError, match=r"observation.joint_position must have shape \(3,\)"):
-        controller.step(seen(0, np.zeros(2), np.zeros(2)), np.zeros((2, 2)))
+        controller.step(seen(np.zeros(2), np.zeros(2)), np.zeros((2, 2)))
     with pytest.raises(ValueError, match=r"observation.feature must have shape \(2,\)"):
-        controller.reset(seen(0, np.zeros(3), np.zeros(3)), 0)
+        controller.reset(seen(np.zeros(3), np.zeros(3)), 0)
     with pytest.raises(ValueError, match=r"reference must have shape \(2, 2\) for a preview of 1"):
         controller.step(first, np.zeros((1, 2)))
     with pytest.raises(ValueError, match="reference must be finite"):
@@ -130,26 +125,26 @@ def test_observations_and_references_of_the_wrong_size_are_refused():
 
 
 def test_a_predictor_stands_before_the_law_and_gets_the_command():
-    seen = []
+    calls = []
 
     class Doubling:
         def reset(self):
-            seen.append("reset")
+            calls.append("reset")
 
         def predict(self, estimate, observation):
             return Prediction(2.0 * observation.feature, observation.joint_position, 1.0)
 
         def note(self, joint_step):
-            seen.append(joint_step)
+            calls.append(joint_step)
 
     controller, law = servo(ConstantEstimator(), predictor=Doubling()), MfacLaw(MfacConfig(), KNOWLEDGE)
-    first = Observation(0.0, np.zeros(3), np.array([0.1, 0.0]))
+    first = seen(np.zeros(3), [0.1, 0.0])
     controller.reset(first, 0)
     u = controller.step(first, np.array([[0.0, 0.0], [0.3, 0.2]])).joint_velocity
-    doubled = Observation(0.0, np.zeros(3), np.array([0.2, 0.0]))
+    doubled = seen(np.zeros(3), [0.2, 0.0])
     np.testing.assert_array_equal(u, law.command(Estimate(J0), doubled, np.array([[0.3, 0.2], [0.6, 0.4]])))
-    assert seen[0] == "reset"
-    np.testing.assert_array_equal(seen[1], u * 0.05)
+    assert calls[0] == "reset"
+    np.testing.assert_array_equal(calls[1], u * 0.05)
 
 
 def test_a_second_predict_stage_is_refused():

@@ -6,20 +6,40 @@ from types import SimpleNamespace
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 from servobench.plant.signals import Observation, PlantSpec
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
+
+
+def plant_spec(n, m, speed=1.0, reach=6.0):
+    """Return a plant of which all joints have the same limits: speed, rad/s, and reach, rad."""
+    names = (tuple(f"{letter}{i}" for i in range(size)) for letter, size in (("j", n), ("y", m)))
+    return PlantSpec.of_joints(*names, np.full(n, speed), np.full(n, -reach), np.full(n, reach), PERIOD)
+
+
+def seen(q, y, valid=True, k=0):
+    """Return what is observed in period k."""
+    return Observation(k * PERIOD, np.asarray(q, dtype=float), np.asarray(y, dtype=float), valid)
+
+
+def motion(dq, dy, e=None, q=None, duration=PERIOD):
+    """Return a motion of the joints by dq and of the feature by dy."""
+    dq, dy = np.asarray(dq, dtype=float), np.asarray(dy, dtype=float)
+    return Motion(np.zeros(dq.size) if q is None else q, dq, dy, np.zeros(dy.size) if e is None else e, duration)
+
+
+def jacobian_network(n=3, m=2, units=4, seed=0):
+    """Return a random Jacobian network."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n, units, n)), rng.uniform(1.0, 2.0, (n, units))
+    return JacobianNetwork(*shapes, rng.normal(size=(n, m, units)))
+
+
 A = 0.4 * np.random.default_rng(11).normal(size=(M, N))  # m/rad
-SPEC = PlantSpec.of_joints(
-    tuple(f"j{i}" for i in range(N)),
-    tuple(f"y{i}" for i in range(M)),
-    np.full(N, LIMIT),
-    np.full(N, -6.0),
-    np.full(N, 6.0),
-    PERIOD,
-)
+SPEC = plant_spec(N, M, LIMIT)
 KNOWLEDGE = RobotKnowledge(SPEC, PREVIEW, lambda q: np.broadcast_to(A, (*np.shape(q)[:-1], M, N)))
 
 
@@ -54,7 +74,7 @@ class ToyArm:
         self.seen = deque([np.zeros(M)] * (latency + 1), maxlen=latency + 1)
 
     def observe(self):
-        return Observation(self.k * PERIOD, self.q, self.seen[0])
+        return seen(self.q, self.seen[0], k=self.k)
 
     def step(self, u):
         self.commands.appendleft(u * PERIOD)
