@@ -17,11 +17,16 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import Field, field, fields, is_dataclass, replace
 from functools import cache, wraps
+from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar, cast, dataclass_transform, get_type_hints
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
-from pydantic import AllowInfNan, ConfigDict, TypeAdapter, ValidationError
+from pydantic import AllowInfNan, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
+from pydantic_core import PydanticCustomError
+
+from servobench.plant.checks import FloatArray
 
 Number: TypeAlias = Annotated[float, AllowInfNan(False)]
 """A finite number."""
@@ -39,6 +44,31 @@ Count: TypeAlias = Annotated[int, Ge(1)]
 """A whole number, 1 or above."""
 Periods: TypeAlias = Annotated[int, Ge(0)]
 """A whole number of control periods, or another count that may be 0."""
+
+
+def _as_names(value: Any) -> Any:  # noqa: ANN401 - what a file holds
+    return (value,) if isinstance(value, str) else value
+
+
+def _as_path(value: Any) -> Any:  # noqa: ANN401 - what a file holds
+    return Path(value) if isinstance(value, str) else value
+
+
+def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
+    if isinstance(value, np.ndarray):
+        return value.astype(np.float64)
+    entries = value if isinstance(value, list | tuple) else [value]
+    if not all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries):
+        raise PydanticCustomError("numbers", "a number or a list of numbers")
+    return np.array(value, dtype=np.float64)
+
+
+Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
+"""One name or several."""
+Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
+"""An array of numbers; in a file, a number or a list of numbers."""
+File: TypeAlias = Annotated[Path, BeforeValidator(_as_path)]
+"""The path of a file."""
 
 Class = TypeVar("Class", bound=type)
 Config = TypeVar("Config")

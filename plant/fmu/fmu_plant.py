@@ -23,11 +23,11 @@ from servobench.plant.fmu.description import FmuDescription, read_description
 from servobench.plant.fmu.instance import Call, Instance, Port
 from servobench.plant.fmu.instance2 import Instance2
 from servobench.plant.fmu.instance3 import Instance3
-from servobench.plant.fmu.mapping import FmuMapping, Names, mapping_spec, read_mapping
+from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping
 from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.plant import PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
-from servobench.plant.settings import Periods, nested, settings
+from servobench.plant.settings import Names, Periods, nested, settings
 from servobench.plant.signals import PlantSpec, Truth
 
 

@@ -38,40 +38,14 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated
 
 import numpy as np
 from annotated_types import MinLen
-from pydantic import BeforeValidator
-from pydantic_core import PydanticCustomError
 
-from servobench.plant.checks import FloatArray
 from servobench.plant.fmu.description import FmuDescription, total_size
-from servobench.plant.settings import Number, Positive, nested, override, settings
+from servobench.plant.settings import File, Names, Number, Numbers, Positive, nested, override, settings
 from servobench.plant.signals import PlantSpec
-
-
-def _as_names(value: Any) -> Any:  # noqa: ANN401 - what a file holds
-    return (value,) if isinstance(value, str) else value
-
-
-def _as_path(value: Any) -> Any:  # noqa: ANN401 - what a file holds
-    return Path(value) if isinstance(value, str) else value
-
-
-def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
-    if isinstance(value, np.ndarray):
-        return value.astype(np.float64)
-    entries = value if isinstance(value, list | tuple) else [value]
-    if not all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries):
-        raise PydanticCustomError("numbers", "a number or a list of numbers")
-    return np.array(value, dtype=np.float64)
-
-
-Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
-"""One name or several; a name stands for a scalar, an array, or all of `name[1]`, `name[2]`, …"""
-Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
-"""A number, or an array of numbers with one axis."""
 
 
 @settings
@@ -112,9 +86,9 @@ class LogNames:
 
 @settings
 class FmuMapping:
-    """The roles of an FMU's variables."""
+    """The roles of an FMU's variables; a name is that of a scalar, an array, or the scalars `name[1]`, `name[2]`."""
 
-    file: Annotated[Path, BeforeValidator(_as_path)]
+    file: File
     """The .fmu file."""
     inputs: Annotated[Names, MinLen(1)]
     """Joint velocity commands, rad/s; they give n."""
