@@ -234,7 +234,7 @@ def test_bad_exports_are_refused(tmp_path, monkeypatch):
         parse_platforms("amiga")
     with pytest.raises(ValueError, match="for the FMU does not exist"):
         export_fmu(tmp_path / "missing" / "ur5.fmu", ExportOptions(2))
-    with pytest.raises(ValueError, match="fmi_version must be 2 or 3, got 4"):
+    with pytest.raises(ValueError, match="fmi_version must be one of 2, 3, got 4"):
         Ur5FmuConfig(fmi_version=4)
     monkeypatch.setattr(compiling.shutil, "which", lambda _: None)
     monkeypatch.setattr(compiling.importlib.util, "find_spec", lambda _: None)
