@@ -7,7 +7,7 @@ import pickle
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -15,7 +15,7 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Cell, carry_out, comparison
+from servobench.harness.batch.campaign import Campaign, Cell, Execution, carry_out, comparison
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.registry import controller_names, offering
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -112,16 +112,15 @@ def compare(
                          ("seeds", chosen)):  # fmt: skip
         if not len(values):
             raise ConfigurationError(f"{what} must name at least one, got none")
-    place: dict[str, Any] = {"workers": workers, "run_timeout": run_timeout}
     if not _can_travel(entries):
-        place = {"workers": 1}
-    whole = Settings(settings or {})
+        workers, run_timeout = 1, None
+    how, whole = Execution(workers, None, run_timeout, resume), Settings(settings or {})
     if out is not None:
-        carry_out(comparison(batch, whole, entries), Path(out), resume=resume, **place)
+        carry_out(comparison(batch, whole, entries), Path(out), how)
         return results.load_runs(Path(out))
     with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
         cells = [Cell(request) for request in batch.requests()]
-        carry_out(Campaign(cells, whole, entries=entries), Path(folder), **place)
+        carry_out(Campaign(cells, whole, entries=entries), Path(folder), replace(how, resume=False))
         return results.load_runs(Path(folder))
 
 

@@ -14,81 +14,65 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
 from servobench.controllers.controller import ControllerEntry
+from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch import results
-from servobench.harness.batch.compare import Batch, check_batch
+from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.workers import Workers, open_workers
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.episode import RunResult, crashed_row, run_experiment
+from servobench.harness.run import episode
+from servobench.harness.run.episode import CRASHED, TIMED_OUT, RunResult, describe_error, failed_row
+from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import ResolvedRun, known_sections, resolve_sections, select
 
 CHUNK: Final = 8  # [runs] without steps; a crash costs at most so many, and messages and files cost little
 LOST: Final = "the run killed the process that carried it out"
-TIMED_OUT: Final = "timed_out"
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A run and its further columns in the table of runs.
-
-    Attributes:
-        request: the run.
-        columns: names and values, such as the place along the axis that a sweep varies.
-        picture: keep what the camera saw last.
-    """
+    """A run and its further columns in the table of runs."""
 
     request: RunRequest
-    columns: Mapping[str, Any] = field(default_factory=dict)
-    picture: bool = False
+    columns: Mapping[str, Any] = field(default_factory=dict)  # such as the place along the axis that a sweep varies
+    picture: bool = False  # keep what the camera saw last
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive runs with common settings.
+    """Consecutive cells with their settings, and controllers that the registry does not know."""
 
-    Attributes:
-        index: of the first run.
-        cells: the runs.
-        settings: overrides of the defaults.
-        entries: controllers that the registry does not know.
-    """
-
-    index: int
+    index: int  # of the first cell
     cells: tuple[Cell, ...]
-    settings: Settings
+    runs: tuple[ResolvedRun, ...]  # one for each cell
     entries: tuple[ControllerEntry, ...] = ()
 
     def singly(self) -> list[Chunk]:
         """Return each run as a chunk of its own."""
-        return [Chunk(self.index + i, (cell,), self.settings, self.entries) for i, cell in enumerate(self.cells)]
+        pairs = zip(self.cells, self.runs, strict=True)
+        return [Chunk(self.index + i, (cell,), (run,), self.entries) for i, (cell, run) in enumerate(pairs)]
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """Runs that share their settings and end in one results folder.
+    """Runs that share their settings and end in one results folder."""
 
-    Attributes:
-        cells: the runs, in the order of the table.
-        settings: overrides of the defaults.
-        steps: keep the table of steps too.
-        entries: controllers that the registry does not know.
-    """
-
-    cells: Sequence[Cell]
-    settings: Settings
-    steps: bool = False
-    entries: tuple[ControllerEntry, ...] = ()
+    cells: Sequence[Cell]  # in the order of the table
+    settings: Settings  # overrides of the defaults
+    steps: bool = False  # keep the table of steps, too
+    entries: tuple[ControllerEntry, ...] = ()  # controllers that the registry does not know
 
 
 def comparison(batch: Batch, settings: Settings, entries: tuple[ControllerEntry, ...] = ()) -> Campaign:
@@ -113,75 +97,122 @@ class Observer:
         """Receive one line for the user."""
 
 
-def carry_out(
-    campaign: Campaign,
-    folder: Path,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    run_timeout: float | None = None,
-    resume: bool = False,
-    observer: Observer | None = None,
-) -> None:
+@dataclass(frozen=True)
+class Execution:
+    """How the runs of a campaign are carried out.
+
+    Attributes:
+        workers: number of processes; None for the number of processors.
+        scheduler: address of a Dask scheduler; None for processes of this machine.
+        run_timeout: [s] time limit of a run; None for no limit.
+        resume: carry out what is missing in the folder.
+        observer: receives the progress.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
+    run_timeout: float | None = None
+    resume: bool = False
+    observer: Observer = field(default_factory=Observer)
+
+    def of_part(self, folder: Path) -> Execution:
+        """Return how a part of a study is carried out: one that was not begun cannot be resumed."""
+        return replace(self, resume=self.resume and folder.exists())
+
+
+def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) -> None:
     """Check and carry out the runs of a campaign and put its tables together.
 
     Ctrl-C raises KeyboardInterrupt; finished runs are kept, and the same call with `resume` continues.
 
     Args:
         campaign: the runs.
-        folder: new folder for the results; with `resume` one that holds those of the same campaign.
-        workers: number of processes; None for the number of processors.
-        scheduler: address of a Dask scheduler; None for processes of this machine.
-        run_timeout: [s] time limit of a run; None for no limit.
-        resume: carry out what is missing in the folder.
-        observer: receives the progress.
+        folder: new folder for the results; to resume, one that holds those of the same campaign.
+        how: where the runs are carried out and what receives the progress.
 
     Raises:
         ConfigurationError: a campaign that cannot be carried out, or a folder that cannot be used.
     """
-    watcher = observer or Observer()
     with offering(campaign.entries):
-        check_campaign(campaign, watcher)
-        manifest = describe_campaign(campaign)
-    if resume:
+        sections = check_campaign(campaign, how.observer)
+    manifest = describe_campaign(campaign, sections)
+    if how.resume:
         results.read_manifest(folder)
     names = {"plants": manifest["plants"], "controllers": manifest["controllers"]}
-    with open_workers(workers, scheduler, run_timeout, **names) as place, results.locked(folder, new=not resume):
-        if resume:
-            check_same_campaign(folder, manifest, watcher)
+    with (
+        open_workers(how.workers, how.scheduler, how.run_timeout, **names) as place,
+        results.locked(folder, new=not how.resume),
+    ):
+        if how.resume:
+            check_same_campaign(folder, manifest, how.observer)
         else:
             results.create_folder(folder, manifest)
         if (folder / results.PARTS).is_dir():
             done = results.finished_runs(folder)
-            watcher.begin(len(campaign.cells), len(done))
-            chunks = _missing_chunks(campaign, done, single=campaign.steps or run_timeout is not None)
+            how.observer.begin(len(campaign.cells), len(done))
+            size = 1 if campaign.steps or how.run_timeout is not None else CHUNK
             keep = folder if campaign.steps and place.local else None
+            chunks = _missing_chunks(campaign, sections, done, size)
             for chunk, outcome in carry_out_chunks(chunks, place, steps=campaign.steps, keep=keep):
                 results.write_part(folder, chunk.index, outcome)
-                watcher.finished([result.row for result in outcome])
+                how.observer.finished([result.row for result in outcome])
         results.collect(folder)
 
 
-def check_campaign(campaign: Campaign, observer: Observer) -> None:
+def check_campaign(campaign: Campaign, observer: Observer) -> dict[str, Any]:
     """Refuse what cannot be run, before anything is written; networks that are needed are trained.
 
+    Runs are built and thrown away until every plant was built with every mismatch, noise factor, latency and
+    controller, and every task once.
+
+    Returns:
+        The typed settings of the runs by section.
+
     Raises:
-        ConfigurationError: a name, setting or mismatch that cannot be used, or a run that is asked for twice.
+        ConfigurationError: a name, setting or mismatch that cannot be used, a run that is asked for twice, or a seed
+            that is kept for tuning.
     """
-    by_condition: dict[tuple[float, int | None], list[RunRequest]] = {}
-    seen: set[str] = set()
-    for request in (cell.request for cell in campaign.cells):
-        if request.run_id in seen:
-            raise ConfigurationError(f"the run {request.run_id} is asked for twice")
-        seen.add(request.run_id)
-        by_condition.setdefault((request.noise_factor, request.latency_periods), []).append(request)
-    for (noise, latency), requests in by_condition.items():
-        check_batch(Batch.around(requests), campaign.settings, observer.training, noise, latency)
+    requests = {cell.request.run_id: cell.request for cell in campaign.cells}
+    if len(requests) < len(campaign.cells):
+        counts = Counter(cell.request.run_id for cell in campaign.cells)
+        raise ConfigurationError(f"the run {counts.most_common(1)[0][0]} is asked for twice")
+    refuse_tuning_seeds(request.seed for request in requests.values())
+    names = {name for request in requests.values() for name in (request.plant, request.controller)}
+    campaign.settings.check_sections([*known_sections(), *names])
+    sections = resolve_sections(requests.values(), campaign.settings)
+    built: set[tuple[object, ...]] = set()
+    for request in requests.values():
+        conditions = (request.mismatch, request.noise_factor, request.latency_periods)
+        new = {(request.plant, *conditions), (request.plant, request.controller), (request.task,)} - built
+        if new:
+            build_once(select(request, sections), observer.training)
+            built |= new
+    return sections
 
 
-def describe_campaign(campaign: Campaign) -> dict[str, Any]:
+def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
+    """Build a run and throw it away: this refuses what is configured wrongly, and trains networks.
+
+    Whatever else fails is left to the run, whose row says so.
+
+    Args:
+        run: what to build.
+        progress: receives how much of a training of networks is done.
+
+    Raises:
+        ConfigurationError: a setting, mismatch or seed that cannot be used.
+    """
+    try:
+        build(run, progress=progress).plant.close()
+    except ConfigurationError:
+        raise
+    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
+        return
+
+
+def describe_campaign(campaign: Campaign, sections: Mapping[str, Any]) -> dict[str, Any]:
     """Return the manifest: that of a batch, the number of runs, and a digest by which `resume` recognises them."""
-    manifest = describe_batch([cell.request for cell in campaign.cells], campaign.settings)
+    manifest = describe_batch([cell.request for cell in campaign.cells], sections)
     identity = {
         "runs": [cell.request.run_id for cell in campaign.cells],
         "configuration": manifest["configuration"],
@@ -226,7 +257,7 @@ def carry_out_chunks(
     while waiting or under_way:
         while waiting and under_way < workers.window:
             chunk = waiting.popleft()
-            future = workers.submit(_unpack, pickle.dumps((chunk, steps, keep)))
+            future = workers.submit(_unpack, _pack(chunk, steps, keep))
             future.add_done_callback(lambda done, chunk=chunk: finished.put((chunk, done)))
             under_way += 1
         chunk, future = finished.get()
@@ -241,9 +272,9 @@ def carry_out_chunks(
 def _outcome(chunk: Chunk, future: Any, workers: Workers) -> list[RunResult] | None:  # noqa: ANN401 - of pebble or Dask
     """Return the results of a chunk; None if it died with several runs, which are to be carried out one by one."""
     try:
-        results_of_chunk: list[RunResult] = future.result()
+        answer: list[RunResult] | str = future.result()
     except workers.lost:
-        status, reason = "crashed", LOST
+        status, reason = CRASHED, LOST
     except TimeoutError:
         status, reason = TIMED_OUT, f"the run took longer than {workers.run_timeout:g} s"
     except BrokenProcessPool as error:
@@ -252,40 +283,54 @@ def _outcome(chunk: Chunk, future: Any, workers: Workers) -> list[RunResult] | N
             "`if __name__ == '__main__':`"
         ) from error
     else:
-        return results_of_chunk
+        if not isinstance(answer, str):
+            return answer
+        status, reason = CRASHED, answer
     return [_failed(chunk.cells[0], status, reason)] if len(chunk.cells) == 1 else None
 
 
-def _missing_chunks(campaign: Campaign, done: set[int], *, single: bool) -> list[Chunk]:
-    """Return the runs that are not in `done` in chunks of consecutive runs."""
-    size = 1 if single else CHUNK
+def _missing_chunks(campaign: Campaign, sections: dict[str, Any], done: set[int], size: int) -> Iterator[Chunk]:
+    """Yield the runs that are not in `done` in chunks of at most `size` consecutive runs."""
     chunks: list[list[int]] = []
     for index in (i for i in range(len(campaign.cells)) if i not in done):
         if chunks and chunks[-1][-1] == index - 1 and len(chunks[-1]) < size:
             chunks[-1].append(index)
         else:
             chunks.append([index])
-    return [Chunk(own[0], tuple(campaign.cells[i] for i in own), campaign.settings, campaign.entries) for own in chunks]
+    for own in chunks:
+        cells = tuple(campaign.cells[i] for i in own)
+        yield Chunk(own[0], cells, tuple(select(cell.request, sections) for cell in cells), campaign.entries)
 
 
-def _unpack(task: bytes) -> list[RunResult]:
-    """Carry out a task in a worker; what cannot be read there must not kill it."""
-    return _carry_out(*pickle.loads(task))
+def _pack(chunk: Chunk, steps: bool, keep: Path | None) -> bytes:
+    try:
+        return pickle.dumps((chunk, steps, keep))
+    except Exception as error:
+        what = f"the run {chunk.cells[0].request.run_id} cannot be sent to another process"
+        raise ConfigurationError(f"{what}: {error}; use one worker") from error
+
+
+def _unpack(task: bytes) -> list[RunResult] | str:
+    """Carry out a task in a worker; where it cannot be read, such as without its plug-in, return why."""
+    try:
+        chunk, steps, keep = pickle.loads(task)
+    except Exception as error:  # noqa: BLE001 - of a plug-in
+        return describe_error(error)
+    return _carry_out(chunk, steps, keep)
 
 
 def _carry_out(chunk: Chunk, steps: bool, keep: Path | None) -> list[RunResult]:
     with offering(chunk.entries):
-        return [_carry_out_run(cell, chunk.settings, steps, keep) for cell in chunk.cells]
+        return [_carry_out_run(*pair, steps, keep) for pair in zip(chunk.cells, chunk.runs, strict=True)]
 
 
-def _carry_out_run(cell: Cell, settings: Settings, steps: bool, keep: Path | None) -> RunResult:
+def _carry_out_run(cell: Cell, run: ResolvedRun, steps: bool, keep: Path | None) -> RunResult:
     try:
-        result = run_experiment(cell.request, settings, steps=steps, picture=cell.picture, keep=keep)
+        result = episode.carry_out(run, steps=steps, picture=cell.picture, keep=keep)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a plug-in does, the others go on
-        return _failed(cell, "crashed", f"{type(error).__name__}: {' '.join(str(error).split())}")
+        return _failed(cell, CRASHED, describe_error(error))
     return RunResult({**result.row, **cell.columns}, result.steps, result.picture)
 
 
 def _failed(cell: Cell, status: str, reason: str) -> RunResult:
-    row = {**crashed_row(cell.request, reason), "status": status, **cell.columns}
-    return RunResult(row, None)
+    return RunResult({**failed_row(cell.request, status, reason), **cell.columns}, None)

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import platform
 import subprocess
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.settings import Settings, flatten
-from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.tasks import find_task
+from servobench.harness.config.settings import flatten
+from servobench.harness.run.request import RunRequest
 
 PACKAGES = (
     "servobench",
@@ -32,37 +28,30 @@ PACKAGES = (
 )
 
 
-def describe_batch(requests: list[RunRequest], settings: Settings) -> dict[str, Any]:
+def describe_batch(requests: Sequence[RunRequest], sections: Mapping[str, Any]) -> dict[str, Any]:
     """Return the manifest of a batch.
 
     Args:
         requests: the runs asked for.
-        settings: overrides; the manifest holds the resolved values.
+        sections: their typed settings by section, as `servobench.harness.run.resolved.resolve_sections` returns them.
     """
-    configuration: dict[str, Any] = {"run": asdict(settings.resolve("run", RunSettings()))}
-    for name in _unique(request.plant for request in requests):
-        configuration[name] = flatten(settings.resolve(name, find_plant(name).config()))
-    for name in _unique(request.controller for request in requests):
-        configuration[name] = flatten(settings.resolve(name, default_config(find_controller(name))))
-    for name in _unique(request.task for request in requests):
-        configuration[name] = flatten(settings.resolve(name, find_task(name).default))
+
+    def used(kind: str) -> list[str]:
+        return list(dict.fromkeys(str(getattr(request, kind)) for request in requests))
+
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "plants": _unique(request.plant for request in requests),
-        "controllers": _unique(request.controller for request in requests),
-        "tasks": _unique(request.task for request in requests),
-        "mismatches": _unique(str(request.mismatch) for request in requests),
+        "plants": used("plant"),
+        "controllers": used("controller"),
+        "tasks": used("task"),
+        "mismatches": used("mismatch"),
         "seeds": sorted({request.seed for request in requests}),
-        "configuration": configuration,
+        "configuration": {name: flatten(config) for name, config in sections.items()},
         "packages": {name: _version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
         "git_commit": _git_commit(),
     }
-
-
-def _unique(values: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(values))
 
 
 def _version(name: str) -> str | None:

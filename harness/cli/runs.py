@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,7 +30,7 @@ from servobench.harness.cli.terminal import console, print_tables
 if TYPE_CHECKING:
     import pandas as pd
 
-    from servobench.harness.batch.campaign import Campaign
+    from servobench.harness.batch.campaign import Campaign, Execution
 
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
 ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
@@ -51,7 +52,7 @@ def run(
     with_report: ReportOption = False,
 ) -> None:
     """Carry out one run."""
-    from servobench.harness.batch.campaign import comparison
+    from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.settings import ConfigurationError, read_settings
 
@@ -62,7 +63,8 @@ def run(
         assignments.append("bullet.view=true")
     name = f"{controller}+{estimator}" if estimator else controller
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
-    _carry_out(comparison(batch, read_settings(config, assignments)), out, with_report=with_report, workers=1)
+    campaign = comparison(batch, read_settings(config, assignments))
+    _carry_out(campaign, out, Execution(workers=1), with_report=with_report)
 
 
 def compare(
@@ -81,7 +83,7 @@ def compare(
     with_report: ReportOption = True,
 ) -> None:
     """Run every combination and compare the controllers."""
-    from servobench.harness.batch.campaign import comparison
+    from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.settings import ConfigurationError, read_settings
 
@@ -94,10 +96,8 @@ def compare(
     )
     if resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
-    _carry_out(
-        comparison(batch, read_settings(config, set_ or [])), out, with_report=with_report, workers=workers,
-        scheduler=scheduler, run_timeout=run_timeout, resume=resume,
-    )  # fmt: skip
+    campaign = comparison(batch, read_settings(config, set_ or []))
+    _carry_out(campaign, out, Execution(workers, scheduler, run_timeout, resume), with_report=with_report)
 
 
 def train(
@@ -137,16 +137,7 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
     console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
 
 
-def _carry_out(
-    campaign: Campaign,
-    out: Path | None,
-    *,
-    with_report: bool,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    run_timeout: float | None = None,
-    resume: bool = False,
-) -> None:
+def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> None:
     """Check everything, run everything, and leave tables, figures and a report behind."""
     from servobench.harness.analysis.tables import SUMMARY_LEGEND, summary_tables
     from servobench.harness.batch import results
@@ -160,10 +151,7 @@ def _carry_out(
     interrupted = False
     with contextlib.closing(ConsoleObserver(console)) as observer:
         try:
-            carry_out(
-                campaign, folder, workers=workers, scheduler=scheduler, run_timeout=run_timeout, resume=resume,
-                observer=observer,
-            )  # fmt: skip
+            carry_out(campaign, folder, replace(how, observer=observer))
         except KeyboardInterrupt:
             if not folder.exists():
                 raise

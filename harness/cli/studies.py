@@ -49,6 +49,7 @@ def robustness(
     config: ConfigOption = None,
 ) -> None:
     """Draw the robustness map: success and settling time along seven axes, each varied by itself."""
+    from servobench.harness.batch.campaign import Execution
     from servobench.harness.batch.compare import parse_seeds
     from servobench.harness.cli.progress import watching
     from servobench.harness.config.settings import read_settings
@@ -58,10 +59,8 @@ def robustness(
     names = split_controllers(controllers)
     where = split_plants(plant, "plant")[0]
     with watching(console, out) as observer:
-        files = make_map(
-            out, where, names, parse_seeds(seeds), settings, workers=workers, scheduler=scheduler,
-            run_timeout=run_timeout, resume=resume, observer=observer,
-        )  # fmt: skip
+        how = Execution(workers, scheduler, run_timeout, resume, observer)
+        files = make_map(out, where, names, parse_seeds(seeds), settings, how)
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 
@@ -76,6 +75,7 @@ def claims(
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
+    from servobench.harness.batch.campaign import Execution
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
     from servobench.harness.studies.claims.table import ANSWERS, differences, read_answers
@@ -83,10 +83,7 @@ def claims(
     names = split_plants(plants)
     wanted = None if check is None else read_answers(check)
     with watching(console, out) as observer:
-        answers = reproduce(
-            out, names, seeds, workers=workers, scheduler=scheduler, run_timeout=run_timeout, resume=resume,
-            observer=observer,
-        )  # fmt: skip
+        answers = reproduce(out, names, seeds, Execution(workers, scheduler, run_timeout, resume, observer))
     for answer in answers:
         console.print(
             f"[bold]{answer.title} on {answer.plant}: {answer.verdict}[/bold]", soft_wrap=True, highlight=False
@@ -117,15 +114,21 @@ def tune(
     """Search for the best settings of each method, with the same budget on the same training plants."""
     from servobench.harness.batch.results import locked
     from servobench.harness.batch.workers import open_workers
+    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.studies.tuning.objective import TuningSet
+    from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
     from servobench.harness.studies.tuning.study import TuningPlan, check_study_folder, open_studies, write_outcomes
 
-    plan = TuningPlan(_split_tunable(controllers), trials, TuningSet(split_words(plants), seeds, offset), study_seed)
+    names = split_names("controllers", controllers, tuple(SPACES), find_tunable)
+    try:
+        plan = TuningPlan(names, trials, TuningSet(split_words(plants), seeds, offset), study_seed)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
     check_study_folder(out)
-    names = {"plants": plan.runs.plants, "controllers": plan.controllers}
-    with open_workers(workers, scheduler, run_timeout, **names) as place, locked(out):
+    place = open_workers(workers, scheduler, run_timeout, plants=plan.runs.plants, controllers=names)
+    with place as opened, locked(out):
         studies = open_studies(out, plan)
-        interrupted = not _advance(studies, plan, place)
+        interrupted = not _advance(studies, plan, opened)
     console.print(_tuned_table(write_outcomes(out, studies)))
     console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
     if interrupted:
@@ -149,9 +152,8 @@ def _advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers)
             for study in studies
         }
         try:
-            for finished in advance(studies, plan, workers):
-                best = "–" if finished.best is None else f"{finished.best:.4f}"
-                progress.update(bars[finished.controller], advance=1, best=best)
+            for controller, best in advance(studies, plan, workers):
+                progress.update(bars[controller], advance=1, best="–" if best is None else f"{best:.4f}")
         except KeyboardInterrupt:
             return False
     return True
@@ -166,9 +168,3 @@ def _tuned_table(outcomes: Mapping[str, TunedValues]) -> Table:
             name, str(tuned.trials), f"{tuned.score_of_defaults:.4f}", f"{tuned.score:.4f}", str(tuned.best_trial)
         )
     return table
-
-
-def _split_tunable(text: str) -> tuple[str, ...]:
-    from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
-
-    return split_names("controllers", text, tuple(SPACES), find_tunable)

@@ -52,7 +52,7 @@ def sweep(
     """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
     from servobench.harness.analysis.tables import SWEEP_LEGEND, sweep_tables
     from servobench.harness.batch import results
-    from servobench.harness.batch.campaign import Campaign, carry_out
+    from servobench.harness.batch.campaign import Campaign, Execution, carry_out
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.batch.sweep import SweepPlan, parse_variation
     from servobench.harness.cli.progress import watching
@@ -72,10 +72,7 @@ def sweep(
     )
     campaign = Campaign(plan.cells(), read_settings(config, set_ or []))
     with watching(console, out) as observer:
-        carry_out(
-            campaign, out, workers=workers, scheduler=scheduler, run_timeout=run_timeout, resume=resume,
-            observer=observer,
-        )  # fmt: skip
+        carry_out(campaign, out, Execution(workers, scheduler, run_timeout, resume, observer))
     print_tables(sweep_tables(results.load_runs(out)), SWEEP_LEGEND)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 

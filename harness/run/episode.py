@@ -22,6 +22,10 @@ from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
 
 COMPLETED = "completed"
+NUMERICAL_ERROR = "numerical_error"
+CRASHED = "crashed"
+TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the time limit
+STATUSES = (COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT)  # besides those of the kinds of `RunFault`
 
 
 @dataclass(frozen=True)
@@ -71,9 +75,9 @@ def carry_out(
     except RunFault as fault:
         status, reason = fault.status, _one_line(fault)
     except FloatingPointError as error:
-        status, reason = "numerical_error", _one_line(error)
+        status, reason = NUMERICAL_ERROR, _one_line(error)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
-        status, reason = "crashed", f"{type(error).__name__}: {_one_line(error)}"
+        status, reason = CRASHED, describe_error(error)
     finally:
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
@@ -95,9 +99,14 @@ def carry_out(
     return RunResult(row, table, image)
 
 
-def crashed_row(request: RunRequest, reason: str) -> dict[str, Any]:
+def failed_row(request: RunRequest, status: str, reason: str) -> dict[str, Any]:
     """Return the row of a run of which nothing is left but why it failed."""
-    return {**request.as_row(), "status": "crashed", "periods": 0, "reason": reason, "mismatch_values": "{}"}
+    return {**request.as_row(), "status": status, "periods": 0, "reason": reason, "mismatch_values": "{}"}
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the kind and the message of an error as one line."""
+    return f"{type(error).__name__}: {_one_line(error)}"
 
 
 def _one_line(error: BaseException) -> str:

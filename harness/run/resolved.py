@@ -1,7 +1,8 @@
-"""A request with all its settings as typed values: names looked up and texts read once a run."""
+"""A request with all its settings as typed values: names looked up and texts read once a batch."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,15 +16,7 @@ from servobench.plant.bench import vary_sensing
 
 @dataclass(frozen=True)
 class ResolvedRun:
-    """All that a run depends on; it can be pickled.
-
-    Attributes:
-        request: what to run.
-        run: the settings that are common to all runs.
-        plant: settings of the plant, noise and latency of the request included.
-        controller: settings of the controller.
-        task: settings of the task.
-    """
+    """All that a run depends on; it can be pickled. The plant's settings include noise and latency of the request."""
 
     request: RunRequest
     run: RunSettings
@@ -38,19 +31,38 @@ def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
     Raises:
         ConfigurationError: an unknown name, or a setting that cannot be used.
     """
-    plant = settings.resolve(request.plant, find_plant(request.plant).config())
+    return select(request, resolve_sections([request], settings))
+
+
+def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict[str, Any]:
+    """Return the typed settings of every section that `requests` read, by name.
+
+    Raises:
+        ConfigurationError: an unknown name, or a setting that cannot be used.
+    """
+    defaults = {"run": RunSettings()}
+    requests = list(requests)
+    defaults |= {name: find_plant(name).config() for name in dict.fromkeys(each.plant for each in requests)}
+    defaults |= {
+        name: default_config(find_controller(name)) for name in dict.fromkeys(each.controller for each in requests)
+    }
+    defaults |= {name: find_task(name).default for name in dict.fromkeys(each.task for each in requests)}
+    return {name: settings.resolve(name, default) for name, default in defaults.items()}
+
+
+def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:
+    """Return `request` with its settings out of those that `resolve_sections` returned.
+
+    Raises:
+        ConfigurationError: a noise factor or latency for a plant that has no such setting.
+    """
+    plant = sections[request.plant]
     if request.noise_factor != 1.0 or request.latency_periods is not None:
         try:
             plant = vary_sensing(plant, request.noise_factor, request.latency_periods)
         except ValueError as error:
             raise ConfigurationError(f"plant {request.plant}: {error}") from error
-    return ResolvedRun(
-        request=request,
-        run=settings.resolve("run", RunSettings()),
-        plant=plant,
-        controller=settings.resolve(request.controller, default_config(find_controller(request.controller))),
-        task=settings.resolve(request.task, find_task(request.task).default),
-    )
+    return ResolvedRun(request, sections["run"], plant, sections[request.controller], sections[request.task])
 
 
 def known_sections() -> list[str]:

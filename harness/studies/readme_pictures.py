@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import carry_out, comparison
+from servobench.harness.batch.campaign import Execution, carry_out, comparison
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.draw import folder_figures, picture_of
@@ -39,12 +39,12 @@ def draw_pictures(folder: Path) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="servobench-") as scratch:
         batch = Path(scratch) / "batch"
-        carry_out(comparison(BATCH, Settings()), batch, workers=1)
+        carry_out(comparison(BATCH, Settings()), batch, Execution(workers=1))
         yield _write(folder / "bench.png", _bench(batch))
         for named in folder_figures(batch):
             if named.kind in FILES:
                 yield _write(folder / f"{FILES[named.kind]}.png", picture_of(named.figure)[0])
-        for path in make_map(Path(scratch) / "map", "fmu", MAP_CONTROLLERS, MAP_SEEDS, Settings()):
+        for path in make_map(Path(scratch) / "map", "fmu", MAP_CONTROLLERS, MAP_SEEDS, Settings(), Execution()):
             if path.suffix == ".png":
                 with Image.open(path) as picture:
                     yield _write(folder / path.name, _small(picture.convert("RGB")))

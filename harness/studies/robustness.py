@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from servobench.harness.analysis.comparison import settled_share, settling_times
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Cell, Observer, carry_out
+from servobench.harness.batch.campaign import Campaign, Cell, Execution, carry_out
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.sweep import place_columns, vary
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -77,12 +77,7 @@ def make_map(
     controllers: Sequence[str],
     seeds: Sequence[int],
     settings: Settings,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    run_timeout: float | None = None,
-    resume: bool = False,
-    observer: Observer | None = None,
+    how: Execution,
 ) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
@@ -92,11 +87,7 @@ def make_map(
         controllers: names of the methods.
         seeds: one robot each.
         settings: overrides of the defaults.
-        workers: as these, see `servobench.harness.batch.campaign.carry_out`.
-        scheduler: the same.
-        run_timeout: the same.
-        resume: the same.
-        observer: the same.
+        how: how the runs are carried out.
 
     Returns:
         The files of the pictures.
@@ -105,10 +96,7 @@ def make_map(
     parts = (STATIC_CAMERA, static, settings), (MOVED_CAMERA, moved, moved_settings(settings))
     for name, cells, chosen in parts:
         folder = out / name
-        carry_out(
-            Campaign(cells, chosen), folder, workers=workers, scheduler=scheduler, run_timeout=run_timeout,
-            resume=resume and folder.exists(), observer=observer,
-        )  # fmt: skip
+        carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
     results.write_summary(out, map_tables(out), results.read_manifest(out / STATIC_CAMERA))
     return draw_map(results.load_runs(out), out / FIGURES)
 

@@ -14,7 +14,7 @@ from optuna.trial import TrialState
 from servobench import controllers
 from servobench.harness.batch.compare import TUNING
 from servobench.harness.batch.workers import Workers, open_workers
-from servobench.harness.config.defaults import apply_settings
+from servobench.harness.config.defaults import apply_settings, default_config
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
 from servobench.harness.run.request import RunSettings
@@ -25,7 +25,6 @@ from servobench.harness.studies.tuning.spaces import (
     SPACES,
     default_values,
     find_tunable,
-    full_settings,
     nested_settings,
 )
 from servobench.harness.studies.tuning.study import TuningPlan, advance, open_studies, write_outcomes
@@ -57,7 +56,7 @@ def made_up(monkeypatch):
     """Runs that cost nothing: the cost is a smooth function of the settings and the run."""
 
     def cost(trial, run):
-        numbers = [value for value in flatten_nested(trial.settings) if isinstance(value, float)]
+        numbers = [value for value in flatten(trial.config).values() if isinstance(value, float)]
         return float(np.tanh(np.sum(np.square(np.array(numbers[:2]) - 0.1))) + 1e-3 * (run.seed % 7))
 
     def costs(trials, runs, _workers):
@@ -66,11 +65,6 @@ def made_up(monkeypatch):
                 yield t, r, cost(trial, run)
 
     monkeypatch.setattr(study, "evaluate", costs)
-
-
-def flatten_nested(values):
-    for value in values.values():
-        yield from flatten_nested(value) if isinstance(value, dict) else [value]
 
 
 def test_every_controller_of_this_package_but_one_bound_has_a_space():
@@ -108,11 +102,10 @@ def test_predictive_reach_is_split_into_delay_and_horizon():
     assert isinstance(SPACES["ukf_mpc"]["law.reach"], IntDistribution)
 
 
-def test_a_trial_says_every_setting_so_that_tuned_files_have_no_say_in_it():
-    entry = find_tunable("rbf_pid")
-    settings = full_settings(entry, {"law": {"integral_gain": 0.5}})
-    assert settings["law"]["integral_gain"] == 0.5
-    assert len(list(flatten_nested(settings))) == len(flatten(entry.config()))
+def test_tuned_files_do_not_matter_to_a_trial():
+    trial = Trial("rbf_pid", apply_settings(find_tunable("rbf_pid"), {"law": {"integral_gain": 0.5}}))
+    assert trial.resolved(SMALL.runs()[0]).controller == trial.config
+    assert default_config(find_tunable("rbf_pid")) != find_tunable("rbf_pid").config()
 
 
 def test_the_set_has_both_delays_equally_often_and_every_run_a_robot_of_its_own():
@@ -156,7 +149,7 @@ def test_the_score_is_the_sum_of_the_means_of_both_tasks():
 def test_a_better_tuned_controller_has_the_better_score():
     """Resolved-rate control by the true Jacobian: with feedforward it follows the circle, without it lags behind."""
     entry = find_tunable("calibrated")
-    trials = [Trial("calibrated", full_settings(entry, {"law": {"feedforward": switch}})) for switch in (True, False)]
+    trials = [Trial("calibrated", apply_settings(entry, {"law": {"feedforward": switch}})) for switch in (True, False)]
     runs = [run for run in SMALL.runs() if run.task == CURVE]
     costs = np.zeros((2, len(runs)))
     for trial, run, cost in evaluate(trials, runs, Workers()):
@@ -166,8 +159,8 @@ def test_a_better_tuned_controller_has_the_better_score():
 
 def test_the_delay_of_the_set_reaches_the_plant():
     entry = find_tunable("calibrated")
-    trial = Trial("calibrated", full_settings(entry, {"law": {"proportional_gain": 6.0}}))
-    prompt, late = (objective.TuningRun("kinematic", MOVE, TUNING.start, latency) for latency in (0, 1))
+    trial = Trial("calibrated", apply_settings(entry, {"law": {"proportional_gain": 6.0}}))
+    prompt, late = (replace(SMALL.runs()[0], latency_periods=periods) for periods in (0, 1))
     costs = {run: cost for _, run, cost in evaluate([trial], [prompt, late], Workers())}
     assert costs[0] < costs[1]
 
@@ -233,7 +226,7 @@ def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_ho
 
 def checked_score(tuned, settings):
     runs = [tuned.tuning_set().runs()[index] for index in tuned.tuning_set().checked()]
-    trial = Trial(tuned.controller, full_settings(find_tunable(tuned.controller), settings))
+    trial = Trial(tuned.controller, apply_settings(find_tunable(tuned.controller), settings))
     costs = {run: cost for _, run, cost in evaluate([trial], runs, Workers())}
     return score(runs, [costs[run] for run in range(len(runs))])
 

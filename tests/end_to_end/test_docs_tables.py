@@ -17,7 +17,7 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
-from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.episode import STATUSES, run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.faults import RunFault
@@ -121,12 +121,7 @@ def test_every_status_is_told_and_can_occur():
         own = {kind.status} if kind.__module__.split(".")[0] == PACKAGE else set()
         return own.union(*(faults(child) for child in kind.__subclasses__()))
 
-    assert {names(row[0])[0] for row in rows} == faults(RunFault) | {
-        "completed",
-        "numerical_error",
-        "crashed",
-        "timed_out",
-    }
+    assert {names(row[0])[0] for row in rows} == faults(RunFault) | set(STATUSES)
 
 
 def test_the_profiles_have_the_magnitudes_of_the_code():

@@ -13,6 +13,7 @@ from servobench.harness.config.defaults import default_config, tuned_file
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve_sections
 
 
 @pytest.fixture
@@ -50,7 +51,8 @@ def test_a_tuned_value_replaces_the_default_of_the_class_and_leaves_the_rest(tun
 def test_what_the_user_sets_wins_and_the_manifest_tells_the_tuned_rest(tuned):
     tuned("[settings.law]\nstep_factor = 0.3\nstep_weight = 0.05\n")
     settings = Settings({"ukf_mfac": {"law": {"step_factor": 0.4}}})
-    manifest = describe_batch([RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)], settings)
+    requests = [RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)]
+    manifest = describe_batch(requests, resolve_sections(requests, settings))
     assert manifest["configuration"]["ukf_mfac"]["law.step_factor"] == 0.4
     assert manifest["configuration"]["ukf_mfac"]["law.step_weight"] == 0.05
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Observer, carry_out
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.claims.answers import answer_all
@@ -20,28 +20,14 @@ MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach signific
 FIGURES: Final = "figures"
 
 
-def reproduce(
-    out: Path,
-    plants: Sequence[str],
-    robots: int,
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    run_timeout: float | None = None,
-    resume: bool = False,
-    observer: Observer | None = None,
-) -> list[Answer]:
+def reproduce(out: Path, plants: Sequence[str], robots: int, how: Execution) -> list[Answer]:
     """Carry out the runs and answer the claims.
 
     Args:
         out: folder for runs, tables and figures.
         plants: names.
         robots: number of robots for each move; two fifths of them for the circle.
-        workers: as these, see `servobench.harness.batch.campaign.carry_out`.
-        scheduler: the same.
-        run_timeout: the same.
-        resume: the same.
-        observer: the same.
+        how: how the runs are carried out.
 
     Returns:
         The answers of all plants, by claim.
@@ -56,10 +42,7 @@ def reproduce(
     tables = {}
     for study in studies(plants, robots):
         folder = out / study.name
-        carry_out(
-            Campaign(study.cells, study.settings), folder, workers=workers, scheduler=scheduler,
-            run_timeout=run_timeout, resume=resume and folder.exists(), observer=observer,
-        )  # fmt: skip
+        carry_out(Campaign(study.cells, study.settings), folder, how.of_part(folder))
         tables[study.name] = results.load_runs(folder)
     answers = sorted(
         (answer for plant in plants for answer in answer_all(tables, plant)),

@@ -19,43 +19,24 @@ HEADING = "# Tuned values, made by `servobench tune`: the table [settings] repla
 
 @dataclass(frozen=True)
 class TunedValues:
-    """The outcome of a study, all of it in the file.
-
-    Attributes:
-        controller: name.
-        study_seed: seed of the sampler.
-        trials: number of trials of which these values are the best.
-        best_trial: its number; 0 is that of the defaults.
-        runs_a_trial: number of runs in a trial.
-        plants: on which the runs took place.
-        moves: number of moves on each plant (`--seeds`).
-        offset: of the seeds in the tuning range (`--offset`).
-        seeds: first and last seed, for the reader.
-        date: day on which the last trial ended, UTC.
-        version: of servobench.
-        score: of these values.
-        score_of_defaults: of the defaults of the controller's class.
-        checked_score: of these values on the subset `TuningSet.checked`.
-        checked_score_of_defaults: of the defaults on that subset.
-        settings: nested values.
-    """
+    """The outcome of a study, all of it in the file."""
 
     controller: str
-    study_seed: int
-    trials: int
-    best_trial: int
+    study_seed: int  # seed of the sampler
+    trials: int  # number of trials of which these values are the best
+    best_trial: int  # its number; 0 is that of the defaults
     runs_a_trial: int
-    plants: tuple[str, ...]
-    moves: int
-    offset: int
-    seeds: tuple[int, ...]
-    date: str
-    version: str
-    score: float
-    score_of_defaults: float
-    checked_score: float
+    plants: tuple[str, ...]  # on which the runs took place
+    moves: int  # on each plant (`--seeds`)
+    offset: int  # of the seeds in the tuning range (`--offset`)
+    seeds: tuple[int, ...]  # first and last seed, for the reader
+    date: str  # day on which the last trial ended, UTC
+    version: str  # of servobench
+    score: float  # of these values
+    score_of_defaults: float  # of the defaults of the controller's class
+    checked_score: float  # of these values on the subset `TuningSet.checked`
     checked_score_of_defaults: float
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any]  # nested values
 
     def tuning_set(self) -> TuningSet:
         """Return the runs on which the values were found."""

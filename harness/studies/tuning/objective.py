@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import cycle
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -24,11 +25,13 @@ from servobench.harness.batch.campaign import Cell, Chunk, carry_out_chunks
 from servobench.harness.batch.compare import tuning_seeds
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import COMPLETED
 from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import find_task
 from servobench.plant.bench import can_vary_sensing
+from servobench.plant.settings import Periods, settings
 
 MOVE: Final = "random"
 CURVE: Final = "circle"
@@ -39,81 +42,56 @@ FAULT_PENALTY: Final = 1.0  # added to the cost 1 of a run that did not complete
 CHECKED: Final = len(LATENCIES)  # runs of each task in the subset that a test scores again
 
 
-@dataclass(frozen=True)
-class TuningRun:
-    """One run of the set.
-
-    Attributes:
-        plant: name of the plant.
-        task: `random` or `circle`.
-        seed: of the tuning range.
-        latency_periods: of the camera.
-    """
-
-    plant: str
-    task: str
-    seed: int
-    latency_periods: int
-
-
-@dataclass(frozen=True)
+@settings
 class TuningSet:
-    """The runs on which every trial of every method is scored.
-
-    Attributes:
-        plants: names of plants whose latency can be set.
-        seeds: moves on each plant; even, so that both delays come equally often.
-        offset: where in the tuning range the seeds begin.
-    """
+    """The runs on which every trial of every method is scored."""
 
     plants: tuple[str, ...] = ("kinematic",)
+    """names of plants whose latency can be set"""
     seeds: int = 8
-    offset: int = 0
+    """moves on each plant: 4, 8, 12, …, so that each delay has its share of moves and circles"""
+    offset: Periods = 0
+    """where in the tuning range the seeds begin"""
 
     def __post_init__(self) -> None:
-        """Check plants and numbers.
-
-        Raises:
-            ConfigurationError: an odd number of moves, seeds outside the tuning range, or a plant without latency.
-        """
+        """Refuse an odd share of delays, seeds outside the tuning range, and a plant without latency."""
         if self.seeds < 4 or self.seeds % 4:
-            raise ConfigurationError(
+            raise ValueError(
                 f"seeds must be 4, 8, 12, …, so that each delay has its share of moves and circles; got {self.seeds}"
             )
         tuning_seeds(self.seeds + self.seeds // 2, self.offset)
         if not self.plants:
-            raise ConfigurationError("no plant to tune on; name one with --plants kinematic")
+            raise ValueError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
             entry = find_plant(name)
             if entry.own_robot or not can_vary_sensing(entry.config()):
-                raise ConfigurationError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
+                raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
-    def runs(self) -> list[TuningRun]:
-        """Return all runs: for each plant the moves, then the circles on further seeds."""
+    def runs(self) -> list[RunRequest]:
+        """Return all runs, still without a controller: for each plant the moves, then the circles on further seeds."""
         seeds = tuning_seeds(self.seeds + self.seeds // 2, self.offset)
         tasks = [MOVE] * self.seeds + [CURVE] * (self.seeds // 2)
         return [
-            TuningRun(plant, task, seed, LATENCIES[index % len(LATENCIES)])
+            RunRequest(plant, "", task, read_mismatch(MISMATCH), seed, latency_periods=latency)
             for plant in self.plants
-            for index, (task, seed) in enumerate(zip(tasks, seeds, strict=True))
+            for task, seed, latency in zip(tasks, seeds, cycle(LATENCIES), strict=False)
         ]
 
     def checked(self) -> list[int]:
         """Return the indices of a subset with both tasks and both delays, small enough for a test."""
-        runs = self.runs()
-        return [
-            index
-            for task in (MOVE, CURVE)
-            for index in [i for i, run in enumerate(runs) if run.task == task and run.plant == self.plants[0]][:CHECKED]
-        ]
+        return [first + i for first in (0, self.seeds) for i in range(CHECKED)]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A controller with settings that are to be scored: all fields of its class, nested."""
+    """A controller with the settings of its class that are to be scored."""
 
     controller: str
-    settings: Mapping[str, Any]
+    config: Any
+
+    def resolved(self, run: RunRequest) -> ResolvedRun:
+        """Return a run of this trial; tuned values that are in use already do not matter."""
+        return replace(resolve(replace(run, controller=self.controller), Settings()), controller=self.config)
 
 
 Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
@@ -129,15 +107,13 @@ def run_cost(task: str, row: Mapping[str, Any]) -> float:
     return 1.0 if math.isnan(settling_time) else settling_time / float(find_task(MOVE).default.duration)
 
 
-def score(runs: Sequence[TuningRun], costs: Sequence[float]) -> float:
+def score(runs: Sequence[RunRequest], costs: Sequence[float]) -> float:
     """Return the score of a trial from the costs of its runs."""
-    by_task = {
-        task: [cost for run, cost in zip(runs, costs, strict=True) if run.task == task] for task in (MOVE, CURVE)
-    }
-    return float(sum(np.mean(values) for values in by_task.values()))
+    pairs = list(zip(runs, costs, strict=True))
+    return float(sum(np.mean([cost for run, cost in pairs if run.task == task]) for task in (MOVE, CURVE)))
 
 
-def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: Workers) -> Iterator[Cost]:
+def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[Cost]:
     """Carry out every run of every trial and yield each cost as it is known, in any order.
 
     Args:
@@ -149,16 +125,8 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: Worker
         ConfigurationError: the worker processes cannot be started.
     """
     pairs = [(t, r) for r in range(len(runs)) for t in range(len(trials))]
-    chunks = [
-        Chunk(index, (Cell(_request(trials[t], runs[r])),), Settings({trials[t].controller: trials[t].settings}))
-        for index, (t, r) in enumerate(pairs)
-    ]
+    resolved = [trials[t].resolved(runs[r]) for t, r in pairs]
+    chunks = [Chunk(index, (Cell(run.request),), (run,)) for index, run in enumerate(resolved)]
     for chunk, (result,) in carry_out_chunks(chunks, workers):
         t, r = pairs[chunk.index]
         yield t, r, run_cost(runs[r].task, result.row)
-
-
-def _request(trial: Trial, run: TuningRun) -> RunRequest:
-    return RunRequest(
-        run.plant, trial.controller, run.task, read_mismatch(MISMATCH), run.seed, latency_periods=run.latency_periods
-    )

@@ -15,13 +15,11 @@ answer one period earlier.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any, Final, TypeAlias
 
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
 from servobench.plant.settings import suggest
@@ -143,12 +141,3 @@ def nested_settings(values: Mapping[str, Any]) -> dict[str, Any]:
         else:
             target[last] = float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
     return nested
-
-
-def full_settings(entry: ControllerEntry, tuned: Mapping[str, Any]) -> dict[str, Any]:
-    """Return every field of the controller's class, nested, with `tuned` on top; what is tuned elsewhere has no say.
-
-    Raises:
-        ConfigurationError: a key or value that the configuration refuses.
-    """
-    return asdict(apply_settings(entry, tuned))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC
 from importlib.metadata import version
 from pathlib import Path
@@ -26,69 +26,41 @@ from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from servobench.harness.batch.compare import build_once
+from servobench.harness.batch.campaign import build_once
 from servobench.harness.batch.results import LOCK
 from servobench.harness.batch.workers import Workers
-from servobench.harness.config.settings import ConfigurationError, Settings, flatten
-from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
+from servobench.harness.config.defaults import apply_settings
+from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.files import TunedValues, write_tuned
 from servobench.harness.studies.tuning.objective import Trial, TuningSet, evaluate, score
-from servobench.harness.studies.tuning.spaces import (
-    SPACES,
-    default_values,
-    find_tunable,
-    full_settings,
-    nested_settings,
-)
+from servobench.harness.studies.tuning.spaces import SPACES, default_values, find_tunable, nested_settings
 from servobench.plant.seeds import named_seed
+from servobench.plant.settings import Count, Periods, settings
 
 JOURNAL: Final = ".journal"
 FINGERPRINT: Final = "fingerprint"
 COSTS: Final = "costs"
 
 
-@dataclass(frozen=True)
+@settings
 class TuningPlan:
-    """What is asked for.
-
-    Attributes:
-        controllers: names with a search space.
-        trials: for each of them, the defaults' included.
-        runs: on which a trial is scored.
-        study_seed: seed of the samplers.
-    """
+    """What is asked for."""
 
     controllers: tuple[str, ...]
-    trials: int
+    """names with a search space"""
+    trials: Count
+    """for each of them, that of the defaults included"""
     runs: TuningSet
-    study_seed: int = 0
+    """on which a trial is scored"""
+    study_seed: Periods = 0
+    """seed of the samplers"""
 
     def __post_init__(self) -> None:
-        """Check names and numbers.
-
-        Raises:
-            ConfigurationError: an unknown controller or one without a space, no trial, or a negative seed.
-        """
+        """Refuse an unknown controller and one without a search space."""
         for name in self.controllers:
             find_tunable(name)
-        if self.trials < 1:
-            raise ConfigurationError(f"trials must be at least 1, got {self.trials}")
-        if self.study_seed < 0:
-            raise ConfigurationError(f"the study's seed must not be negative, got {self.study_seed}")
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A run that is finished.
-
-    Attributes:
-        controller: whose run it was.
-        best: least score of its finished trials; None while there is none.
-    """
-
-    controller: str
-    best: float | None
 
 
 class MethodStudy:
@@ -137,7 +109,7 @@ class MethodStudy:
         )
         with np.errstate(all="ignore"):  # the sampler's densities may underflow
             self._asked = self._study.ask(dict(SPACES[self.controller]))
-        return Trial(self.controller, full_settings(self._entry, nested_settings(self._asked.params)))
+        return Trial(self.controller, apply_settings(self._entry, nested_settings(self._asked.params)))
 
     def tell(self, costs: Sequence[float]) -> None:
         """Finish the trial that was asked for with the costs of its runs."""
@@ -227,12 +199,9 @@ def check_study_folder(folder: Path) -> None:
     Raises:
         ConfigurationError: names the folder.
     """
-    if folder.exists() and not (folder.is_dir() and (any(folder.glob(f"*{JOURNAL}")) or not _contents(folder))):
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name] * folder.exists()
+    if set(names) - {LOCK} and not any(name.endswith(JOURNAL) for name in names):
         raise ConfigurationError(f"{folder} exists already and holds no study; name another folder with --out")
-
-
-def _contents(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.name != LOCK]
 
 
 def open_studies(folder: Path, plan: TuningPlan) -> list[MethodStudy]:
@@ -251,19 +220,23 @@ def open_studies(folder: Path, plan: TuningPlan) -> list[MethodStudy]:
     return [opened[name] for name in plan.controllers]
 
 
-def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> Iterator[Finished]:
-    """Carry out the trials that are left, a round at a time, and yield after every run."""
+def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> Iterator[tuple[str, float | None]]:
+    """Carry out the trials that are left, a round at a time.
+
+    Yields:
+        After every run: its controller, and the least score of that one's trials; None while none is finished.
+    """
     runs = plan.runs.runs()
     while active := [study for study in studies if len(study.finished()) < plan.trials]:
         with undisturbed():
             trials = [study.ask() for study in active]
         for trial in trials:
-            _train(trial, plan.runs.plants[0])
+            build_once(trial.resolved(runs[0]))  # networks are trained before workers need them
         costs = np.zeros((len(trials), len(runs)))
         best = [study.best() for study in active]
         for trial_index, run_index, cost in evaluate(trials, runs, workers):
             costs[trial_index, run_index] = cost
-            yield Finished(active[trial_index].controller, best[trial_index])
+            yield active[trial_index].controller, best[trial_index]
         with undisturbed():
             for study, row in zip(active, costs, strict=True):
                 study.tell(row.tolist())
@@ -288,9 +261,3 @@ def write_outcomes(folder: Path, studies: Sequence[MethodStudy]) -> Mapping[str,
     for name, tuned in outcomes.items():
         write_tuned(folder / f"{name}.toml", tuned)
     return outcomes
-
-
-def _train(trial: Trial, plant: str) -> None:
-    """Train the networks of a controller, if it has any, before workers need them."""
-    request = RunRequest(plant, trial.controller, objective.MOVE, read_mismatch(objective.MISMATCH), 0)
-    build_once(request, Settings({trial.controller: trial.settings}))
