@@ -6,8 +6,9 @@ import inspect
 import pickle
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -141,16 +142,10 @@ class NoSettings:
     """The settings of a controller that is given as a class: none."""
 
 
-@dataclass(frozen=True)
-class _Constructor:
-    """Builds a controller that is given as a class."""
-
-    kind: type[Controller]
-
-    def __call__(self, _settings: NoSettings, knowledge: RobotKnowledge) -> Controller:
-        construct: Any = self.kind
-        made: Controller = construct(knowledge)
-        return made
+def _construct(
+    kind: Callable[[RobotKnowledge], Controller], _settings: NoSettings, robot: RobotKnowledge
+) -> Controller:
+    return kind(robot)
 
 
 def _named(controllers: Sequence[AnyController]) -> tuple[tuple[str, ...], tuple[ControllerEntry, ...]]:
@@ -165,7 +160,7 @@ def _named(controllers: Sequence[AnyController]) -> tuple[tuple[str, ...], tuple
             entry = given
         elif isinstance(given, type) and issubclass(given, Controller):
             summary = (inspect.getdoc(given) or given.__name__).splitlines()[0]
-            entry = ControllerEntry(given.__name__, summary, NoSettings, _Constructor(given))
+            entry = ControllerEntry(given.__name__, summary, NoSettings, partial(_construct, given))
         else:
             raise ConfigurationError(f"controller must be a name, a subclass of Controller or an entry, got {given!r}")
         if entry.name in controller_names():

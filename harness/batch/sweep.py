@@ -18,20 +18,12 @@ Variation: TypeAlias = tuple[str, tuple[Magnitude, ...]]
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All combinations of these.
+    """All combinations of these; each variation is put on top of every mismatch by itself, not with the others."""
 
-    Attributes:
-        batch: plants, controllers, tasks, mismatches and seeds.
-        variations: axes with their magnitudes; each is put on top of every mismatch by itself, not combined with the
-            others.
-        noise_factors: on the plants' sensor noise.
-        latencies: [periods]; None for what a plant is configured with.
-    """
-
-    batch: Batch
-    variations: tuple[Variation, ...] = ()
-    noise_factors: tuple[float, ...] = (1.0,)
-    latencies: tuple[int | None, ...] = (None,)
+    batch: Batch  # plants, controllers, tasks, mismatches and seeds
+    variations: tuple[Variation, ...] = ()  # axes with their magnitudes
+    noise_factors: tuple[float, ...] = (1.0,)  # on the plants' sensor noise
+    latencies: tuple[int | None, ...] = (None,)  # [periods]; None for what a plant is configured with
 
     def cells(self) -> list[Cell]:
         """Return the runs, seeds varying fastest."""

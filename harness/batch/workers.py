@@ -28,20 +28,12 @@ TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for
 
 @dataclass(frozen=True)
 class Workers:
-    """A place where runs are carried out.
+    """A place where runs are carried out."""
 
-    Attributes:
-        submit: starts a function with arguments elsewhere and returns its future; None: runs are carried out in this
-            process.
-        window: number of tasks that are handed out at a time.
-        lost: what a future raises if the process that carried out its task died.
-        run_timeout: [s] time limit of a run; None for no limit.
-    """
-
-    submit: Callable[..., Any] | None = None
-    window: int = 1
-    lost: tuple[type[BaseException], ...] = ()
-    run_timeout: float | None = None
+    submit: Callable[..., Any] | None = None  # as `submit` of an executor; None: runs stay in this process
+    window: int = 1  # number of tasks that are handed out at a time
+    lost: tuple[type[BaseException], ...] = ()  # what a future raises if the process that carried out its task died
+    run_timeout: float | None = None  # [s] time limit of a run; None for no limit
 
     @property
     def local(self) -> bool:

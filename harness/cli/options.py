@@ -57,6 +57,6 @@ def split_controllers(text: str) -> tuple[str, ...]:
 
 def split_tasks(text: str) -> tuple[str, ...]:
     """Return the tasks that a user named."""
-    from servobench.harness.run.tasks import find_task, task_names
+    from servobench.harness.run.tasks import TASKS, find_task
 
-    return split_names("tasks", text, task_names(), find_task)
+    return split_names("tasks", text, list(TASKS), find_task)

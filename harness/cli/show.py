@@ -45,9 +45,9 @@ def controllers(name: NameArgument = None) -> None:
 
 def tasks(name: NameArgument = None) -> None:
     """List the tasks, or show the settings of one."""
-    from servobench.harness.run.tasks import find_task, task_names
+    from servobench.harness.run.tasks import TASKS, find_task
 
-    _show("tasks", name, task_names(), find_task, lambda entry: entry.default)
+    _show("tasks", name, list(TASKS), find_task, lambda entry: entry.default)
 
 
 def _show(

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -24,37 +24,21 @@ JOINT_UNIT = "rad"
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """A run as arrays of k rows; NaN where a number is not known.
+    """A run as arrays of k rows; NaN where a number is not known."""
 
-    Attributes:
-        spec: names and units for the columns.
-        time: (k,) [s].
-        reference: (k, m) [unit of the feature].
-        feature: (k, m), what the controller saw [unit of the feature].
-        true_feature: (k, m) [unit of the feature].
-        joint_position: (k, n), as the encoders report it [rad].
-        command: (k, n) [rad/s].
-        feature_valid: (k,), whether a measurement arrived.
-        estimated_jacobian: (k, m, n), the one that the controller used [unit of the feature per rad].
-        true_jacobian: (k, m, n) [unit of the feature per rad].
-        controller_time: (k,) [µs].
-        plant_time: (k,) [µs].
-        diagnostics: (k,) for each number that the controller gave at least once.
-    """
-
-    spec: PlantSpec
-    time: FloatArray
-    reference: FloatArray
-    feature: FloatArray
-    true_feature: FloatArray
-    joint_position: FloatArray
-    command: FloatArray
-    feature_valid: npt.NDArray[np.bool_]
-    estimated_jacobian: FloatArray
-    true_jacobian: FloatArray
-    controller_time: FloatArray
-    plant_time: FloatArray
-    diagnostics: Mapping[str, FloatArray]
+    spec: PlantSpec  # names and units for the columns
+    time: FloatArray  # (k,) [s]
+    reference: FloatArray  # (k, m) [unit of the feature]
+    feature: FloatArray  # (k, m), what the controller saw [unit of the feature]
+    true_feature: FloatArray  # (k, m) [unit of the feature]
+    joint_position: FloatArray  # (k, n), as the encoders report it [rad]
+    command: FloatArray  # (k, n) [rad/s]
+    feature_valid: npt.NDArray[np.bool_]  # (k,), whether a measurement arrived
+    estimated_jacobian: FloatArray  # (k, m, n), the one that the controller used [unit of the feature per rad]
+    true_jacobian: FloatArray  # (k, m, n) [unit of the feature per rad]
+    controller_time: FloatArray  # (k,) [µs]
+    plant_time: FloatArray  # (k,) [µs]
+    diagnostics: dict[str, FloatArray]  # (k,) for each number that the controller gave at least once
 
     def __len__(self) -> int:
         """Number of rows."""
@@ -122,16 +106,23 @@ class StepLog:
             spec: sizes, names and units.
             periods: how many rows there is room for.
         """
-        m, n = spec.m, spec.n
-        self._spec = spec
+        features, joints, jacobians = (periods, spec.m), (periods, spec.n), (periods, spec.m, spec.n)
         self._count = 0
-        self._time = np.empty(periods)
-        self._reference, self._feature, self._true_feature = np.empty((3, periods, m))
-        self._joint_position, self._command = np.empty((2, periods, n))
-        self._valid = np.empty(periods, dtype=np.bool_)
-        self._estimated_jacobian, self._true_jacobian = np.full((2, periods, m, n), np.nan)
-        self._nanoseconds = np.empty((2, periods))
-        self._diagnostics: dict[str, FloatArray] = {}
+        self._rows = Steps(
+            spec=spec,
+            time=np.empty(periods),
+            reference=np.empty(features),
+            feature=np.empty(features),
+            true_feature=np.empty(features),
+            joint_position=np.empty(joints),
+            command=np.empty(joints),
+            feature_valid=np.empty(periods, dtype=np.bool_),
+            estimated_jacobian=np.full(jacobians, np.nan),
+            true_jacobian=np.full(jacobians, np.nan),
+            controller_time=np.empty(periods),
+            plant_time=np.empty(periods),
+            diagnostics={},
+        )
 
     def add(
         self,
@@ -154,44 +145,30 @@ class StepLog:
             diagnostics: the controller's own numbers; a name may come later than the first row.
             nanoseconds: how long the controller's and the plant's step took.
         """
-        k = self._count
-        self._time[k] = observation.time
-        self._reference[k] = reference
-        self._feature[k] = observation.feature
-        self._true_feature[k] = truth.feature
-        self._joint_position[k] = observation.joint_position
-        self._command[k] = command.joint_velocity
-        self._valid[k] = observation.feature_valid
+        k, rows = self._count, self._rows
+        rows.time[k] = observation.time
+        rows.reference[k] = reference
+        rows.feature[k] = observation.feature
+        rows.true_feature[k] = truth.feature
+        rows.joint_position[k] = observation.joint_position
+        rows.command[k] = command.joint_velocity
+        rows.feature_valid[k] = observation.feature_valid
         if estimate is not None:
-            self._estimated_jacobian[k] = estimate
+            rows.estimated_jacobian[k] = estimate
         if truth.jacobian is not None:
-            self._true_jacobian[k] = truth.jacobian
-        self._nanoseconds[:, k] = nanoseconds
+            rows.true_jacobian[k] = truth.jacobian
+        rows.controller_time[k], rows.plant_time[k] = (time / 1000.0 for time in nanoseconds)
         for name, value in diagnostics.items():
-            if name not in self._diagnostics:
-                self._diagnostics[name] = np.full(len(self._time), np.nan)
-            self._diagnostics[name][k] = value
+            if name not in rows.diagnostics:
+                rows.diagnostics[name] = np.full(len(rows), np.nan)
+            rows.diagnostics[name][k] = value
         self._count += 1
 
     def steps(self) -> Steps:
         """Return the rows so far."""
-        k = self._count
-        controller_time, plant_time = self._nanoseconds[:, :k] / 1000.0
-        return Steps(
-            self._spec,
-            self._time[:k],
-            self._reference[:k],
-            self._feature[:k],
-            self._true_feature[:k],
-            self._joint_position[:k],
-            self._command[:k],
-            self._valid[:k],
-            self._estimated_jacobian[:k],
-            self._true_jacobian[:k],
-            controller_time,
-            plant_time,
-            {name: values[:k] for name, values in self._diagnostics.items()},
-        )
+        k, rows = self._count, self._rows
+        arrays = {item.name: getattr(rows, item.name)[:k] for item in fields(rows)[1:-1]}
+        return Steps(rows.spec, **arrays, diagnostics={name: values[:k] for name, values in rows.diagnostics.items()})
 
 
 def column_unit(unit: str) -> str:

@@ -24,32 +24,20 @@ from servobench.plant.seeds import named_seed
 
 @dataclass(frozen=True, eq=False)
 class CameraMove:
-    """A change of the camera's pose during a run that the controller must notice by itself.
+    """A change of the camera's pose during a run that the controller must notice by itself."""
 
-    Attributes:
-        period: the first period with the new pose.
-        X_BC: (4, 4), the new pose in the base frame.
-    """
-
-    period: int
-    X_BC: FloatArray
+    period: int  # the first period with the new pose
+    X_BC: FloatArray  # (4, 4), the new pose in the base frame
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How long a run is and what ends it early.
+    """How long a run is and what ends it early."""
 
-    Attributes:
-        periods: control periods in the run.
-        preview: future rows of the reference that a controller sees.
-        lost_after_periods: a run ends after so many periods in a row without a valid feature.
-        camera_move: a move of the camera in the middle of the run, or None.
-    """
-
-    periods: int
-    preview: int
-    lost_after_periods: int
-    camera_move: CameraMove | None = None
+    periods: int  # control periods in the run
+    preview: int  # future rows of the reference that a controller sees
+    lost_after_periods: int  # a run ends after so many periods in a row without a valid feature
+    camera_move: CameraMove | None = None  # a move of the camera in the middle of the run, or None
 
 
 def run_loop(

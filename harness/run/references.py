@@ -50,15 +50,10 @@ class FixedPoint(Reference):
 
 @dataclass(frozen=True, eq=False)
 class Waypoints(Reference):
-    """Straight lines between points passed at given times; before the first and after the last it rests there.
+    """Straight lines between points passed at given times; before the first and after the last it rests there."""
 
-    Attributes:
-        times: (p,), s, ascending.
-        points: (p, m), m.
-    """
-
-    times: FloatArray
-    points: FloatArray
+    times: FloatArray  # (p,), ascending [s]
+    points: FloatArray  # (p, m) [m]
 
     def __post_init__(self) -> None:
         """Check sizes and order."""
@@ -76,18 +71,16 @@ class Waypoints(Reference):
 
 
 @dataclass(frozen=True, eq=False)
-class Circle(Reference):
-    """y_ref(t) = c + r (cos ωt · a + sin ωt · b), ω = 2π / lap time, a and b the first two feature axes.
+class Laps(Reference):
+    """y_ref(t) = c + r (cos ωt · a + s(t) · b), ω = 2π / lap time, a and b the first two feature axes.
 
-    Attributes:
-        centre: c, (m,), m.
-        radius: r, m.
-        lap_time: s.
+    s(t) = sin ωt on a circle, and sin ωt cos ωt on a figure of eight (Gerono's lemniscate).
     """
 
-    centre: FloatArray
-    radius: float
-    lap_time: float
+    centre: FloatArray  # c, (m,) [m]
+    radius: float  # r [m]
+    lap_time: float  # [s]
+    eight: bool = False
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -95,28 +88,12 @@ class Circle(Reference):
         check_number("lap_time", self.lap_time, above=0.0)
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
-        """Return points on the circle."""
+        """Return points on the curve."""
         phase = 2 * np.pi * np.asarray(time, dtype=np.float64) / self.lap_time
-        return _in_plane(self.centre, self.radius * np.cos(phase), self.radius * np.sin(phase))
-
-
-@dataclass(frozen=True, eq=False)
-class Lemniscate(Reference):
-    """A figure of eight (Gerono): y_ref(t) = c + r (cos ωt · a + sin ωt cos ωt · b), with the symbols of `Circle`."""
-
-    centre: FloatArray
-    radius: float
-    lap_time: float
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        check_number("radius", self.radius, above=0.0)
-        check_number("lap_time", self.lap_time, above=0.0)
-
-    def at(self, time: npt.ArrayLike) -> FloatArray:
-        """Return points on the figure."""
-        phase = 2 * np.pi * np.asarray(time, dtype=np.float64) / self.lap_time
-        return _in_plane(self.centre, self.radius * np.cos(phase), self.radius * np.sin(phase) * np.cos(phase))
+        points = np.broadcast_to(self.centre, (*phase.shape, len(self.centre))).copy()
+        points[..., 0] += self.radius * np.cos(phase)
+        points[..., 1] += self.radius * np.sin(phase) * (np.cos(phase) if self.eight else 1.0)
+        return points
 
 
 def line(start: FloatArray, end: FloatArray, duration: float) -> Waypoints:
@@ -156,10 +133,3 @@ def read_waypoints(path: Path, feature_names: tuple[str, ...]) -> Waypoints:
         return Waypoints(values[:, 0], values[:, 1:])
     except ValueError as error:
         raise ValueError(f"waypoint file {path}: {error}") from error
-
-
-def _in_plane(centre: FloatArray, along_first: FloatArray, along_second: FloatArray) -> FloatArray:
-    points = np.broadcast_to(centre, (*along_first.shape, len(centre))).copy()
-    points[..., 0] += along_first
-    points[..., 1] += along_second
-    return points

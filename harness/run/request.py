@@ -38,15 +38,6 @@ class RunSettings:
 class RunRequest:
     """One cell of a comparison.
 
-    Attributes:
-        plant: its name.
-        controller: its name.
-        task: its name.
-        mismatch: how far the true robot may be from the nominal one; its text is read, too.
-        seed: of everything random in the run.
-        noise_factor: multiplies the sensor noise that the plant is configured with.
-        latency_periods: of the camera; None for what the plant is configured with.
-
     Raises:
         ConfigurationError: a text that is no mismatch.
     """
@@ -54,10 +45,10 @@ class RunRequest:
     plant: str
     controller: str
     task: str
-    mismatch: Mismatch
-    seed: int
-    noise_factor: float = 1.0
-    latency_periods: int | None = None
+    mismatch: Mismatch  # how far the true robot may be from the nominal one; its text is read, too
+    seed: int  # of everything random in the run
+    noise_factor: float = 1.0  # multiplies the sensor noise that the plant is configured with
+    latency_periods: int | None = None  # of the camera; None for what the plant is configured with
 
     def __post_init__(self) -> None:
         """Read a mismatch that came as text."""

@@ -10,7 +10,7 @@ from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import controller_names, find_controller, find_plant, plant_names
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.tasks import find_task, task_names
+from servobench.harness.run.tasks import TASKS, find_task
 from servobench.plant.bench import vary_sensing
 
 
@@ -67,4 +67,4 @@ def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:
 
 def known_sections() -> list[str]:
     """Return every section that a configuration may have."""
-    return ["run", *plant_names(), *controller_names(), *task_names()]
+    return ["run", *plant_names(), *controller_names(), *TASKS]

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.references import Circle, FixedPoint, Lemniscate, Reference, TaskKind, line, read_waypoints
+from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskKind, line, read_waypoints
 from servobench.plant.checks import FloatArray, as_vector, check_number
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
@@ -30,21 +30,13 @@ REACH = (0.35, 0.75)  # [m] from the shoulder to the ball: away from the arm's o
 
 @dataclass(frozen=True)
 class Scenario:
-    """A task made concrete for one true robot.
+    """A task made concrete for one true robot."""
 
-    Attributes:
-        start: (n,), joint positions at time 0; None for a plant that brings its own [rad].
-        reference: the desired feature over time.
-        duration: [s].
-        evaluate_from: where the evaluated part begins [s].
-        kind: whether the reference is a fixed target or moves.
-    """
-
-    start: FloatArray | None
-    reference: Reference
-    duration: float
-    evaluate_from: float
-    kind: TaskKind = "curve"
+    start: FloatArray | None  # (n,), joint positions at time 0; None for a plant that brings its own [rad]
+    reference: Reference  # the desired feature over time
+    duration: float  # [s]
+    evaluate_from: float  # where the evaluated part begins [s]
+    kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
 
 
 @settings
@@ -144,21 +136,13 @@ class TargetTask:
 
 @dataclass(frozen=True)
 class TaskSetting:
-    """Where a task is to be done.
+    """Where a task is to be done."""
 
-    Attributes:
-        model: the true robot, or None for a plant that brings its own.
-        n: number of joints.
-        feature_names: m names.
-        seed: for tasks that draw random numbers.
-        moved: the true robot after its camera was moved in the middle of the run; None if it is not.
-    """
-
-    model: HandEyeModel | None
-    n: int
-    feature_names: tuple[str, ...]
-    seed: int
-    moved: HandEyeModel | None = None
+    model: HandEyeModel | None  # the true robot, or None for a plant that brings its own
+    n: int  # number of joints
+    feature_names: tuple[str, ...]  # m names
+    seed: int  # for tasks that draw random numbers
+    moved: HandEyeModel | None = None  # the true robot once its camera was moved; None if it is not
 
     @property
     def m(self) -> int:
@@ -183,21 +167,13 @@ class TaskSetting:
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """A task as the command line knows it.
+    """A task as the command line knows it."""
 
-    Attributes:
-        name: the word on the command line.
-        summary: one line for `servobench tasks`.
-        default: its settings.
-        build: makes a scenario from settings and the setting of the run.
-        any_robot: it needs no UR5: start and target are not given as its joint positions.
-    """
-
-    name: str
-    summary: str
-    default: Any
-    build: Callable[[Any, TaskSetting], Scenario]
-    any_robot: bool = False
+    name: str  # the word on the command line
+    summary: str  # one line for `servobench tasks`
+    default: Any  # its settings
+    build: Callable[[Any, TaskSetting], Scenario]  # makes a scenario from settings and the setting of the run
+    any_robot: bool = False  # it needs no UR5: start and target are not given as its joint positions
 
 
 def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
@@ -237,17 +213,9 @@ def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting) -> 
     return bool(point[2] >= lowest and REACH[0] <= np.linalg.norm(point - SHOULDER) <= REACH[1])
 
 
-def _build_circle(config: CircleTask, setting: TaskSetting) -> Scenario:
-    reference = Circle(as_vector("centre", config.centre, setting.m), config.radius, config.lap_time)
-    return _lap_scenario(config, reference, setting)
-
-
-def _build_lemniscate(config: LemniscateTask, setting: TaskSetting) -> Scenario:
-    reference = Lemniscate(as_vector("centre", config.centre, setting.m), config.radius, config.lap_time)
-    return _lap_scenario(config, reference, setting)
-
-
-def _lap_scenario(config: CircleTask, reference: Reference, setting: TaskSetting) -> Scenario:
+def _build_laps(config: CircleTask, setting: TaskSetting) -> Scenario:
+    centre, eight = as_vector("centre", config.centre, setting.m), isinstance(config, LemniscateTask)
+    reference = Laps(centre, config.radius, config.lap_time, eight)
     laps, lap_time = config.laps, config.lap_time
     return Scenario(setting.start(config.start), reference, laps * lap_time, (laps - 1) * lap_time)
 
@@ -290,19 +258,14 @@ _ENTRIES = (
     TaskEntry("exp2", "a move inside the training region, forward and down", EXP2, _build_point),
     TaskEntry("exp3", "a move inside the training region, across and up", EXP3, _build_point),
     TaskEntry("exp4", "a move that starts outside the training region", EXP4, _build_point),
-    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_circle, any_robot=True),
+    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_laps, any_robot=True),
     TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line, any_robot=True),
-    TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(), _build_lemniscate, any_robot=True),
+    TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(), _build_laps, any_robot=True),
     TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
     TaskEntry("target", "a move to a given feature (target.target)", TargetTask(), _build_target, any_robot=True),
     TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),
 )
 TASKS = {entry.name: entry for entry in _ENTRIES}
-
-
-def task_names() -> list[str]:
-    """Return the names of all tasks."""
-    return list(TASKS)
 
 
 def find_task(name: str) -> TaskEntry:

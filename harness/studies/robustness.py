@@ -39,17 +39,11 @@ FIGURES: Final = "figures"
 
 @dataclass(frozen=True)
 class Line:
-    """An axis of the map.
+    """An axis of the map."""
 
-    Attributes:
-        axis: of the mismatch, or "latency" or "noise".
-        title: label of the axis.
-        places: its magnitudes.
-    """
-
-    axis: str
-    title: str
-    places: tuple[Magnitude, ...]
+    axis: str  # of the mismatch, or "latency" or "noise"
+    title: str  # label of the axis
+    places: tuple[Magnitude, ...]  # its magnitudes
 
     def request(self, request: RunRequest, place: Magnitude) -> RunRequest:
         """Return `request` at one place of this axis."""

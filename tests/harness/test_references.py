@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.harness.run.references import Circle, FixedPoint, Lemniscate, Waypoints, line, read_waypoints
+from servobench.harness.run.references import FixedPoint, Laps, Waypoints, line, read_waypoints
 
 CENTRE = np.array([0.1, -0.2, 1.2])
 NAMES = ("x", "y", "z")
@@ -13,8 +13,8 @@ NAMES = ("x", "y", "z")
     "reference",
     [
         FixedPoint(CENTRE),
-        Circle(CENTRE, 0.3, 10.0),
-        Lemniscate(CENTRE, 0.25, 7.0),
+        Laps(CENTRE, 0.3, 10.0),
+        Laps(CENTRE, 0.25, 7.0, eight=True),
         Waypoints(np.array([0.3, 1.1, 4.0]), np.random.default_rng(0).normal(size=(3, 3))),
     ],
 )
@@ -28,7 +28,7 @@ def test_a_reference_sampled_at_once_has_the_bits_of_every_instant_by_itself(ref
 
 def test_a_circle_keeps_its_radius_its_depth_and_its_lap():
     times = np.linspace(0, 10, 201)
-    points = Circle(CENTRE, 0.3, 10.0).at(times)
+    points = Laps(CENTRE, 0.3, 10.0).at(times)
     np.testing.assert_allclose(np.linalg.norm(points - CENTRE, axis=1), 0.3, atol=1e-12)
     assert (points[:, 2] == CENTRE[2]).all()
     np.testing.assert_allclose(points[0], points[-1], atol=1e-12)
@@ -36,7 +36,7 @@ def test_a_circle_keeps_its_radius_its_depth_and_its_lap():
 
 
 def test_a_lemniscate_crosses_its_centre_twice_a_lap():
-    eight = Lemniscate(CENTRE, 0.2, 8.0)
+    eight = Laps(CENTRE, 0.2, 8.0, eight=True)
     np.testing.assert_allclose(eight.at([2.0, 6.0]), [CENTRE, CENTRE], atol=1e-12)
     np.testing.assert_allclose(eight.at(1.0), CENTRE + [0.2 / np.sqrt(2), 0.1, 0], atol=1e-12)
 
@@ -61,33 +61,26 @@ def test_waypoints_come_back_from_a_file(tmp_path):
         ("time_s,x_m,y_m,z_m\n0,0,0\n", "row 1: z_m is not a number: None"),
         ("time_s,x_m,y_m,z_m\n0,0,nan,1\n", "not finite"),
         ("time_s,x_m,y_m,z_m\n1,0,0,1\n1,0,0,1\n", "times must ascend"),
+        (None, "points.csv cannot be read"),
     ],
 )
-def test_a_malformed_waypoint_file_is_refused(tmp_path, text, message):
+def test_a_missing_or_malformed_waypoint_file_is_refused(tmp_path, text, message):
     file = tmp_path / "points.csv"
-    file.write_text(text)
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(ValueError, match=message):
         read_waypoints(file, NAMES)
 
 
-def test_a_missing_waypoint_file_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="none.csv cannot be read"):
-        read_waypoints(tmp_path / "none.csv", NAMES)
-
-
-@pytest.mark.parametrize("curve", [Circle, Lemniscate])
-def test_a_curve_needs_a_radius_and_a_lap_time(curve):
-    with pytest.raises(ValueError, match="radius must be above 0"):
-        curve(CENTRE, 0.0, 1.0)
-    with pytest.raises(ValueError, match="lap_time must be above 0"):
-        curve(CENTRE, 1.0, -1.0)
-
-
-def test_a_line_needs_a_duration():
-    with pytest.raises(ValueError, match="duration must be above 0"):
-        line(CENTRE, CENTRE, 0.0)
-
-
-def test_waypoints_need_a_time_for_each_point():
-    with pytest.raises(ValueError, match="need times"):
-        Waypoints(np.zeros(3), np.zeros((2, 3)))
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (Laps, (CENTRE, 0.0, 1.0), "radius must be above 0"),
+        (Laps, (CENTRE, 1.0, -1.0), "lap_time must be above 0"),
+        (line, (CENTRE, CENTRE, 0.0), "duration must be above 0"),
+        (Waypoints, (np.zeros(3), np.zeros((2, 3))), "need times"),
+    ],
+)
+def test_a_reference_that_cannot_be_is_refused(kind, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kind(*arguments)
