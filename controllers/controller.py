@@ -14,7 +14,9 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from servobench.plant.checks import FloatArray
+import numpy as np
+
+from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.signals import Command, Observation, PlantSpec
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
@@ -47,6 +49,26 @@ class RobotKnowledge:
     true_symbolic: SymbolicFeature | None = None
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
+
+    def check(self, observation: Observation, reference: FloatArray | None = None) -> None:
+        """Check what a controller is given.
+
+        Raises:
+            ValueError: an observation or a reference of the wrong size, or a reference that is not finite.
+        """
+        for name, size in (("joint_position", self.spec.n), ("feature", self.spec.m)):
+            shape = getattr(observation, name).shape
+            if shape != (size,):
+                raise ValueError(f"observation.{name} must have shape {(size,)}, got {shape}")
+        if reference is None:
+            return
+        wanted = (1 + self.preview, self.spec.m)
+        if np.shape(reference) != wanted:
+            raise ValueError(
+                f"reference must have shape {wanted} for a preview of {self.preview}, got {np.shape(reference)}"
+            )
+        if not is_finite(reference):
+            raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")
 
 
 class Controller(ABC):

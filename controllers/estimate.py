@@ -16,7 +16,8 @@ class Estimate:
     Attributes:
         jacobian: Ĵ, (m, n), m/rad, at the present joint position.
         delay: [periods] by which features are late, from 0 to `MAX_DELAY`; 0 where it is not identified.
-        noise: [m] standard deviation of the feature per axis; None where it is not identified.
+        noise: [m] standard deviation of the feature per axis; None where it is not identified. No law of this package
+            reads it: `rbfnn_bridged` finds its own from its own innovations.
     """
 
     jacobian: FloatArray

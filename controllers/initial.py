@@ -56,12 +56,12 @@ class InitialJacobian(ABC):
 
 
 @final
-class NominalJacobian(InitialJacobian):
-    """Ĵ₀ = J_nominal(q(0))."""
+class KnownJacobian(InitialJacobian):
+    """Ĵ₀ = J(q(0)) of a model, which may be constant."""
 
-    def __init__(self, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> None:
-        """Take the nominal model, (n,) rad -> (m, n) m/rad, and the sizes that it must have."""
-        self._nominal_jacobian = nominal_jacobian
+    def __init__(self, model: JacobianFunction, spec: PlantSpec) -> None:
+        """Take the model, (n,) rad -> (m, n) m/rad, and the sizes that it must have."""
+        self._model = model
         self._shape = (spec.m, spec.n)
 
     def reset(self, observation: Observation) -> None:
@@ -70,37 +70,9 @@ class NominalJacobian(InitialJacobian):
         Raises:
             ValueError: the model is that of another robot.
         """
-        self._jacobian = np.array(self._nominal_jacobian(observation.joint_position), dtype=np.float64)
+        self._jacobian = np.array(self._model(observation.joint_position), dtype=np.float64)
         if self._jacobian.shape != self._shape:
             raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {self._jacobian.shape}")
-
-    def step(self, observation: Observation) -> None:
-        """Return None: nothing has to move."""
-
-    def jacobian(self) -> FloatArray:
-        """Return Ĵ₀, (m, n), m/rad."""
-        return self._jacobian.copy()
-
-
-@final
-class GivenJacobian(InitialJacobian):
-    """Ĵ₀ as written in the configuration."""
-
-    def __init__(self, given: tuple[tuple[float, ...], ...], spec: PlantSpec) -> None:
-        """Check the matrix against the plant.
-
-        Raises:
-            ValueError: ragged, of the wrong shape, or not finite.
-        """
-        lengths = [len(row) for row in given]
-        if lengths != [spec.n] * spec.m:
-            raise ValueError(f"given must hold {spec.m} rows of {spec.n} entries, got rows of length {lengths}")
-        self._jacobian = np.array(given, dtype=np.float64)
-        if not np.isfinite(self._jacobian).all():
-            raise ValueError(f"given must be finite, got {given}")
-
-    def reset(self, observation: Observation) -> None:
-        """Nothing to forget."""
 
     def step(self, observation: Observation) -> None:
         """Return None: nothing has to move."""
@@ -189,12 +161,16 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
     Raises:
         ValueError: the nominal Jacobian is wanted where no model exists, or settings that do not fit the plant.
     """
+    spec, model = knowledge.spec, knowledge.nominal_jacobian
     if config.source == "probe":
-        return ProbedJacobian(config, knowledge.spec)
+        return ProbedJacobian(config, spec)
     if config.source == "given":
-        return GivenJacobian(config.given, knowledge.spec)
-    if knowledge.nominal_jacobian is None:
+        lengths = [len(row) for row in config.given]
+        if lengths != [spec.n] * spec.m:
+            raise ValueError(f"given must hold {spec.m} rows of {spec.n} entries, got rows of length {lengths}")
+        return KnownJacobian(lambda _: np.array(config.given), spec)
+    if model is None:
         raise ValueError(
             "source 'nominal' needs a nominal model, and this plant has none; take 'probe' or 'given' instead"
         )
-    return NominalJacobian(knowledge.nominal_jacobian, knowledge.spec)
+    return KnownJacobian(model, spec)

@@ -58,16 +58,16 @@ class Method:
 
     Attributes:
         name: the word on the command line.
-        summary: one line for `servobench controllers`.
         law: a name in `LAWS`.
         estimator: a name in `ESTIMATORS`.
+        summary: one line for `servobench controllers`.
         law_defaults: settings of the law that differ from its own defaults.
     """
 
     name: str
-    summary: str
     law: str
     estimator: str
+    summary: str
     law_defaults: Mapping[str, object] = field(default_factory=dict)
 
     def config(self) -> MethodConfig:
@@ -104,44 +104,28 @@ class Method:
 
 _ROWS = (
     Method(
-        "rbfnn_mfac",
+        "rbfnn_mfac", "rbfnn", "rbf",
         "the proposed method: a controller network and a Jacobian network that learn online (eqs. 7-39)",
-        law="rbfnn",
-        estimator="rbf",
     ),
     Method(
-        "rbfnn_mfac_plus",
+        "rbfnn_mfac_plus", "rbfnn_bridged", "rbf_aligned",
         "the proposed method with an estimated camera map and delay, prediction past all delays and a faster law",
-        law="rbfnn_bridged",
-        estimator="rbf_aligned",
     ),
+    Method("ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)"),
+    Method("ukf_mpc", "mpc", "ukf", "unscented Kalman filter with model predictive control (eq. 46)"),
     Method(
-        "ukf_mfac", "unscented Kalman filter with model-free adaptive control (eq. 45)", law="mfac", estimator="ukf"
-    ),
-    Method("ukf_mpc", "unscented Kalman filter with model predictive control (eq. 46)", law="mpc", estimator="ukf"),
-    Method(
-        "rbf_pid",
+        "rbf_pid", "pid", "rbf_lyapunov",
         "Jacobian network under a Lyapunov update with the pseudo-inverse law (eqs. 40-43)",
-        law="pid",
-        estimator="rbf_lyapunov",
     ),
+    Method("constant", "pid", "constant", "pseudo-inverse of the first Jacobian for ever: the lower bound"),
     Method(
-        "constant",
-        "pseudo-inverse of the first Jacobian for ever: the lower bound",
-        law="pid",
-        estimator="constant",
+        "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian, with feedforward: the upper bound",
+        {"feedforward": True},
     ),
-    Method(
-        "calibrated",
-        "pseudo-inverse of the true Jacobian, with feedforward: the upper bound",
-        law="pid",
-        estimator="true",
-        law_defaults={"feedforward": True},
-    ),
-    Method("broyden", "Broyden's rank-one update with the pseudo-inverse law", law="pid", estimator="broyden"),
-    Method("rls", "recursive least squares with forgetting, with the pseudo-inverse law", law="pid", estimator="rls"),
-    Method("cfdl_mfac", "compact-form model-free adaptive control of Hou and Jin", law="mfac", estimator="cfdl"),
-)
+    Method("broyden", "pid", "broyden", "Broyden's rank-one update with the pseudo-inverse law"),
+    Method("rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law"),
+    Method("cfdl_mfac", "mfac", "cfdl", "compact-form model-free adaptive control of Hou and Jin"),
+)  # fmt: skip
 METHODS: Mapping[str, ControllerEntry] = {row.name: row.entry() for row in _ROWS}
 
 
@@ -157,4 +141,4 @@ def compose(law: str, estimator: str) -> ControllerEntry:
         ValueError: an unknown name.
     """
     summary = f"the law {law} with the Jacobian of the estimator {estimator}"
-    return Method(f"{law}+{estimator}", summary, law=law, estimator=estimator).entry()
+    return Method(f"{law}+{estimator}", law, estimator, summary).entry()

@@ -14,7 +14,7 @@ from servobench.controllers.controller import Controller, ControllerEntry, Diagn
 from servobench.controllers.laws.mpc.closed_form import decay_targets, move_weights
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
 from servobench.controllers.laws.mpc.qp import QpShape, QpSolution
-from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.checks import FloatArray
 from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, Share, settings
 from servobench.plant.signals import Command, Observation
@@ -80,7 +80,7 @@ class NmpcCalibrated(Controller):
             raise ValueError(f"preview must be at least horizon + delay_periods = {reach}, got {knowledge.preview}")
         if knowledge.true_symbolic is None:
             raise ValueError("true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics")
-        self._config, self._spec, self._preview = config, knowledge.spec, knowledge.preview
+        self._config, self._spec, self._knowledge = config, knowledge.spec, knowledge
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
         self._along_plan = self._model.map(config.horizon)
@@ -102,8 +102,13 @@ class NmpcCalibrated(Controller):
         self._forget()
 
     def reset(self, observation: Observation, seed: int) -> None:
-        """Forget plan, warm start, commands sent and disturbance; nothing is random."""
-        del observation, seed
+        """Forget plan, warm start, commands sent and disturbance; nothing is random.
+
+        Raises:
+            ValueError: an observation of the wrong size.
+        """
+        del seed
+        self._knowledge.check(observation)
         self._program.reset()
         self._forget()
 
@@ -115,7 +120,7 @@ class NmpcCalibrated(Controller):
             SolverFailed: no solution, and the fallback is "raise".
         """
         config, delay = self._config, self._config.delay_periods
-        self._check(observation, reference)
+        self._knowledge.check(observation, reference)
         present = observation.joint_position
         feature, self._jacobian = self._evaluate(present)
         if observation.feature_valid:
@@ -141,7 +146,7 @@ class NmpcCalibrated(Controller):
         return None if self._jacobian is None else self._jacobian.copy()
 
     def _shared(self) -> Iterable[object]:
-        return self._model, self._along_plan
+        return self._knowledge, self._model, self._along_plan
 
     def _forget(self) -> None:
         n, delay = self._spec.n, self._config.delay_periods
@@ -152,15 +157,6 @@ class NmpcCalibrated(Controller):
         self._jacobian = None
         self._fallbacks = 0
         self._diagnostics: dict[str, float] = {}
-
-    def _check(self, observation: Observation, reference: FloatArray) -> None:
-        as_vector("observation.joint_position", observation.joint_position, self._spec.n)
-        as_vector("observation.feature", observation.feature, self._spec.m)
-        wanted = (1 + self._preview, self._spec.m)
-        if np.shape(reference) != wanted:
-            raise ValueError(f"reference must have shape {wanted}, got {np.shape(reference)}")
-        if not np.isfinite(reference).all():
-            raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")
 
     def _evaluate(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
         feature, jacobian = self._model(joint_position)

@@ -8,15 +8,14 @@ from typing import Any, Generic, TypeVar
 
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
 from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
-from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator
 from servobench.controllers.estimators.estimator import Estimator
+from servobench.controllers.estimators.fixed import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
-from servobench.controllers.estimators.true import TrueConfig, TrueEstimator
-from servobench.controllers.estimators.ukf import UkfConfig, UkfEstimator
+from servobench.controllers.estimators.ukf import UkfConfig, ukf_estimator
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
@@ -47,7 +46,7 @@ class Part(Generic[Kind]):
 ESTIMATORS: dict[str, Part[Estimator]] = {
     "constant": Part(ConstantConfig, ConstantEstimator),
     "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
-    "ukf": Part(UkfConfig, UkfEstimator),
+    "ukf": Part(UkfConfig, ukf_estimator),
     "kalman": Part(KalmanConfig, KalmanEstimator),
     "broyden": Part(BroydenConfig, BroydenEstimator),
     "rls": Part(RlsConfig, RlsEstimator),

@@ -11,8 +11,6 @@ import math
 from collections.abc import Iterable
 from typing import final
 
-import numpy as np
-
 from servobench.controllers.controller import Controller, Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.estimator import Estimator, Motion
@@ -61,14 +59,10 @@ class ServoController(Controller):
         if predictor is not None and "predict" in law.owns:
             raise ValueError(f"predictor must be None for {type(law).__name__}, which predicts itself")
         self._predictor = predictor
-        self._period = knowledge.spec.period
         self.estimator = estimator
         self.law = law
         self._initial = initial
         self._knowledge = knowledge
-        spec = knowledge.spec
-        self._shapes = {"joint_position": (spec.n,), "feature": (spec.m,)}
-        self._reference_shape = (1 + knowledge.preview, spec.m)
         self._forget()
 
     def _shared(self) -> Iterable[object]:
@@ -88,7 +82,7 @@ class ServoController(Controller):
             ValueError: an observation of the wrong size.
         """
         del seed
-        self._check_observation(observation)
+        self._knowledge.check(observation)
         self._initial.reset(observation)
         self._forget()
 
@@ -99,8 +93,7 @@ class ServoController(Controller):
             ValueError: an observation or a reference of the wrong size.
             ControllerDiverged: the estimate, or what the law asked for, is not finite.
         """
-        self._check_observation(observation)
-        self._check_reference(reference)
+        self._knowledge.check(observation, reference)
         probing = None if self._ready else self._initial.step(observation)
         if probing is not None:
             self._probing = True
@@ -131,7 +124,7 @@ class ServoController(Controller):
         bound = predictor.predict(estimate, observation)
         ahead = Observation(observation.time, bound.joint_position, bound.feature, observation.feature_valid)
         u = self.law.command(estimate, ahead, shifted(reference, bound.lead, len(reference)))
-        predictor.note(u * self._period)
+        predictor.note(u * self._knowledge.spec.period)
         return u
 
     def diagnostics(self) -> Diagnostics:
@@ -166,18 +159,3 @@ class ServoController(Controller):
         unexplained = motion.feature_step - J.dot(motion.joint_step)
         self._prediction_error = math.sqrt(unexplained.dot(unexplained))
         self.estimator.update(motion)
-
-    def _check_observation(self, observation: Observation) -> None:
-        for name, wanted in self._shapes.items():
-            shape = getattr(observation, name).shape
-            if shape != wanted:
-                raise ValueError(f"observation.{name} must have shape {wanted}, got {shape}")
-
-    def _check_reference(self, reference: FloatArray) -> None:
-        if np.shape(reference) != self._reference_shape:
-            raise ValueError(
-                f"reference must have shape {self._reference_shape} for a preview of {self._reference_shape[0] - 1}, "
-                f"got {np.shape(reference)}"
-            )
-        if not is_finite(reference):
-            raise ValueError(f"reference must be finite, got {np.asarray(reference).tolist()}")

@@ -67,10 +67,6 @@ class BroydenEstimator(Estimator):
                 self._J, motion.joint_step, motion.feature_step, step_factor=config.step_factor, regularisation=0.0
             )
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return the present estimate, (m, n), m/rad."""
-        return self._J.copy()
-
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used."""
         return {"estimator_updated": float(self._updated)}

@@ -70,10 +70,6 @@ class CfdlEstimator(Estimator):
             self._J = self._J0.copy()
             self._resets += 1
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return the present estimate, (m, n), m/rad."""
-        return self._J.copy()
-
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used and how often Φ was reset in this run."""
         return {"estimator_updated": float(self._updated), "jacobian_resets": float(self._resets)}

@@ -40,14 +40,19 @@ class Estimator(ABC):
     def update(self, motion: Motion) -> None:
         """Learn from one observed motion."""
 
-    @abstractmethod
+    _J: FloatArray  # of an estimator of one matrix, (m, n), m/rad
+
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return Ĵ at `joint_position` (n,), rad, as an (m, n) array in m/rad that the caller may keep."""
+        """Return Ĵ at `joint_position` (n,), rad, as an (m, n) array in m/rad that the caller may keep.
+
+        An estimator of one matrix, kept as `_J`, returns it wherever the arm is; any other overrides this.
+        """
+        return self._J.copy()
 
     def estimate(self, joint_position: FloatArray) -> Estimate:
         """Return what the law needs to know; an estimator of delay or noise overrides this."""
         return Estimate(self.jacobian(joint_position))
 
-    @abstractmethod
     def diagnostics(self) -> Diagnostics:
-        """Return named numbers about the last update; for the log only."""
+        """Return named numbers about the last update, if there are any; for the log only."""
+        return {}

@@ -12,6 +12,7 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal, final
 
 import numpy as np
@@ -53,16 +54,6 @@ def cholesky_of(P: FloatArray) -> FloatArray:
     if not is_finite(L):  # LAPACK lets NaN pass
         raise FilterDiverged(f"covariance is not finite: diagonal {np.diag(P).tolist()}")
     return L
-
-
-def full_covariance(J: FloatArray, P: FloatArray) -> FloatArray:
-    """Return the covariance of vec(J) by rows, (mn, mn), from itself or from that which all rows share, (n, n)."""
-    return np.asarray(np.kron(np.eye(J.size // len(P)), P), dtype=np.float64)
-
-
-def filter_diagnostics(P: FloatArray, *, updated: bool) -> Diagnostics:
-    """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
-    return {"estimator_updated": float(updated), "jacobian_deviation": math.sqrt(P.trace() / len(P))}
 
 
 def measurement_matrix(joint_step: FloatArray, m: int) -> FloatArray:
@@ -123,6 +114,19 @@ def split_update(
     return J + np.outer(feature_step - J @ joint_step, K), (P + P.T) / 2
 
 
+def full_update(
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, Q: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Do the same by `kalman_update`, for P, (mn, mn), of all entries.
+
+    Raises:
+        FilterDiverged: the covariance is no longer positive definite.
+    """
+    x, P = kalman_update(J.ravel(), P, measurement_matrix(joint_step, len(J)), feature_step, Q=Q, R=R)
+    cholesky_of(P)
+    return x.reshape(J.shape), P
+
+
 @final
 class KalmanEstimator(Estimator):
     """x ← x + K (Δy − H x), K = P Hᵀ (H P Hᵀ + R)⁻¹, P in Joseph form; motions below a minimum ‖Δq‖ are left out.
@@ -130,17 +134,24 @@ class KalmanEstimator(Estimator):
     J changes only where the arm moves, so a motion that is left out adds no process noise either.
     """
 
-    def __init__(self, config: KalmanConfig, knowledge: RobotKnowledge | None = None) -> None:
-        """Take the settings; nothing about the robot is needed."""
-        self._config = config
+    def __init__(
+        self,
+        config: KalmanConfig,
+        knowledge: RobotKnowledge | None = None,
+        update: Callable[..., tuple[FloatArray, FloatArray]] = full_update,
+    ) -> None:
+        """Take the settings and what the form "full" calls, as `full_update`; nothing about the robot is needed."""
+        self._config, self._full_update = config, update
         self._q = config.process_deviation**2
         self._r = 2.0 * config.feature_noise**2
 
     def reset(self, jacobian: FloatArray) -> None:
         """Start from Ĵ₀, (m, n), m/rad, with the configured covariance."""
         m, n = jacobian.shape
+        size = n if self._config.form == "split" else m * n
         self._J = jacobian.copy()
-        self._P = np.eye(n if self._config.form == "split" else m * n) * self._config.initial_deviation**2
+        self._P = np.eye(size) * self._config.initial_deviation**2
+        self._Q, self._R = np.eye(size) * self._q, np.eye(m) * self._r
         self._updated = False
 
     def update(self, motion: Motion) -> None:
@@ -149,29 +160,23 @@ class KalmanEstimator(Estimator):
         Raises:
             FilterDiverged: the covariance is no longer positive definite.
         """
-        self._updated = math.sqrt(motion.joint_step.dot(motion.joint_step)) >= self._config.min_joint_step
+        dq, dy = motion.joint_step, motion.feature_step
+        self._updated = math.sqrt(dq.dot(dq)) >= self._config.min_joint_step
         if not self._updated:
             return
         if self._config.form == "split":
-            self._J, self._P = split_update(
-                self._J, self._P, motion.joint_step, motion.feature_step, q=self._q, r=self._r
-            )
+            self._J, self._P = split_update(self._J, self._P, dq, dy, q=self._q, r=self._r)
+            cholesky_of(self._P)
         else:
-            m, size = self._J.shape[0], self._J.size
-            H = measurement_matrix(motion.joint_step, m)
-            Q, R = np.eye(size) * self._q, np.eye(m) * self._r
-            x, self._P = kalman_update(self._J.ravel(), self._P, H, motion.feature_step, Q=Q, R=R)
-            self._J = x.reshape(self._J.shape)
-        cholesky_of(self._P)
-
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return the present estimate, (m, n), m/rad."""
-        return self._J.copy()
+            self._J, self._P = self._full_update(self._J, self._P, dq, dy, Q=self._Q, R=self._R)
 
     def covariance(self) -> FloatArray:
         """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
-        return full_covariance(self._J, self._P)
+        return np.asarray(np.kron(np.eye(self._J.size // len(self._P)), self._P), dtype=np.float64)
 
     def diagnostics(self) -> Diagnostics:
-        """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
-        return filter_diagnostics(self._P, updated=self._updated)
+        """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
+        return {
+            "estimator_updated": float(self._updated),
+            "jacobian_deviation": math.sqrt(self._P.trace() / len(self._P)),
+        }

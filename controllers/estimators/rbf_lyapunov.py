@@ -24,26 +24,6 @@ class RbfLyapunovConfig:
     """[1/m] n₃, weight of the prediction error."""
 
 
-def lyapunov_step(
-    theta: FloatArray, motion: Motion, jacobian: FloatArray, n2: float, n3: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the change of the weights over one motion, and the prediction error.
-
-    Args:
-        theta: θ(q), (n, L).
-        motion: what was observed.
-        jacobian: Ĵ(q), (m, n), m/rad.
-        n2: n₂.
-        n3: n₃.
-
-    Returns:
-        ΔW_i = Δq_i (n₃ s − n₂ e) θ_iᵀ, (n, m, L), and s = (Δy − ĴΔq) / duration, (m,), m/s.
-    """
-    s = (motion.feature_step - jacobian @ motion.joint_step) / motion.duration
-    pull = n3 * s - n2 * motion.error
-    return pull[:, None] * (motion.joint_step[:, None] * theta)[:, None, :], s
-
-
 @final
 class RbfLyapunovEstimator(Estimator):
     """Jacobian network whose update makes V = ½ n₂ eᵀe + ½ Σ‖W̃_i‖² decrease under u = K_p Ĵ⁺ e.
@@ -90,11 +70,10 @@ class RbfLyapunovEstimator(Estimator):
 
     def update(self, motion: Motion) -> None:
         """Learn from one motion."""
-        theta = self._features.at(motion.joint_position)
-        J = jacobian_output(self._weights, theta)
-        change, s = lyapunov_step(theta, motion, J, self._config.n2, self._config.n3)
-        self._weights = self._weights + change
-        self._rate_error = s
+        theta, dq = self._features.at(motion.joint_position), motion.joint_step
+        s = self._rate_error = (motion.feature_step - jacobian_output(self._weights, theta) @ dq) / motion.duration
+        pull = self._config.n3 * s - self._config.n2 * motion.error
+        self._weights = self._weights + pull[:, None] * (dq[:, None] * theta)[:, None, :]
 
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (n,), rad."""

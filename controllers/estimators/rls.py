@@ -96,10 +96,6 @@ class RlsEstimator(Estimator):
         self._P *= min(1.0, config.covariance_limit / self._mean_diagonal())
         cholesky_of(self._P)
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return the present estimate, (m, n), m/rad."""
-        return self._J.copy()
-
     def diagnostics(self) -> Diagnostics:
         """Return whether the last motion was used and the mean of P's diagonal, 1/rad²."""
         return {"estimator_updated": float(self._updated), "covariance_mean": self._mean_diagonal()}

@@ -15,15 +15,14 @@ multiples of the identity it even splits by rows: the form "split" gives the sam
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Literal, final
+from functools import cache
+from typing import Literal
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import cholesky_of, filter_diagnostics, full_covariance, split_update
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator, cholesky_of
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import NonNegative, Positive, settings
 
@@ -65,6 +64,7 @@ class SigmaWeights:
     covariance: FloatArray
 
 
+@cache
 def sigma_weights(size: int, alpha: float, beta: float, kappa: float) -> SigmaWeights:
     """Return van der Merwe's weights for a state of `size` entries; α = 1, β = 0 are Julier's."""
     spread = alpha**2 * (size + kappa)
@@ -121,55 +121,17 @@ def unscented_update(
     return J + K.dot(feature_step - z).reshape(J.shape), P
 
 
-@final
-class UkfEstimator(Estimator):
-    """x ← x + K (Δy − ẑ) with the gain of the unscented transform; motions below a minimum ‖Δq‖ are left out.
+def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> KalmanEstimator:
+    """Return the random-walk estimator whose gain is that of the unscented transform.
 
-    J changes only where the arm moves, so a motion that is left out adds no process noise either. The paper does not
-    say how P₀, Q and R are chosen, nor what happens at rest; R is kept honest here (2σ² of the feature's noise).
+    The paper does not say how P₀, Q and R are chosen, nor what happens at rest; R is kept honest here (2σ² of the
+    feature's noise), and motions below a minimum ‖Δq‖ are left out.
     """
 
-    def __init__(self, config: UkfConfig, knowledge: RobotKnowledge | None = None) -> None:
-        """Take the settings; nothing about the robot is needed."""
-        self._config = config
-        self._q = config.process_deviation**2
-        self._r = 2.0 * config.feature_noise**2
+    def update(J: FloatArray, *arguments: FloatArray, **noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+        weights = sigma_weights(J.size, config.alpha, config.beta, config.kappa)
+        return unscented_update(J, *arguments, **noise, weights=weights)
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Start from Ĵ₀, (m, n), m/rad, with the configured covariance."""
-        config, (m, n) = self._config, jacobian.shape
-        size = n if config.form == "split" else m * n
-        self._J = jacobian.copy()
-        self._P = np.eye(size) * config.initial_deviation**2
-        self._Q, self._R = np.eye(size) * self._q, np.eye(m) * self._r
-        self._weights = sigma_weights(size, config.alpha, config.beta, config.kappa)
-        self._updated = False
-
-    def update(self, motion: Motion) -> None:
-        """Correct by one motion.
-
-        Raises:
-            FilterDiverged: the covariance is no longer positive definite.
-        """
-        dq, dy = motion.joint_step, motion.feature_step
-        self._updated = math.sqrt(dq.dot(dq)) >= self._config.min_joint_step
-        if not self._updated:
-            return
-        if self._config.form == "split":
-            self._J, self._P = split_update(self._J, self._P, dq, dy, q=self._q, r=self._r)
-            cholesky_of(self._P)
-        else:
-            weights = self._weights
-            self._J, self._P = unscented_update(self._J, self._P, dq, dy, Q=self._Q, R=self._R, weights=weights)
-
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return the present estimate, (m, n), m/rad."""
-        return self._J.copy()
-
-    def covariance(self) -> FloatArray:
-        """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
-        return full_covariance(self._J, self._P)
-
-    def diagnostics(self) -> Diagnostics:
-        """Return whether the last motion was used and the mean deviation of an entry, m/rad."""
-        return filter_diagnostics(self._P, updated=self._updated)
+    walk = config.initial_deviation, config.process_deviation, config.feature_noise, config.min_joint_step
+    form: Literal["split", "full"] = "split" if config.form == "split" else "full"
+    return KalmanEstimator(KalmanConfig(*walk, form), knowledge, update)

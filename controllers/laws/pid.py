@@ -43,11 +43,6 @@ class PidConfig:
     """Add the reference's own velocity; needs a preview of at least 1."""
 
 
-def reference_velocity(reference: FloatArray, period: float) -> FloatArray:
-    """Return ẏ_ref = (y_ref(k+1) − y_ref(k)) / dt, (m,), m/s, from a reference (1 + preview, m) with preview ≥ 1."""
-    return np.asarray((reference[1] - reference[0]) / period)
-
-
 @final
 class PidLaw(Law):
     """u = Ĵ⁺ (K_p e + K_i I + K_d d [+ ẏ_ref]), limited as a whole so that the direction stays.
@@ -89,7 +84,7 @@ class PidLaw(Law):
         integral = self._integral + self._dt * e if observation.feature_valid else self._integral
         v = config.proportional_gain * e + config.integral_gain * integral + config.derivative_gain * self._derivative
         if config.feedforward:
-            v = v + reference_velocity(reference, self._dt)
+            v = v + (reference[1] - reference[0]) / self._dt
         wanted = damped_inverse(estimate.jacobian, config.damping) @ v
         u = scale_to_limit(wanted, self._limit)
         self._saturated = bool((np.abs(wanted) > self._limit).any())

@@ -10,7 +10,7 @@ that is still to come (`joint_response`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import final
 
 import numpy as np
@@ -39,38 +39,38 @@ class Prediction:
 
 
 @final
+@dataclass(eq=False)
 class Predictor:
-    """ŷ, q̂ and lead as above; each half can be switched off, and with both off they are what is measured."""
+    """ŷ, q̂ and lead as above; each half can be switched off, and with both off they are what is measured.
 
-    def __init__(
-        self,
-        joints: int,
-        *,
-        bridge: bool = True,
-        response_length: int = 12,
-        observe: bool = True,
-        feature_noise: float = 0.001,
-        find_noise: bool = True,
-        model_error: float = 0.2,
-    ) -> None:
-        """Start with an arm at rest; the keywords are those settings of `RbfnnBridgedConfig`."""
-        self._joints, self._bridge, self._response_length = joints, bridge, response_length
-        self._observe, self._feature_noise = observe, feature_noise
-        self._find_noise, self._model_error = find_noise, model_error
+    The keywords are those settings of `RbfnnBridgedConfig`.
+    """
+
+    joints: int
+    _: KW_ONLY
+    bridge: bool = True
+    response_length: int = 12
+    observe: bool = True
+    feature_noise: float = 0.001
+    find_noise: bool = True
+    model_error: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Start with an arm at rest."""
         self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
-        self._response = JointResponse(self._response_length, self._joints)
+        self._response = JointResponse(self.response_length, self.joints)
         self._filter: FeatureFilter | None = None
-        self._noise = NoiseLevel(self._feature_noise)
+        self._noise = NoiseLevel(self.feature_noise)
         self._filtered_delay = 0
         self._past: FloatArray | None = None  # q(k), q(k−1), …
 
     @property
     def lead(self) -> float:
         """The present lead [periods]."""
-        return self._response.lead if self._bridge else 0.0
+        return self._response.lead if self.bridge else 0.0
 
     def predict(self, estimate: Estimate, observation: Observation) -> Prediction:
         """Return the prediction of this period.
@@ -81,8 +81,8 @@ class Predictor:
         if not 0 <= estimate.delay <= MAX_DELAY:
             raise ValueError(f"delay must be from 0 to {MAX_DELAY} periods, got {estimate.delay}")
         J, past = estimate.jacobian, pushed(self._past, observation.joint_position, MAX_DELAY + 2)
-        self._past, delay, flight = past, 0, np.zeros(self._joints)
-        if self._bridge:
+        self._past, delay, flight = past, 0, np.zeros(self.joints)
+        if self.bridge:
             self._response.learn(past[0] - past[1])
             delay, flight = estimate.delay, self._response.flight()
         seen = self._seen(J, past, delay, observation)
@@ -95,10 +95,10 @@ class Predictor:
     def _seen(self, jacobian: FloatArray, past: FloatArray, delay: int, observation: Observation) -> FloatArray:
         """Return z, (m,), m: where the feature was at its exposure, `delay` periods ago."""
         y = observation.feature
-        if not self._observe:
+        if not self.observe:
             return y
         if self._filter is None or delay != self._filtered_delay:
-            self._filter = FeatureFilter(self._noise, self._model_error, y, find_noise=self._find_noise)
+            self._filter = FeatureFilter(self._noise, self.model_error, y, find_noise=self.find_noise)
             self._filtered_delay = delay
         else:
             step = past[delay] - past[delay + 1]

@@ -81,14 +81,8 @@ class RbfnnBridgedConfig:
 
     def gains(self, period: float) -> CorrectionGains:
         """Return what the base "jacobian" needs, for a control period [s]."""
-        return CorrectionGains(
-            self.k,
-            self.epsilon,
-            self.leak,
-            1.0 - math.exp(-self.gain * period),
-            1.0 - math.exp(-self.posture_gain * period),
-            self.damping,
-        )
+        error_share, posture_share = (1.0 - math.exp(-gain * period) for gain in (self.gain, self.posture_gain))
+        return CorrectionGains(self.k, self.epsilon, self.leak, error_share, posture_share, self.damping)
 
 
 @final

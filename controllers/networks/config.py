@@ -7,10 +7,10 @@ from typing import Annotated, Literal, TypeAlias
 from annotated_types import Ge, Len, Lt
 
 from servobench.controllers.networks.rbf import Kernel
-from servobench.controllers.networks.samples import Placement
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.settings import Count, NonNegative, Number, Periods, Positive, nested, settings
 
+Placement = Literal["halton", "sobol", "kmeans"]
 Grid: TypeAlias = Annotated[tuple[Positive, ...], Len(1)]
 Samples: TypeAlias = Annotated[int, Ge(10)]
 

@@ -31,9 +31,9 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features, jacobian_features
 from servobench.controllers.networks.samples import (
-    ControllerRegion,
     ControllerSamples,
     choose_centres,
+    controller_dimension,
     controller_samples,
     joint_samples,
     pool_size,
@@ -66,7 +66,7 @@ def train(
         ValueError: the region does not fit the plant, or the nominal Jacobian has another shape or is not finite.
     """
     digest = training_digest(config, nominal_jacobian, spec)
-    report = progress if progress is not None else _ignore_progress
+    report = progress or (lambda share, what: None)
     jacobian, jacobian_error = _train_jacobian(config, nominal_jacobian, spec, report)
     controller, controller_error = _train_controller(config, nominal_jacobian, spec, report)
     report(1.0, "done")
@@ -178,14 +178,12 @@ def _train_controller(
 ) -> tuple[ControllerNetwork, float]:
     """Return the controller network and its held-out error, the RMS over joints of ψ ξ − q_cmd, rad."""
     plan: ControllerTraining = config.controller
-    region = controller_region(config, spec)
+    dimension = controller_dimension(config, spec)
     rng = np.random.default_rng([config.seed, 2])
-    posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
-    gains = (plan.gain * spec.period, posture_gain * spec.period)
-    unit = unit_points(plan.samples, region.dimension, rng, plan.placement)
-    samples = controller_samples(unit, region, nominal_jacobian, *gains)
-    pool = unit_points(pool_size(plan.hidden, plan.placement), region.dimension, rng, plan.placement)
-    pool_xi = controller_samples(pool, region, nominal_jacobian, *gains).xi
+    unit = unit_points(plan.samples, dimension, rng, plan.placement)
+    samples = controller_samples(unit, config, spec, nominal_jacobian)
+    pool = unit_points(pool_size(plan.hidden, plan.placement), dimension, rng, plan.placement)
+    pool_xi = controller_samples(pool, config, spec, nominal_jacobian).xi
     centres = choose_centres(pool_xi, plan.hidden, rng, plan.placement)
     wanted = samples.command
     held = held_out_count(plan.samples, config.held_out)
@@ -233,14 +231,6 @@ def ideal_controller_matrix(gain: FloatArray, error_history: int, position_histo
     return psi
 
 
-def controller_region(config: TrainingConfig, spec: PlantSpec) -> ControllerRegion:
-    """Return from where the controller's samples come."""
-    plan = config.controller
-    lower, upper = config.region(spec.n)
-    step = spec.joint_velocity_limit * spec.period
-    return ControllerRegion(lower, upper, plan.error_range, step, plan.error_history, plan.position_history, spec.m)
-
-
 def ridge_path(features: FloatArray, targets: FloatArray, regularisations: tuple[float, ...]) -> Iterator[FloatArray]:
     """Yield the ridge solutions W = (FᵀF + λ μ I)⁻¹ Fᵀ Y for each λ, with μ the largest eigenvalue of FᵀF.
 
@@ -268,7 +258,3 @@ def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec)
     if not np.isfinite(J).all():
         raise ValueError("nominal_jacobian must be finite in the whole training region")
     return J
-
-
-def _ignore_progress(share: float, what: str) -> None:
-    """Do nothing with the progress."""

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from servobench.controllers.controller import JacobianFunction
+from servobench.controllers.networks.config import Placement, TrainingConfig
 from servobench.controllers.networks.rbf import information_vector
 from servobench.plant.checks import FloatArray
+from servobench.plant.signals import PlantSpec
 
-Placement = Literal["halton", "sobol", "kmeans"]
 CLUSTERING_POOL = 20  # samples a centre when centres come from k-means
 
 
@@ -78,37 +78,14 @@ class ControllerSamples:
         return np.asarray(self.position + (self.gain @ self.error[..., None])[..., 0] + self.posture_step)
 
 
-@dataclass(frozen=True, eq=False)
-class ControllerRegion:
-    """From where the controller's samples come.
-
-    Attributes:
-        lower: (n,), rad.
-        upper: (n,), rad.
-        error_range: largest error an axis, m.
-        step_range: (n,), rad, largest joint step between two entries of the history.
-        error_history: L_e.
-        position_history: L_c.
-        m: number of features.
-    """
-
-    lower: FloatArray
-    upper: FloatArray
-    error_range: float
-    step_range: FloatArray
-    error_history: int
-    position_history: int
-    m: int
-
-    @property
-    def dimension(self) -> int:
-        """Unit-cube coordinates that one sample takes."""
-        steps = max(self.error_history, self.position_history) - 1
-        return self.lower.size * (1 + steps) + self.m + 1
+def controller_dimension(config: TrainingConfig, spec: PlantSpec) -> int:
+    """Return how many coordinates of the unit cube one sample of the controller takes."""
+    plan = config.controller
+    return spec.n * max(plan.error_history, plan.position_history) + spec.m + 1
 
 
 def controller_samples(
-    unit: FloatArray, region: ControllerRegion, jacobian: JacobianFunction, proportional: float, posture: float
+    unit: FloatArray, config: TrainingConfig, spec: PlantSpec, jacobian: JacobianFunction
 ) -> ControllerSamples:
     """Return samples of ξ that a servo with its target at rest could see, and the ideal controller's parts at them.
 
@@ -117,22 +94,23 @@ def controller_samples(
     q(k−2) = q(k−1) − Δq, e(k−1) = e(k) + J Δq.
 
     Args:
-        unit: (S, region.dimension), points of the unit cube.
-        region: from where the samples come.
+        unit: (S, controller_dimension), points of the unit cube.
+        config: the region, the gains and from where the errors and histories come.
+        spec: sizes, speed limit and control period.
         jacobian: of the nominal model, vectorised.
-        proportional: K_p dt, the share of the error that one period should remove.
-        posture: K_n dt, the share of the distance from the region's middle that one period should remove.
     """
-    n, m = region.lower.size, region.m
-    q = joint_samples(unit[:, :n], region.lower, region.upper)
+    plan, (lower, upper), (n, m) = config.controller, config.region(spec.n), (spec.n, spec.m)
+    q = joint_samples(unit[:, :n], lower, upper)
     direction, magnitude = 2.0 * unit[:, n : n + m] - 1.0, unit[:, n + m : n + m + 1]
-    error = region.error_range * magnitude * direction
-    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * region.step_range
+    error = plan.error_range * magnitude * direction
+    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (spec.joint_velocity_limit * spec.period)
     back = np.concatenate([np.zeros((len(unit), 1, n)), np.cumsum(steps, axis=1)], axis=1)
     J = jacobian(q)
-    errors = error[:, None, :] + back[:, : region.error_history] @ np.swapaxes(J, -1, -2)
-    positions = q[:, None, :] - back[:, : region.position_history]
+    errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
+    positions = q[:, None, :] - back[:, : plan.position_history]
     pinv = np.asarray(np.linalg.pinv(J), dtype=np.float64)
-    away = (region.lower + region.upper)[None, :] / 2.0 - q
+    away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
+    posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
+    proportional, posture = plan.gain * spec.period, posture_gain * spec.period
     return ControllerSamples(information_vector(errors, positions), error, q, proportional * pinv, posture * free)

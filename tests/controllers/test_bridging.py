@@ -196,7 +196,7 @@ def test_the_second_joint_takes_over_where_the_first_is_at_its_limit():
     np.testing.assert_array_equal(redistribute(small, np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9), small)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(n=st.integers(1, 7), m=st.integers(1, 4), seed=st.integers(0, 10**6))
 def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, seed):
     rng = np.random.default_rng(seed)

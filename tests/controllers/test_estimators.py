@@ -9,7 +9,7 @@ from kit.toy import motion, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator, projection_update
 from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
-from servobench.controllers.estimators.constant import ConstantEstimator
+from servobench.controllers.estimators.fixed import ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     KalmanEstimator,
@@ -18,8 +18,7 @@ from servobench.controllers.estimators.kalman import (
     split_update,
 )
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
-from servobench.controllers.estimators.true import TrueConfig, TrueEstimator
-from servobench.controllers.estimators.ukf import UkfConfig, UkfEstimator, sigma_weights, unscented_update
+from servobench.controllers.estimators.ukf import UkfConfig, sigma_weights, ukf_estimator, unscented_update
 from servobench.plant.faults import FilterDiverged
 
 LEARNING = [
@@ -27,12 +26,8 @@ LEARNING = [
     RlsEstimator(RlsConfig()),
     CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-6, reset=False)),
     KalmanEstimator(KalmanConfig()),
-    UkfEstimator(UkfConfig()),
+    ukf_estimator(UkfConfig()),
 ]
-
-
-def named(estimator):
-    return type(estimator).__name__
 
 
 def random_motions(n, m, count, seed=3):
@@ -45,7 +40,7 @@ def random_motions(n, m, count, seed=3):
         yield dq, J @ dq + rng.normal(scale=0.0014, size=m)
 
 
-@pytest.mark.parametrize("estimator", LEARNING, ids=named)
+@pytest.mark.parametrize("estimator", LEARNING)
 def test_a_constant_jacobian_is_found_when_all_joints_move(estimator):
     rng = np.random.default_rng(0)
     J = rng.normal(size=(3, 6))
@@ -56,7 +51,7 @@ def test_a_constant_jacobian_is_found_when_all_joints_move(estimator):
     np.testing.assert_allclose(estimator.jacobian(dq), J, atol=0.01 if hasattr(estimator, "covariance") else 1e-3)
 
 
-@pytest.mark.parametrize("estimator", LEARNING, ids=named)
+@pytest.mark.parametrize("estimator", LEARNING)
 def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
     estimator.reset(np.ones((3, 6)))
     before = estimator.diagnostics()
@@ -75,7 +70,7 @@ def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
         # P = 1/4, r = 2 · 1/8 = 1/4, Δq = (1, 0): S = 1/2, K = (1/2, 0), innovation 0.4 − 0.2 = 0.2
         (KalmanEstimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
         (KalmanEstimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
-        (UkfEstimator(UkfConfig(0.5, 0.0, np.sqrt(0.125))), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
+        (ukf_estimator(UkfConfig(0.5, 0.0, np.sqrt(0.125))), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
     ],
 )
 def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq, expected):
@@ -115,8 +110,8 @@ def test_the_split_forms_equal_the_full_ones(n, m):
     estimators = [
         KalmanEstimator(KalmanConfig(form="full")),
         KalmanEstimator(KalmanConfig(form="split")),
-        UkfEstimator(UkfConfig(form="sigma_points")),
-        UkfEstimator(UkfConfig(form="split")),
+        ukf_estimator(UkfConfig(form="sigma_points")),
+        ukf_estimator(UkfConfig(form="split")),
     ]
     for estimator in estimators:
         estimator.reset(np.full((m, n), 0.1))

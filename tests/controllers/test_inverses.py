@@ -41,7 +41,7 @@ def test_the_damped_inverse_is_the_ridge_solution_at_any_size_of_the_jacobian(si
     np.testing.assert_allclose(damped_inverse(J, 0.02) @ e, wanted, rtol=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(seed=st.integers(0, 10**6), exponent=st.floats(-4.0, 8.0), damping=st.floats(1e-3, 1.0))
 def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
     J = 10.0**exponent * np.random.default_rng(seed).normal(size=(3, 6))

@@ -49,7 +49,7 @@ def test_one_update_by_hand_and_every_candidate_on_its_own():
     np.testing.assert_allclose(s, [17.0, 1.0])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10**6))
 def test_the_nearest_rotation_is_that_of_wahbas_problem(seed):
     M = np.random.default_rng(seed).normal(size=(3, 3))

@@ -17,14 +17,11 @@ def fresh(n, m, limit=1e6, preview=1, **settings):
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4), lam=st.floats(1e-3, 10.0))
 def test_the_step_minimises_error_plus_weighted_motion(seed, n, m, lam):
-    """Rounding errors ε‖S‖ of S = λI + JJᵀ change the step by up to ε‖S‖ ‖JᵀS⁻¹‖ ‖S⁻¹e‖ ≤ ε‖S‖ ‖e‖ / (2 λ√λ)."""
     rng = np.random.default_rng(seed)
     J, e = rng.normal(size=(m, n)), rng.normal(size=m)
     stacked = np.vstack([J, np.sqrt(lam) * np.eye(n)])
     expected = np.linalg.lstsq(stacked, np.concatenate([e, np.zeros(n)]), rcond=None)[0]
-    S = lam * np.eye(m) + J @ J.T
-    rounding = 10 * np.finfo(float).eps * np.linalg.norm(S) * np.linalg.norm(e) / lam**1.5
-    np.testing.assert_allclose(mfac_step(J, e, 1.0, lam), expected, rtol=0, atol=rounding)
+    np.testing.assert_allclose(mfac_step(J, e, 1.0, lam), expected, atol=1e-10)
 
 
 def test_the_short_form_equals_the_printed_one():

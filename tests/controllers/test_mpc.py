@@ -287,7 +287,7 @@ def test_reset_forgets_everything_bit_for_bit(solver):
         np.testing.assert_array_equal(law.command(*arguments), fresh.command(*arguments))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     n=st.integers(2, 8), m=st.integers(1, 4), mode=st.sampled_from(["moves", "constant"]), seed=st.integers(0, 2**32)
 )

@@ -95,7 +95,7 @@ def test_the_information_vector_holds_the_errors_first_and_the_newest_of_each_fi
     np.testing.assert_array_equal(xi, [1, 2, 3, 4, 5, 6, 7])
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50, derandomize=True)
 @given(n=st.integers(2, 8), m=st.integers(1, 4), scale=st.floats(1e-6, 1e9))
 def test_features_lie_between_zero_and_one_at_any_distance(n, m, scale):
     network, controller = jacobian_network(n, m), controller_network(n, m)

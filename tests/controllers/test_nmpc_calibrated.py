@@ -141,21 +141,3 @@ def test_knowledge_that_does_not_suffice_is_named():
         NmpcCalibrated(config, knowledge(symbolic=None))
     with pytest.raises(ValueError, match=r"true_symbolic must give an expression of shape \(3, 1\), got \(6, 1\)"):
         NmpcCalibrated(config, knowledge(symbolic=lambda q: q))
-
-
-@pytest.mark.parametrize(
-    ("observation", "reference", "message"),
-    [
-        (Observation(0.0, np.zeros(5), np.zeros(3)), hold(np.zeros(3)), "observation.joint_position must have shape"),
-        (Observation(0.0, START, np.zeros(2)), hold(np.zeros(3)), "observation.feature must have shape"),
-        (
-            Observation(0.0, START, np.zeros(3)),
-            hold(np.zeros(3), 3),
-            r"reference must have shape \(13, 3\), got \(4, 3\)",
-        ),
-        (Observation(0.0, START, np.zeros(3)), hold([0.0, np.nan, 0.0]), "reference must be finite"),
-    ],
-)
-def test_a_step_with_the_wrong_size_is_refused(observation, reference, message):
-    with pytest.raises(ValueError, match=message):
-        make().step(observation, reference)

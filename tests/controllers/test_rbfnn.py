@@ -222,7 +222,7 @@ def test_saturation_and_weight_norms_are_told():
     assert set(told) >= {"criterion", "step_size", "predicted_error", "learned_weight_norm"}
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40, derandomize=True)
 @given(
     n=st.integers(2, 8),
     m=st.integers(1, 4),

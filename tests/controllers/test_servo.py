@@ -6,8 +6,8 @@ import pytest
 from kit.toy import plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.estimators.estimator import Estimator
+from servobench.controllers.estimators.fixed import ConstantEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
@@ -109,19 +109,6 @@ def test_an_estimate_that_is_not_finite_is_a_named_fault():
     estimator.J = np.full((2, 3), np.nan)
     with pytest.raises(ControllerDiverged, match="jacobian is not finite at 0 s"):
         controller.step(first, np.zeros((2, 2)))
-
-
-def test_observations_and_references_of_the_wrong_size_are_refused():
-    controller, first = servo(ConstantEstimator()), seen(np.zeros(3), np.zeros(2))
-    controller.reset(first, 0)
-    with pytest.raises(ValueError, match=r"observation.joint_position must have shape \(3,\)"):
-        controller.step(seen(np.zeros(2), np.zeros(2)), np.zeros((2, 2)))
-    with pytest.raises(ValueError, match=r"observation.feature must have shape \(2,\)"):
-        controller.reset(seen(np.zeros(3), np.zeros(3)), 0)
-    with pytest.raises(ValueError, match=r"reference must have shape \(2, 2\) for a preview of 1"):
-        controller.step(first, np.zeros((1, 2)))
-    with pytest.raises(ValueError, match="reference must be finite"):
-        controller.step(first, np.full((2, 2), np.nan))
 
 
 def test_a_predictor_stands_before_the_law_and_gets_the_command():

@@ -11,7 +11,6 @@ from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import FORMAT, TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.fit import (
-    controller_region,
     ideal_controller_matrix,
     obtain_networks,
     ridge_path,
@@ -20,7 +19,13 @@ from servobench.controllers.networks.fit import (
     training_digest,
 )
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, jacobian_features, jacobian_output
-from servobench.controllers.networks.samples import choose_centres, controller_samples, pool_size, unit_points
+from servobench.controllers.networks.samples import (
+    choose_centres,
+    controller_dimension,
+    controller_samples,
+    pool_size,
+    unit_points,
+)
 
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac_plus", "rbf_pid")]
 N, M = 3, 2
@@ -56,10 +61,8 @@ def test_the_jacobian_network_is_as_good_on_fresh_joint_positions_as_it_says(net
 
 
 def test_the_controller_network_is_as_good_on_fresh_samples_as_it_says(networks):
-    region = controller_region(CONFIG, SPEC)
-    unit = np.random.default_rng(8).uniform(size=(500, region.dimension))
-    plan = CONFIG.controller
-    samples = controller_samples(unit, region, planar_jacobian, plan.gain * PERIOD, plan.posture_gain * PERIOD)
+    unit = np.random.default_rng(8).uniform(size=(500, controller_dimension(CONFIG, SPEC)))
+    samples = controller_samples(unit, CONFIG, SPEC, planar_jacobian)
     error = np.sqrt(np.mean((networks.controller.command(samples.xi) - samples.command) ** 2))
     assert 0.5 * networks.controller_error < error < 2.0 * networks.controller_error
     assert error < 0.25 * np.sqrt(np.mean((samples.command - samples.position) ** 2))
@@ -82,9 +85,9 @@ def test_the_jacobian_network_does_not_depend_on_the_controller_s_settings(netwo
 
 def test_samples_of_the_controller_follow_from_the_model():
     plan = dataclasses.replace(CONTROLLER, error_history=2, position_history=2)
-    region = controller_region(dataclasses.replace(CONFIG, controller=plan), SPEC)
-    unit = unit_points(50, region.dimension, np.random.default_rng(0))
-    samples = controller_samples(unit, region, planar_jacobian, 0.15, 0.025)
+    config = dataclasses.replace(CONFIG, controller=plan)
+    unit = unit_points(50, controller_dimension(config, SPEC), np.random.default_rng(0))
+    samples = controller_samples(unit, config, SPEC, planar_jacobian)
     e, e_old, q, q_old = np.split(samples.xi, [M, 2 * M, 2 * M + N], axis=1)
     J = planar_jacobian(q)
     np.testing.assert_array_equal(e, samples.error)

@@ -104,10 +104,6 @@ class MpcLaw(Law):
     def __init__(self, config: MpcConfig, knowledge: RobotKnowledge) -> None:
         """Build the quadratic program.
 
-        Args:
-            config: settings.
-            knowledge: sizes, limits, period and preview.
-
         Raises:
             ValueError: the preview does not reach the horizon, or a setting does not fit the sizes.
         """

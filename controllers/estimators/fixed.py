@@ -1,4 +1,4 @@
-"""The estimator that uses the true Jacobian: the upper bound of every comparison, not a competitor."""
+"""The estimators that learn nothing, the bounds of every comparison: the first Jacobian, and the true one."""
 
 from __future__ import annotations
 
@@ -6,10 +6,30 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import settings
+
+
+@settings
+class ConstantConfig:
+    """The constant estimator has no settings; its Ĵ₀ is set under `initial`."""
+
+
+@final
+class ConstantEstimator(Estimator):
+    """Ĵ(k) = Ĵ₀ for ever."""
+
+    def __init__(self, config: ConstantConfig | None = None, knowledge: RobotKnowledge | None = None) -> None:
+        """Take nothing: there are no settings, and nothing about the robot is needed."""
+
+    def reset(self, jacobian: FloatArray) -> None:
+        """Keep Ĵ₀, (m, n), m/rad."""
+        self._J = jacobian.copy()
+
+    def update(self, motion: Motion) -> None:
+        """Learn nothing."""
 
 
 @settings
@@ -40,7 +60,3 @@ class TrueEstimator(Estimator):
     def jacobian(self, joint_position: FloatArray) -> FloatArray:
         """Return J(q), (m, n), m/rad."""
         return np.array(self._true_jacobian(joint_position), dtype=np.float64)
-
-    def diagnostics(self) -> Diagnostics:
-        """Return nothing: nothing is estimated."""
-        return {}
