@@ -43,10 +43,10 @@ def check_number(
     name: str,
     value: float,
     *,
-    above: float | None = None,
-    at_least: float | None = None,
-    at_most: float | None = None,
-    below: float | None = None,
+    above: float = -math.inf,
+    at_least: float = -math.inf,
+    at_most: float = math.inf,
+    below: float = math.inf,
 ) -> None:
     """Check a configured number against its bounds.
 
@@ -61,18 +61,9 @@ def check_number(
     Raises:
         ValueError: not finite, or out of bounds; names the argument, what was wanted and what came.
     """
-    wanted = []
-    good = bool(np.isfinite(value))
-    for word, bound, holds in (
-        ("above", above, above is None or value > above),
-        ("at least", at_least, at_least is None or value >= at_least),
-        ("at most", at_most, at_most is None or value <= at_most),
-        ("below", below, below is None or value < below),
-    ):
-        if bound is not None:
-            wanted.append(f"{word} {bound:g}")
-            good = good and holds
-    if not good:
+    if not (math.isfinite(value) and above < value < below and at_least <= value <= at_most):
+        bounds = {"above": above, "at least": at_least, "at most": at_most, "below": below}
+        wanted = [f"{word} {bound:g}" for word, bound in bounds.items() if math.isfinite(bound)]
         raise ValueError(f"{name} must be {' and '.join(wanted) or 'finite'}, got {value}")
 
 

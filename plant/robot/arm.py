@@ -128,10 +128,6 @@ class SerialArm:
         poses[self.n] = pose
         return poses if theta.ndim == 1 else np.moveaxis(poses, 0, -3)
 
-    def flange_pose(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return X_BE, the flange in the base frame, (..., 4, 4), for joint positions (..., n) in rad."""
-        return self.frames(joint_position)[..., -1, :, :]
-
     def ball_position(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the ball centre in the base frame, (..., 3) m, for joint positions (..., n) in rad."""
         return self._ball(self.frames(joint_position))

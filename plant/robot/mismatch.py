@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, fields, replace
+from math import radians
 from pathlib import Path
 from typing import Self
 
@@ -31,8 +32,8 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, ur5_arm_from_calibration
 from servobench.plant.seeds import named_generator
 
-MAX_TILT = math.radians(45.0)
-MAX_MOVE_TILT = math.radians(30.0)
+MAX_TILT = radians(45.0)
+MAX_MOVE_TILT = radians(30.0)
 
 ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
 LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -48,18 +49,8 @@ AXES = {
 PROFILES: dict[str, dict[str, float]] = {
     "none": {},
     "factory": {},
-    "moderate": {
-        "links": 0.05,
-        "joint_offsets": math.radians(3.0),
-        "camera_rotation": math.radians(15.0),
-        "tool": 0.020,
-    },
-    "severe": {
-        "links": 0.10,
-        "joint_offsets": math.radians(6.0),
-        "camera_rotation": math.radians(45.0),
-        "tool": 0.040,
-    },
+    "moderate": {"links": 0.05, "joint_offsets": radians(3.0), "camera_rotation": radians(15.0), "tool": 0.02},
+    "severe": {"links": 0.1, "joint_offsets": radians(6.0), "camera_rotation": radians(45.0), "tool": 0.04},
 }
 
 
@@ -170,11 +161,8 @@ class Mismatch:
 
     def size(self, axis: str) -> float:
         """Return the magnitude of an axis in SI units [rad, m or 1]; 0 where it is not given."""
-        size = PROFILES.get(self.profile, {}).get(axis, 0.0)
-        for name, magnitude in self.axes:
-            if name == axis:
-                size = magnitude.size(axis)
-        return size
+        given = dict(self.axes)
+        return given[axis].size(axis) if axis in given else PROFILES.get(self.profile, {}).get(axis, 0.0)
 
     @property
     def camera_exact(self) -> bool:

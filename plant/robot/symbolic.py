@@ -8,7 +8,7 @@ numbers and a function (or generated C code) whose geometry is a parameter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import casadi
@@ -41,19 +41,6 @@ class HandEyeGeometry:
     p_BC: SX
 
 
-def geometry_symbols(n: int) -> HandEyeGeometry:
-    """Return a geometry of `n` joints in which every number is a symbol.
-
-    Raises:
-        ValueError: n below 1.
-    """
-    if n < 1:
-        raise ValueError(f"n must be at least 1, got {n}")
-    shapes = ((n + 1, 3), (n + 1, 3), (n, 1), (n, 1), (3, 1), (3, 3), (3, 1))
-    names = [field.name for field in fields(HandEyeGeometry)]
-    return HandEyeGeometry(*(casadi.SX.sym(name, *shape) for name, shape in zip(names, shapes, strict=True)))
-
-
 def geometry_of(model: HandEyeModel) -> HandEyeGeometry:
     """Return the geometry of `model` as constants."""
     arm = model.arm
@@ -84,21 +71,6 @@ def feature_and_jacobian(joint_position: SX, geometry: HandEyeGeometry) -> tuple
     ball = position + rotation @ geometry.tool
     columns = [geometry.gear_ratio[i] * casadi.cross(axes[i], ball - origins[i]) for i in range(n)]
     return geometry.R_BC.T @ (ball - geometry.p_BC), geometry.R_BC.T @ casadi.horzcat(*columns)
-
-
-def parametric_model(n: int) -> casadi.Function:
-    """Return (q, translation, rpy, joint_offset, gear_ratio, tool, R_BC, p_BC) -> (feature, jacobian) for n joints."""
-    q, geometry = casadi.SX.sym("joint_position", n), geometry_symbols(n)
-    names = ["joint_position", *(field.name for field in fields(geometry))]
-    inputs = [q, *(getattr(geometry, name) for name in names[1:])]
-    return casadi.Function("hand_eye", inputs, list(feature_and_jacobian(q, geometry)), names, ["feature", "jacobian"])
-
-
-def symbolic_model(model: HandEyeModel) -> casadi.Function:
-    """Return q -> (feature, jacobian), (n,) rad -> (3,) m and (3, n) m/rad, with the numbers of `model` bound."""
-    q = casadi.SX.sym("joint_position", model.arm.n)
-    outputs = list(feature_and_jacobian(q, geometry_of(model)))
-    return casadi.Function("hand_eye", [q], outputs, ["joint_position"], ["feature", "jacobian"])
 
 
 def symbolic_feature(model: HandEyeModel) -> casadi.Function:

@@ -43,8 +43,6 @@ INERTIA = (
     (0.0000806, 0.000132),
 )
 MAX_TORQUE = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)  # Nm
-MAX_JOINT_SPEED = np.pi  # rad/s, the vendor's limit
-JOINT_RANGE = 2 * np.pi  # rad, each way
 
 # Appearance only: tube radii, and the offset of a link's tube from its joints along the joint's axis.
 TUBE_RADIUS = (0.062, 0.056, 0.047, 0.04, 0.04, 0.038)  # m

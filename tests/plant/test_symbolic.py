@@ -5,13 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.symbolic import (
-    geometry_of,
-    geometry_symbols,
-    parametric_model,
-    symbolic_feature,
-    symbolic_model,
-)
+from servobench.plant.robot.symbolic import feature_and_jacobian, geometry_of, symbolic_feature
 from servobench.plant.robot.ur5 import nominal_ur5, ur5_arm_from_calibration
 
 
@@ -38,37 +32,12 @@ def models():
 
 
 @pytest.mark.parametrize("model", models())
-def test_symbolic_feature_and_jacobian_equal_the_numpy_ones(model):
-    function = symbolic_model(model)
-    q = np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, model.arm.n))
-    for pose, feature, jacobian in zip(q, model.feature(q), model.jacobian(q), strict=True):
-        symbolic_feature, symbolic_jacobian = function(pose)
-        np.testing.assert_allclose(np.asarray(symbolic_feature)[:, 0], feature, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(np.asarray(symbolic_jacobian), jacobian, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("model", models())
-def test_symbolic_jacobian_equals_automatic_differentiation(model):
+def test_the_symbolic_feature_and_its_jacobians_equal_the_numpy_ones(model):
     q = casadi.SX.sym("q", model.arm.n)
-    _, jacobian = symbolic_model(model)(q)
-    feature = symbolic_feature(model)(q)
-    difference = casadi.Function("difference", [q], [casadi.jacobian(feature, q) - jacobian])
-    for pose in np.random.default_rng(2).uniform(-np.pi, np.pi, (20, model.arm.n)):
-        np.testing.assert_allclose(np.asarray(difference(pose)), 0.0, atol=1e-12)
-
-
-def test_parametric_model_with_numbers_equals_the_bound_one():
-    function = parametric_model(6)
-    for seed in range(3):
-        model = random_model(seed)
-        geometry = geometry_of(model)
-        numbers = [casadi.DM(getattr(geometry, name)) for name in function.name_in()[1:]]
-        q = np.random.default_rng(seed).uniform(-np.pi, np.pi, 6)
-        feature, jacobian = function(q, *numbers)
-        np.testing.assert_allclose(np.asarray(feature)[:, 0], model.feature(q), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(np.asarray(jacobian), model.jacobian(q), rtol=0, atol=1e-12)
-
-
-def test_a_geometry_without_joints_is_refused():
-    with pytest.raises(ValueError, match="n must be at least 1, got 0"):
-        geometry_symbols(0)
+    feature, jacobian = feature_and_jacobian(q, geometry_of(model))
+    automatic = casadi.jacobian(symbolic_feature(model)(q), q)
+    function = casadi.Function("all", [q], [feature, jacobian, automatic])
+    for pose in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (50, model.arm.n)):
+        y, J, derived = (np.asarray(value) for value in function(pose))
+        np.testing.assert_allclose(y[:, 0], model.feature(pose), rtol=0, atol=1e-12)
+        np.testing.assert_allclose([J, derived], [model.jacobian(pose)] * 2, rtol=0, atol=1e-12)
