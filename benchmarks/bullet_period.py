@@ -14,8 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, build_bullet
-from servobench.plant.bullet.scene import Scene, view_of
-from servobench.plant.bullet.urdf import ur5_body
+from servobench.plant.bullet.scene import Scene
 from servobench.plant.checks import whole_steps
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot import ur5
@@ -36,8 +35,8 @@ def measure(config: BulletConfig, period: float, repeats: int) -> tuple[np.ndarr
     """Return the times, ms, (repeats,) of whole periods and of bare ones."""
     model = nominal_ur5()
     plant = build_bullet(config, PlantSetup(model, HOME, period))
-    scene = Scene(model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=False)
-    view = view_of(config.camera(), model.X_BC)
+    scene = Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=False)
+    camera = config.camera()
     plant.reset(0)
     scene.place(HOME)
     steps = whole_steps(period, PHYSICS_STEP)
@@ -46,7 +45,7 @@ def measure(config: BulletConfig, period: float, repeats: int) -> tuple[np.ndarr
         speed = 0.2 * np.sin(0.3 * k) * np.ones(6)
         targets = [speed.tolist()] * steps
         command = Command(speed)
-        bare[k] = milliseconds(lambda targets=targets: (scene.advance(targets), scene.render(view)))
+        bare[k] = milliseconds(lambda targets=targets: (scene.advance(targets), scene.render(camera, model.X_BC)))
         whole[k] = milliseconds(lambda command=command: plant.step(command))
     plant.close()
     scene.close()

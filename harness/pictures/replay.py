@@ -20,7 +20,6 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
 from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
-from servobench.plant.bullet.urdf import ur5_body
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import PinholeCamera
@@ -29,7 +28,7 @@ from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.seeds import named_seed
 
 if TYPE_CHECKING:
-    from servobench.plant.bullet.scene import Scene, View
+    from servobench.plant.bullet.scene import Scene
 
 EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame: from the front right, down to the workspace
 OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
@@ -129,16 +128,16 @@ class Replay:
             run: what to show.
             fineness: pixels rendered for one of the overview, along each side; above 1 edges become smooth.
         """
-        from servobench.plant.bullet.scene import Scene, view_of  # noqa: PLC0415 - PyBullet prints a banner when it is imported
+        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet prints a banner when it is imported
 
         self._run, self._fineness = run, fineness
-        self._scene: Scene = Scene(run.model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=True, window=False)
+        self._scene: Scene = Scene(run.model.arm, physics_step=PHYSICS_STEP, scenery=True, window=False)
         self._camera = run.config.camera()
-        self._views: list[View] = [view_of(self._camera, model.X_BC) for model in (run.model, run.moved) if model]
-        self._view = self._views[0]
+        self._poses = [model.X_BC for model in (run.model, run.moved) if model]
+        self._pose = self._poses[0]
         self._overview_pose = _look_at(np.array(EYE), np.array(TARGET))
-        fine = replace(OVERVIEW, width=round(fineness * OVERVIEW.width), height=round(fineness * OVERVIEW.height))
-        self._overview: View = view_of(fine, self._overview_pose)
+        width, height = round(fineness * OVERVIEW.width), round(fineness * OVERVIEW.height)
+        self._overview = replace(OVERVIEW, width=width, height=height)
 
     def __enter__(self) -> Self:
         """Return the replay."""
@@ -150,20 +149,20 @@ class Replay:
 
     def place(self, k: int) -> None:
         """Put arm and camera where they were in period `k`."""
-        self._view = self._views[k >= self._run.moved_from]
+        self._pose = self._poses[k >= self._run.moved_from]
         self._scene.place(self._run.model.arm.joint_angle(self._run.joint_position[k]))
 
     def camera_view(self) -> ByteArray:
         """Return what the run's camera sees, (h, w, 3), the detected ball marked."""
-        rgba, buffer = self._scene.render(self._view)
+        rgba, buffer = self._scene.render(self._camera, self._pose)
         found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
         return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
 
     def overview(self, trails: list[Trail]) -> ByteArray:
         """Return the arm from aside, (480, 640, 3) times the fineness, with trails; what is hidden is pale."""
-        rgba, buffer = self._scene.render(self._overview)
+        rgba, buffer = self._scene.render(self._overview, self._overview_pose)
         picture = np.ascontiguousarray(rgba[..., :3])
-        depth = self._overview.camera.metric_depth(buffer)
+        depth = self._overview.metric_depth(buffer)
         for trail in trails:
             self._draw(picture, depth, trail)
         return picture
@@ -171,7 +170,7 @@ class Replay:
     def _draw(self, picture: ByteArray, depth: FloatArray, trail: Trail) -> None:
         if len(trail.points) < 2 or not np.isfinite(trail.points).all():
             return
-        camera, X = self._overview.camera, self._overview_pose
+        camera, X = self._overview, self._overview_pose
         p_C = (trail.points - X[:3, 3]) @ X[:3, :3]
         if (p_C[:, 2] < camera.near).any():
             return

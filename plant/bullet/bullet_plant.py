@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from servobench.plant.bench import Bench, SensingConfig, World
-from servobench.plant.bullet.detection import ByteArray, Detection, draw_detection, find_ball
-from servobench.plant.bullet.urdf import ur5_body
+from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.faults import PlantDiverged
 from servobench.plant.plant import PlantEntry, PlantSetup
@@ -90,21 +89,6 @@ class BulletConfig:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What the camera sees at an instant.
-
-    Attributes:
-        rgb: (h, w, 3).
-        depth: (h, w), m, without noise.
-        detection: the ball as found in the noise-free image, or None.
-    """
-
-    rgb: ByteArray
-    depth: FloatArray
-    detection: Detection | None
-
-
 def velocity_targets(
     v: FloatArray, u: FloatArray, decay: float, steps: int, room: tuple[FloatArray, FloatArray]
 ) -> FloatArray:
@@ -159,7 +143,7 @@ class BulletWorld(World):
             ValueError: a start of the wrong size, a period that physics steps do not divide, an arm that is not like a
                 UR5, a gear ratio of 0, or a window without a display.
         """
-        from servobench.plant.bullet.scene import Scene, view_of  # noqa: PLC0415 - PyBullet prints a banner when it is imported
+        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet prints a banner when it is imported
 
         model, start = setup.robot()
         self._config, self._model = config, model
@@ -170,11 +154,8 @@ class BulletWorld(World):
             raise ValueError(f"gear_ratio must not be zero, got {model.arm.gear_ratio.tolist()}")
         self._decay = math.exp(-PHYSICS_STEP / config.lag) if config.lag > 0.0 else 0.0
         self._camera, self._depth_noise = config.camera(), config.noise()
-        self._X_BC, self._view_of = model.X_BC, view_of
-        self.move_camera(model.X_BC)
-        self._scene: Scene = Scene(
-            model.arm, ur5_body(), physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view
-        )
+        self._X_BC = model.X_BC
+        self._scene: Scene = Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view)
 
     @property
     def spec(self) -> PlantSpec:
@@ -208,7 +189,7 @@ class BulletWorld(World):
 
     def see(self) -> FloatArray | None:
         """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
-        found = find_ball(*self._scene.render(self._view), self._camera, ur5.BALL_RADIUS, self._sense)
+        found = find_ball(*self._render(), self._camera, ur5.BALL_RADIUS, self._sense)
         if found is None:
             return None
         found.centre.setflags(write=False)
@@ -238,23 +219,17 @@ class BulletWorld(World):
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
         self._model = replace(self._model, X_BC=X_BC)
-        self._view = self._view_of(self._camera, X_BC)
 
     def truth(self) -> Truth:
         """Return the feature by the simulator's own ball, and the Jacobian of the true model at the present joints."""
         feature = self._model.to_camera(self._scene.ball_position())
         return Truth(feature, self._model.jacobian(self._joint_position()))
 
-    def frame(self) -> Frame:
-        """Return what the camera sees now, without noise; the run and its random streams stay as they are."""
-        rgba, buffer = self._scene.render(self._view)
-        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
-        return Frame(rgba[..., :3].copy(), self._camera.metric_depth(buffer), found)
-
     def picture(self) -> ByteArray:
         """Return what the camera sees now with the detected ball marked, (h, w, 3)."""
-        frame = self.frame()
-        return draw_detection(frame.rgb, frame.detection, self._camera, ur5.BALL_RADIUS)
+        rgba, buffer = self._render()
+        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
+        return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
 
     def close(self) -> None:
         """Leave PyBullet's world."""
@@ -263,9 +238,12 @@ class BulletWorld(World):
     def _joint_position(self) -> FloatArray:
         """Return the reported joint positions q = (θ − o)/g, (n,) rad."""
         arm = self._model.arm
-        q: FloatArray = (self._scene.joint_angles() - arm.joint_offset) / arm.gear_ratio
+        q: FloatArray = (self._scene.joint_state()[0] - arm.joint_offset) / arm.gear_ratio
         q.setflags(write=False)
         return q
+
+    def _render(self) -> tuple[ByteArray, FloatArray]:
+        return self._scene.render(self._camera, self._model.X_BC)
 
     def _sense(self, depth: FloatArray) -> FloatArray:
         return self._depth_noise.apply(depth, self._camera, self._noise)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,8 @@ import numpy as np
 import pybullet
 
 from servobench.plant.bullet.meshes import sphere_obj
-from servobench.plant.bullet.urdf import ArmBody, arm_urdf, bench_files
+from servobench.plant.bullet.urdf import arm_urdf, bench_files
+from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
 
 if TYPE_CHECKING:
@@ -30,43 +30,20 @@ BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too
 BALL_MESH = "ball.obj"
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """A camera in the scene, as PyBullet takes it.
-
-    Attributes:
-        camera: the intrinsics.
-        view: 16 numbers of the OpenGL view matrix, column by column.
-        projection: 16 numbers of the OpenGL projection matrix, column by column.
-    """
-
-    camera: PinholeCamera
-    view: tuple[float, ...]
-    projection: tuple[float, ...]
-
-
-def view_of(camera: PinholeCamera, X_BC: FloatArray) -> View:
-    """Return the view of a camera at X_BC (4, 4)."""
-    # OpenGL stores matrices column by column.
-    view, projection = view_matrix(X_BC).T.ravel(), camera.projection_matrix().T.ravel()
-    return View(camera, tuple(view.tolist()), tuple(projection.tolist()))
-
-
 class Scene:
     """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
 
-    def __init__(self, arm: SerialArm, body: ArmBody, *, physics_step: float, scenery: bool, window: bool) -> None:
+    def __init__(self, arm: SerialArm, *, physics_step: float, scenery: bool, window: bool) -> None:
         """Open a world and load the arm.
 
         Args:
-            arm: the true kinematics.
-            body: masses, torques and appearance.
+            arm: the true kinematics of an arm like the UR5.
             physics_step: s.
             scenery: whether to load the table and the floor.
             window: whether to open PyBullet's window.
 
         Raises:
-            ValueError: a window is wanted where there is no display.
+            ValueError: another number of joints, or a window is wanted where there is no display.
             ConnectionError: PyBullet opens no world, as too many are open.
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
@@ -75,7 +52,7 @@ class Scene:
         if self._client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
-            self._load(arm, body, physics_step, scenery=scenery)
+            self._load(arm, physics_step, scenery=scenery)
             if window:
                 self._aim_window()
         except BaseException:
@@ -84,9 +61,8 @@ class Scene:
         n = arm.n
         self._joints = list(range(n))
         self._ball_link = n + 1
-        self._torque = body.max_torque.tolist()
 
-    def _load(self, arm: SerialArm, body: ArmBody, physics_step: float, *, scenery: bool) -> None:
+    def _load(self, arm: SerialArm, physics_step: float, *, scenery: bool) -> None:
         client = self._client
         # With the default residual threshold the solver stops early, and gravity makes a motor at rest creep by
         # 1 mrad/s. With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
@@ -94,7 +70,7 @@ class Scene:
             fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
         )
         pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
-        files = {"arm.urdf": arm_urdf(arm, body, BALL_MESH), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
+        files = {"arm.urdf": arm_urdf(arm, BALL_MESH), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
         if scenery:
             files |= bench_files()
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
@@ -126,16 +102,11 @@ class Scene:
 
     def advance(self, velocities: list[list[float]]) -> None:
         """Take a physics step for each row of target joint velocities, (n,) rad/s, under the motors' torque limits."""
-        arm, client, joints, torque = self._arm, self._client, self._joints, self._torque
+        arm, client, joints = self._arm, self._client, self._joints
         control, step, mode = pybullet.setJointMotorControlArray, pybullet.stepSimulation, pybullet.VELOCITY_CONTROL
         for row in velocities:
-            control(arm, joints, mode, targetVelocities=row, forces=torque, physicsClientId=client)
+            control(arm, joints, mode, targetVelocities=row, forces=ur5.MAX_TORQUE, physicsClientId=client)
             step(physicsClientId=client)
-
-    def joint_angles(self) -> FloatArray:
-        """Return the joint angles θ, (n,) rad."""
-        states = pybullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
-        return np.array([state[0] for state in states])
 
     def joint_state(self) -> tuple[FloatArray, FloatArray]:
         """Return the joint angles θ, (n,) rad, and their speeds, (n,) rad/s."""
@@ -149,14 +120,12 @@ class Scene:
         )
         return np.array(state[4])
 
-    def render(self, view: View) -> tuple[ByteArray, FloatArray]:
-        """Return what a camera sees: colours (h, w, 4) uint8, and OpenGL depths (h, w) in [0, 1]."""
-        camera = view.camera
+    def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
+        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 4) uint8, and OpenGL depths (h, w) in [0, 1]."""
         _, _, rgba, depth, _ = pybullet.getCameraImage(
             camera.width,
             camera.height,
-            view.view,
-            view.projection,
+            *(matrix.T.ravel().tolist() for matrix in (view_matrix(X_BC), camera.projection_matrix())),
             shadow=0,
             renderer=pybullet.ER_TINY_RENDERER,
             flags=pybullet.ER_NO_SEGMENTATION_MASK,

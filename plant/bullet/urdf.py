@@ -1,4 +1,4 @@
-"""URDF of a serial arm with a ball on its flange, and of the table and floor on which it stands.
+"""URDF of an arm like the UR5 with a ball on its flange, and of the table and floor on which it stands.
 
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
@@ -9,14 +9,13 @@ apart. Numbers are written with `repr`, so that none loses a digit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.bullet.meshes import rectangles_obj
-from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 
@@ -36,88 +35,37 @@ LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBulle
 BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
 
 
-@dataclass(frozen=True, eq=False)
-class ArmBody:
-    """Masses, torques and appearance of a serial arm with n joints.
-
-    Attributes:
-        mass: (n,), kg.
-        centre_of_mass: (n, 3), m, of link i in its DH frame, which is where joint i+1 sits.
-        inertia: (n, 2), kg m², about the centre of mass: across the link and along it.
-        max_torque: (n,), Nm.
-        tube_radius: (n,), m; appearance only.
-        side_step: (n,), m, how far a link's tube runs beside its joints, along the joint's axis; appearance only.
-        ball_radius: m.
-    """
-
-    mass: FloatArray
-    centre_of_mass: FloatArray
-    inertia: FloatArray
-    max_torque: FloatArray
-    tube_radius: FloatArray
-    side_step: FloatArray
-    ball_radius: float
-
-    def __post_init__(self) -> None:
-        """Check shapes and signs and freeze the arrays."""
-        n = len(self.mass)
-        shapes = {"centre_of_mass": (n, 3), "inertia": (n, 2)}
-        for name in ("mass", "centre_of_mass", "inertia", "max_torque", "tube_radius", "side_step"):
-            value, shape = np.asarray(getattr(self, name), dtype=np.float64), shapes.get(name, (n,))
-            if value.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {value.shape}")
-            object.__setattr__(self, name, as_vector(name, value.ravel(), value.size).reshape(shape))
-        for name in ("mass", "inertia", "max_torque", "tube_radius"):
-            if not (getattr(self, name) > 0.0).all():
-                raise ValueError(f"{name} must be positive, got {getattr(self, name).tolist()}")
-        check_number("ball_radius", self.ball_radius, above=0.0)
-
-
-def ur5_body() -> ArmBody:
-    """Return masses, torques and appearance of the UR5."""
-    return ArmBody(
-        mass=np.array(ur5.MASS),
-        centre_of_mass=np.array(ur5.CENTRE_OF_MASS),
-        inertia=np.array(ur5.INERTIA),
-        max_torque=np.array(ur5.MAX_TORQUE),
-        tube_radius=np.array(ur5.TUBE_RADIUS),
-        side_step=np.array(ur5.SIDE_STEP),
-        ball_radius=ur5.BALL_RADIUS,
-    )
-
-
-def arm_urdf(arm: SerialArm, body: ArmBody, ball_mesh: str) -> str:
-    """Return the URDF of an arm; its joint angles are the true ones, θ.
+def arm_urdf(arm: SerialArm, ball_mesh: str) -> str:
+    """Return the URDF of an arm with masses and looks of the UR5; its joint angles are the true ones, θ.
 
     Args:
         arm: the kinematics, mismatch included.
-        body: masses, torques and appearance for the same number of joints.
         ball_mesh: name of a file beside the URDF that holds a mesh of the unit sphere.
 
     Returns:
         The URDF as text: the base, a link a joint in the arm's order, the flange and the ball.
 
     Raises:
-        ValueError: `body` is for another number of joints.
+        ValueError: the arm has another number of joints than the UR5.
     """
-    if len(body.mass) != arm.n:
-        raise ValueError(f"body must be for {arm.n} joints, got one for {len(body.mass)}")
+    if arm.n != len(ur5.MASS):
+        raise ValueError(f"arm must have {len(ur5.MASS)} joints like the UR5, got {arm.n}")
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    _draw_base(_add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], body.tube_radius[0])
+    _draw_base(_add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], ur5.TUBE_RADIUS[0])
     for i, name in enumerate(arm.joint_names):
         step = arm.translation[i + 1]
-        centre = rotation_from_rpy(arm.rpy[i + 1]) @ body.centre_of_mass[i] + step
+        centre = rotation_from_rpy(arm.rpy[i + 1]) @ ur5.CENTRE_OF_MASS[i] + step
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
-        link = _add_link(robot, links[i + 1], body.mass[i], body.inertia[i], centre=centre, along=along)
-        _draw_link(link, step, body.tube_radius[i], body.side_step[i])
+        link = _add_link(robot, links[i + 1], ur5.MASS[i], ur5.INERTIA[i], centre=centre, along=along)
+        _draw_link(link, step, ur5.TUBE_RADIUS[i], ur5.SIDE_STEP[i])
         _add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     _add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, body)
+    _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool)
     _add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
-    _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, body.ball_radius)
+    _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ur5.BALL_RADIUS)
     return _text(robot)
 
 
@@ -180,10 +128,10 @@ def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -
         _draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
 
 
-def _draw_tool(link: ET.Element, tool: FloatArray, body: ArmBody) -> None:
+def _draw_tool(link: ET.Element, tool: FloatArray) -> None:
     """Draw the flange's plate and the stick that carries the ball."""
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * body.tube_radius[-1])
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * body.ball_radius)
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * ur5.TUBE_RADIUS[-1])
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * ur5.BALL_RADIUS)
 
 
 def _numbers(values: npt.ArrayLike) -> str:

@@ -5,7 +5,7 @@ import pybullet
 import pytest
 
 from servobench.plant.bullet.meshes import rectangles_obj, sphere_obj
-from servobench.plant.bullet.urdf import ArmBody, arm_urdf, bench_files, rpy_along, ur5_body
+from servobench.plant.bullet.urdf import arm_urdf, bench_files, rpy_along
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 
@@ -35,7 +35,7 @@ def arm(request) -> SerialArm:
 @pytest.fixture
 def loaded(arm, tmp_path):
     """The arm in PyBullet: a function from reported joint positions to the state of a link."""
-    (tmp_path / "arm.urdf").write_text(arm_urdf(arm, ur5_body(), "ball.obj"), encoding="utf-8")
+    (tmp_path / "arm.urdf").write_text(arm_urdf(arm, "ball.obj"), encoding="utf-8")
     (tmp_path / "ball.obj").write_text(sphere_obj(0), encoding="utf-8")
     client = pybullet.connect(pybullet.DIRECT)
     flags = pybullet.URDF_USE_INERTIA_FROM_FILE
@@ -93,17 +93,17 @@ def test_masses_and_inertias_arrive_in_the_simulator(loaded):
 
 def test_numbers_in_the_urdf_lose_no_digit():
     arm = perturbed_ur5()
-    origins = ET.fromstring(arm_urdf(arm, ur5_body(), "ball.obj")).findall("joint/origin")
+    origins = ET.fromstring(arm_urdf(arm, "ball.obj")).findall("joint/origin")
     written = np.array([[float(part) for part in origin.get("xyz").split()] for origin in origins])
     np.testing.assert_array_equal(written, np.vstack([arm.translation, arm.tool]))
 
 
 def test_nothing_collides():
-    assert "<collision" not in arm_urdf(ur5.ur5_arm(), ur5_body(), "ball.obj") + bench_files()["bench.urdf"]
+    assert "<collision" not in arm_urdf(ur5.ur5_arm(), "ball.obj") + bench_files()["bench.urdf"]
 
 
 def test_nothing_but_the_ball_is_reddish():
-    robot = ET.fromstring(arm_urdf(ur5.ur5_arm(), ur5_body(), "ball.obj"))
+    robot = ET.fromstring(arm_urdf(ur5.ur5_arm(), "ball.obj"))
     bench = ET.fromstring(bench_files()["bench.urdf"])
     for visual in [*robot.iter("visual"), *bench.iter("visual")]:
         red, green, blue, _ = (float(part) for part in visual.find("material/color").get("rgba").split())
@@ -152,28 +152,7 @@ def test_rectangles_face_up_and_have_their_area():
     assert (vertices[:, 2] == -0.5).all()
 
 
-def changed_body(**change) -> ArmBody:
-    body = ur5_body()
-    names = ("mass", "centre_of_mass", "inertia", "max_torque", "tube_radius", "side_step", "ball_radius")
-    return ArmBody(**({name: getattr(body, name) for name in names} | change))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"centre_of_mass": np.zeros((5, 3))}, r"centre_of_mass must have shape \(6, 3\), got \(5, 3\)"),
-        ({"mass": -np.ones(6)}, "mass must be positive"),
-        ({"inertia": np.zeros((6, 2))}, "inertia must be positive"),
-        ({"max_torque": np.full(6, np.nan)}, "max_torque must be finite"),
-        ({"ball_radius": 0.0}, "ball_radius must be above 0"),
-    ],
-)
-def test_a_bad_body_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        changed_body(**change)
-
-
-def test_a_body_for_another_number_of_joints_is_refused():
+def test_an_arm_with_another_number_of_joints_is_refused():
     arm = SerialArm(("one",), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(1), np.ones(1), np.array([0.0, 0.0, 0.1]))
-    with pytest.raises(ValueError, match="body must be for 1 joints, got one for 6"):
-        arm_urdf(arm, ur5_body(), "ball.obj")
+    with pytest.raises(ValueError, match="arm must have 6 joints like the UR5, got 1"):
+        arm_urdf(arm, "ball.obj")
