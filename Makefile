@@ -39,7 +39,7 @@ docs: $(VENV)/ready
 
 # Draw the README's pictures anew from committed seeds: the map takes six minutes on two processors, more where they are slow.
 figures: $(VENV)/ready
-	$(BIN)/python -m servobench.harness.studies.readme_pictures docs/pictures
+	$(BIN)/python docs/readme_pictures.py docs/pictures
 
 benchmark: $(VENV)/ready
 	for file in benchmarks/*.py; do $(BIN)/python $$file || exit 1; done

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 from PIL import Image
 
+import readme_pictures
 from kit.command import servobench
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import Batch
-from servobench.harness.studies import readme_pictures, robustness
+from servobench.harness.studies import robustness
 
 
 def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
