@@ -22,6 +22,7 @@ from servobench.harness.batch.campaign import Campaign, Cell, Execution, carry_o
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.sweep import place_columns, vary
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.panels import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.request import RunRequest
@@ -146,7 +147,6 @@ def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:
     """
     if "axis" not in runs or not set(runs["axis"]) & {line.axis for line in LINES}:
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
-    folder.mkdir(parents=True, exist_ok=True)
     return [
         *_draw(runs, folder / "robustness", "Runs that arrived within 5 mm and stayed, %", settled_share, 104.0),
         *_draw(
@@ -195,7 +195,4 @@ def _draw(
         figure.legend(handles, labels, loc="outside lower center", ncols=len(controllers), frameon=False)
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     figure.suptitle(f"{title}: {robots} robots a point on {plant}, bars are 95 % intervals")
-    files = [stem.with_suffix(suffix) for suffix in (".png", ".pdf")]
-    for file in files:
-        figure.savefig(file, dpi=150)
-    return files
+    return save_figure(figure, stem)

@@ -10,30 +10,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.statistics import NO_ESTIMATE
+from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.panels import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.studies.claims.measurements import Answer, Measurement
 
+READINGS = {"ε = 0": "reading_epsilon", "entries": "reading_entries"}  # claim -> name of its figure
+MAX_LABEL = 28  # characters of an ordinate's label on one line
+
 
 def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
-    """Draw a figure for each claim, a column a plant and a row a measurement, as PNG and PDF.
-
-    Args:
-        answers: of all plants.
-        folder: where; made if needed.
-
-    Returns:
-        The files.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
+    """Draw a figure for each claim, a column a plant and a row a measurement; return the files, PNG and PDF."""
     files = []
     for claim in dict.fromkeys(answer.claim for answer in answers):
-        own = [answer for answer in answers if answer.claim == claim]
-        figure = _draw(own)
-        name = {"ε = 0": "reading_epsilon", "entries": "reading_entries"}.get(claim, f"claim_{claim}")
-        for suffix in (".png", ".pdf"):
-            files.append((folder / name).with_suffix(suffix))
-            figure.savefig(files[-1], dpi=150)
+        figure = _draw([answer for answer in answers if answer.claim == claim])
+        files += save_figure(figure, folder / READINGS.get(claim, f"claim_{claim}"))
     return files
 
 
@@ -46,7 +37,7 @@ def _draw(answers: Sequence[Answer]) -> Figure:
             _draw_panel(grid[row, column], [m for m in answer.measurements if m.panel == panel])
         grid[0, column].set_title(f"{answer.plant}: {answer.verdict}")
     for row, panel in enumerate(panels):
-        grid[row, 0].set_ylabel("\n".join(_wrapped(panel)))
+        grid[row, 0].set_ylabel(panel if len(panel) < MAX_LABEL else panel.replace(", ", ",\n", 1))
     figure.suptitle(answers[0].title)
     return figure
 
@@ -62,17 +53,10 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
     draw_places(axes, range(len(places)), values, method_styles(labels), joined=False)
     axes.set_xticks(range(len(places)), places)
     axes.set_xlim(-0.6, len(places) - 0.4)
-    if "−" in measured[0].panel:
-        axes.axhline(0.0, color="black", linewidth=0.8)
-    elif " over " in measured[0].panel:
-        axes.axhline(1.0, color="black", linewidth=0.8)
+    if "−" in measured[0].panel or " over " in measured[0].panel:  # a difference or a ratio: a line at "alike"
+        axes.axhline(0.0 if "−" in measured[0].panel else 1.0, color="black", linewidth=0.8)
     else:
         ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
         axes.set_ylim(0.0, 1.15 * max(1e-9, float(np.max(ends[np.isfinite(ends)], initial=0.0))))
     axes.grid(visible=True, alpha=0.3)
     axes.legend(fontsize=7, frameon=False)
-
-
-def _wrapped(text: str) -> list[str]:
-    middle = text.find(",")
-    return [text] if middle < 0 or len(text) < 28 else [text[: middle + 1], text[middle + 2 :]]

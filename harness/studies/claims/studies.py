@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from servobench.harness.batch.campaign import Cell
 from servobench.harness.batch.compare import Batch
@@ -31,28 +30,16 @@ READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Study:
-    """Runs with common settings.
+class Study(NamedTuple):
+    """Runs with common settings."""
 
-    Attributes:
-        name: of its folder.
-        settings: overrides of the defaults.
-        cells: the runs.
-    """
-
-    name: str
-    settings: Settings
-    cells: tuple[Cell, ...]
+    name: str  # of its folder
+    settings: Settings  # overrides of the defaults
+    cells: tuple[Cell, ...]  # the runs
 
 
 def studies(plants: Sequence[str], seeds: int) -> list[Study]:
-    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle.
-
-    Args:
-        plants: names.
-        seeds: number of robots.
-    """
+    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle."""
     rendered = {"bullet": {"scenery": False}}  # the same observations, bit for bit, for a fifth of the time
     robots = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
     some = robots[: max(2, 2 * seeds // 5)]
@@ -63,12 +50,5 @@ def studies(plants: Sequence[str], seeds: int) -> list[Study]:
 
     four = (PROPOSED, *OTHERS)
     main = Study(MAIN, Settings(rendered), cells(four, MOVES, robots) + cells(four, (CIRCLE,), some))
-    others = [
-        Study(
-            name,
-            Settings({**rendered, PROPOSED: reading}),
-            cells((PROPOSED,), MOVES, some) + cells((PROPOSED,), (CIRCLE,), some),
-        )
-        for name, reading in READINGS.items()
-    ]
-    return [main, *others]
+    own = cells((PROPOSED,), (*MOVES, CIRCLE), some)
+    return [main, *(Study(name, Settings({**rendered, PROPOSED: reading}), own) for name, reading in READINGS.items())]

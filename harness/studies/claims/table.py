@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -16,43 +17,21 @@ from servobench.harness.studies.claims.measurements import Answer
 ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
 NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
-SHARE, PERIOD = 0.1, 0.051  # of a number, and absolute, by which evidence may differ
-COLUMNS: Final = ("claim", "statement", "plant", "verdict", "evidence")
+RELATIVE, ABSOLUTE = 0.1, 0.051  # tolerances of the numbers in the evidence: a tenth and a period
 
 Answers: TypeAlias = Mapping[tuple[str, str], tuple[str, str]]
 
 
-def answer_table(answers: Sequence[Answer]) -> pd.DataFrame:
-    """Return a row for each claim and plant."""
-    return pd.DataFrame([[getattr(answer, name) for name in COLUMNS] for answer in answers], columns=list(COLUMNS))
-
-
-def measurement_table(answers: Sequence[Answer]) -> pd.DataFrame:
-    """Return a row for each number behind the answers."""
-    return pd.DataFrame(
-        [
-            {
-                "claim": answer.claim,
-                "plant": answer.plant,
-                "measured": m.panel,
-                "place": m.place,
-                "label": m.label,
-                "value": m.estimate.value,
-                "low": m.estimate.low,
-                "high": m.estimate.high,
-                "count": m.estimate.count,
-                "holds": m.holds,
-            }
-            for answer in answers
-            for m in answer.measurements
-        ]
-    )
-
-
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:
-    """Write both tables."""
-    answer_table(answers).to_csv(folder / ANSWERS, index=False)
-    measurement_table(answers).to_csv(folder / MEASUREMENTS, index=False)
+    """Write a row for each claim and plant, and a row for each number behind the answers."""
+    pd.DataFrame(answers).drop(columns="measurements").to_csv(folder / ANSWERS, index=False)
+    rows = [
+        {"claim": answer.claim, "plant": answer.plant, "measured": m.panel, "place": m.place, "label": m.label,
+         **asdict(m.estimate), "holds": m.holds}
+        for answer in answers
+        for m in answer.measurements
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(folder / MEASUREMENTS, index=False)
 
 
 def read_answers(path: Path) -> Answers:
@@ -88,7 +67,7 @@ def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
 def _agree(found: str, wanted: str) -> bool:
     ours, theirs = ([float(number) for number in NUMBER.findall(text)] for text in (found, wanted))
     same_words = NUMBER.sub("", found) == NUMBER.sub("", wanted)
-    return same_words and bool(np.allclose(ours, theirs, rtol=SHARE, atol=PERIOD))
+    return same_words and bool(np.allclose(ours, theirs, rtol=RELATIVE, atol=ABSOLUTE))
 
 
 def markdown_table(answers: Sequence[Answer]) -> str:
