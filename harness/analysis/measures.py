@@ -2,49 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import pandas as pd
 
+HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 
-@dataclass(frozen=True)
-class Measure:
-    """How a column of the table of runs is shown.
 
-    Attributes:
-        name: for the reader.
-        unit: of the shown number; empty = that of the plant's feature, or a handier one.
-        factor: from the column to `unit`.
-        digits: behind the decimal point.
-    """
+def handy_unit(feature_unit: str | None) -> tuple[str, float]:
+    """Return the unit in which errors of a feature are shown, and the factor to it; None is an unknown unit."""
+    return HANDY_UNITS.get(feature_unit or "", (feature_unit or "feature unit", 1.0))
+
+
+class Measure(NamedTuple):
+    """How a column of the table of runs is shown; where `unit` is None, in the unit of the plant's feature."""
 
     name: str
-    unit: str
-    factor: float
-    digits: int
+    digits: int  # behind the decimal point
+    unit: str | None = None
+    factor: float = 1.0  # from the column to `unit`
 
     def scale(self, runs: pd.DataFrame) -> tuple[str, float]:
         """Return the unit in which these runs are shown, and the factor to it."""
         if self.unit:
             return self.unit, self.factor
         units = runs.reindex(columns=["feature_unit"])["feature_unit"].dropna().unique().tolist()
-        return HANDY_UNITS.get(units[0], (units[0], 1.0)) if len(units) == 1 else ("feature unit", 1.0)
+        return handy_unit(units[0] if len(units) == 1 else None)
 
 
-HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 MEASURES: Final = {
-    "settling_time_s": Measure("settling time", "s", 1.0, 2),
-    "overshoot": Measure("overshoot", "%", 100.0, 1),
-    "steady_state_error": Measure("last second", "", 1.0, 2),
-    "rms_error_evaluated": Measure("RMS of the evaluated part", "", 1.0, 2),
-    "max_error": Measure("largest error", "", 1.0, 1),
-    "path_length_ratio": Measure("path ratio", "1", 1.0, 3),
-    "jacobian_error_mean": Measure("mean Jacobian error", "%", 100.0, 1),
-    "control_effort_rad": Measure("control effort", "rad", 1.0, 2),
-    "saturation_fraction": Measure("saturated periods", "%", 100.0, 1),
-    "feature_invalid_fraction": Measure("periods without a feature", "%", 100.0, 1),
-    "controller_time_median_us": Measure("controller step, median", "µs", 1.0, 0),
-    "controller_time_p99_us": Measure("controller step, 99 %", "µs", 1.0, 0),
-    "plant_time_median_us": Measure("plant step, median", "µs", 1.0, 0),
+    "settling_time_s": Measure("settling time", 2, "s"),
+    "overshoot": Measure("overshoot", 1, "%", 100.0),
+    "steady_state_error": Measure("last second", 2),
+    "rms_error_evaluated": Measure("RMS of the evaluated part", 2),
+    "max_error": Measure("largest error", 1),
+    "path_length_ratio": Measure("path ratio", 3, "1"),
+    "jacobian_error_mean": Measure("mean Jacobian error", 1, "%", 100.0),
+    "control_effort_rad": Measure("control effort", 2, "rad"),
+    "saturation_fraction": Measure("saturated periods", 1, "%", 100.0),
+    "feature_invalid_fraction": Measure("periods without a feature", 1, "%", 100.0),
+    "controller_time_median_us": Measure("controller step, median", 0, "µs"),
+    "controller_time_p99_us": Measure("controller step, 99 %", 0, "µs"),
+    "plant_time_median_us": Measure("plant step, median", 0, "µs"),
 }

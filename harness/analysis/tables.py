@@ -138,7 +138,7 @@ def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: fl
         known = runs[metric].dropna()
         never = 2.0 * float(known.max()) if len(known) else 1.0
     compared = compare_pairs(runs, pairs, never=never, metric=metric, keys=("seed",))
-    measure = MEASURES.get(metric, Measure(metric.replace("_", " "), "1", 1.0, 2))
+    measure = MEASURES.get(metric, Measure(metric.replace("_", " "), 2, "1"))
     unit, factor = measure.scale(runs)
     what = measure.name if unit == "1" else f"{measure.name}, {unit}"
     return pd.DataFrame(

@@ -151,7 +151,7 @@ def record(
             shown = _new_run(RECORDED | chosen, read_settings(config, set_ or []))
         paths = write_recording(
             shown,
-            (out or (folder or Path("results")) / RECORDINGS) / str(shown.row["run_id"]),
+            (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"]),
             wanted,
             lambda share, what: status.update(f"drawing: {100 * share:3.0f} %, {what}"),
         )

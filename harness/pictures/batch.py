@@ -13,16 +13,12 @@ from servobench.harness.pictures.tracks import Tracks
 from servobench.harness.run.episode import COMPLETED
 
 EFFORT = (("control_effort_rad", 1.0, "control effort [rad]"), ("saturation_fraction", 100.0, "saturated periods [%]"))
+COMMAND = "joint_velocity_command_"
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 
 
 def draw_effort(runs: pd.DataFrame, styles: Styles) -> Figure | None:
-    """Draw control effort and saturation of each run, a column a task, a line a controller; None without values.
-
-    Args:
-        runs: rows of the table of runs, of one plant and mismatch.
-        styles: of the controllers.
-    """
+    """Draw control effort and saturation of each run, a column a task, a line a controller; None without values."""
     rows = [row for row in EFFORT if row[0] in runs and runs[row[0]].notna().any()]
     if not rows:
         return None
@@ -80,8 +76,8 @@ def draw_step_times(tasks: dict[str, Tracks], styles: Styles) -> Figure | None:
 
 def draw_joint_speeds(tracks: Tracks, styles: Styles) -> Figure | None:
     """Draw the commanded speed of each joint over time; None without values."""
-    richest = max(tracks.values(), key=lambda track: len(track.joints))
-    columns = [name for name in richest.table.columns if name.startswith("joint_velocity_command_")]
+    known = [[name for name in track.table.columns if name.startswith(COMMAND)] for track in tracks.values()]
+    columns = max(known, key=len)
     if not columns:
         return None
     rows = -(-len(columns) // 2)
@@ -91,7 +87,7 @@ def draw_joint_speeds(tracks: Tracks, styles: Styles) -> Figure | None:
         for name, track in tracks.items():
             style = styles[name].line_arguments(len(track.table)) | {"linewidth": 1.0, "markersize": 3.5}
             axes.plot(track.time, track.column(column), label=name, **style)
-        axes.set_title(column.removeprefix("joint_velocity_command_").removesuffix("_rad_s"))
+        axes.set_title(column.removeprefix(COMMAND).removesuffix("_rad_s"))
     for axes in panels[len(columns) :]:
         axes.set_visible(False)
     for axes in panels[max(0, len(columns) - 2) : len(columns)]:

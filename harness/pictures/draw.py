@@ -6,8 +6,8 @@ import io
 import re
 import textwrap
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -45,52 +45,36 @@ HEADINGS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class NamedFigure:
-    """A figure and what it is called.
+class NamedFigure(NamedTuple):
+    """A figure and what it is called."""
 
-    Attributes:
-        kind: what it shows, one of HEADINGS.
-        stem: name of its file without ending.
-        title: the heading and what its runs have in common.
-        figure: the drawing.
-    """
-
-    kind: str
-    stem: str
-    title: str
+    kind: str  # what it shows, one of HEADINGS
+    stem: str  # name of its file without ending
+    title: str  # the heading and what its runs have in common
     figure: Figure
 
 
 def draw_figures(folder: Path) -> list[Path]:
-    """Draw the figures of a results folder into its folder `figures`, as PNG and PDF.
-
-    Args:
-        folder: a results folder; the first seed of each plant and mismatch is drawn.
-
-    Returns:
-        The files.
+    """Draw the first seed of each plant and mismatch into the folder's `figures`; return the files, PNG and PDF.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    paths = []
-    for named in folder_figures(folder):
-        (folder / FOLDER).mkdir(exist_ok=True)
-        paths += save_figure(named.figure, folder / FOLDER / named.stem)
-    return paths
+    return [
+        path for named in folder_figures(folder) for path in save_figure(named.figure, folder / FOLDER / named.stem)
+    ]
 
 
 def save_figure(figure: Figure, stem: Path) -> list[Path]:
     """Write a figure as PNG and as PDF beside each other; the same figure gives the same bytes."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
     paths = []
     for ending in FORMATS:
-        path = stem.with_name(f"{stem.name}.{ending}")
+        paths.append(stem.with_name(f"{stem.name}.{ending}"))
         with figure_style():
             metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
-            figure.savefig(path, dpi=RESOLUTION, metadata=metadata)
+            figure.savefig(paths[-1], dpi=RESOLUTION, metadata=metadata)
         figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
-        paths.append(path)
     return paths
 
 

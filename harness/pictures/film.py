@@ -10,7 +10,7 @@ from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import matplotlib as mpl
@@ -22,10 +22,9 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.draw import save_figure
-from servobench.harness.pictures.panels import SETTLED
+from servobench.harness.pictures.panels import mark_settling_band, plain_logarithms
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
-from servobench.harness.pictures.style import figure_style, method_styles
-from servobench.harness.run.metrics import SETTLING_BAND
+from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles
 from servobench.plant.bullet.detection import ByteArray
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import suggest
@@ -35,19 +34,19 @@ WIDTH, HEIGHT = 960, 736  # px of a frame; ffmpeg wants multiples of 16
 HEAD, VIEW_WIDTH, VIEW_HEIGHT = 32, 640, 480  # px: line of text on top, overview below it at the left
 SIDE = WIDTH - VIEW_WIDTH
 CAMERA_HEIGHT = 240  # px
-LARGEST_RATE = 25.0  # frames a second
+MAX_RATE = 25.0  # frames a second
 GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
-FINENESS = 1.25  # rendered pixels for one of the overview
+FINENESS = 1.25  # pixels rendered for one pixel of the overview, along each side
 REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
-PLACES = 8  # snapshots
-NEAR = 0.05  # of a curve's size, within which its reference counts as back where it began
+SNAPSHOT_COUNT = 8
+CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
 
 
 def find_kind(name: str) -> str:
-    """Return the name of a kind of recording.
+    """Return `name` if it is a kind of recording.
 
     Raises:
-        ConfigurationError: an unknown one.
+        ConfigurationError: it is none.
     """
     if name not in KINDS:
         raise ConfigurationError(f"--kinds: unknown {name!r}: {suggest(name, KINDS)}")
@@ -55,16 +54,13 @@ def find_kind(name: str) -> str:
 
 
 def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress: Progress) -> list[Path]:
-    """Write what is wanted of a run.
+    """Write the recordings of a run that are named in `kinds`, beside each other, and return the files.
 
     Args:
         run: a logged run.
-        stem: the files' place and name without ending.
+        stem: path of the files without ending.
         kinds: some of KINDS.
-        progress: told how far it is.
-
-    Returns:
-        The files.
+        progress: called with the share that is done and what is being drawn.
 
     Raises:
         ConfigurationError: the extra `animation` is missing, or ffmpeg cannot write.
@@ -72,7 +68,6 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
     paths = []
     films = [kind for kind in kinds if kind != SNAPSHOTS]
     ffmpeg = _ffmpeg() if films else None
-    stem.parent.mkdir(parents=True, exist_ok=True)
     if SNAPSHOTS in kinds:
         progress(0.0, "snapshots")
         with figure_style():
@@ -80,15 +75,18 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
         paths += save_figure(figure, stem.with_name(f"{stem.name}_snapshots"))
     if ffmpeg is None:
         return paths
-    step = _frame_step(run.track.time)
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    step, rate = _frame_rate(run.track.time)
+    board, count = _Board(run), len(run.track.table)
     try:
         with ExitStack() as stack:
-            writers = []
+            replay, writers = stack.enter_context(Replay(run, fineness=FINENESS)), []
             for kind in films:
                 paths.append(stem.with_name(f"{stem.name}.{kind}"))
-                writers.append(stack.enter_context(_writer(ffmpeg, kind, paths[-1], _rate(run.track.time, step))))
-            for share, frame in _frames(run, step):
-                progress(share, "frames")
+                writers.append(stack.enter_context(_writer(ffmpeg, kind, paths[-1], rate)))
+            for k in range(0, count, step):
+                progress(k / count, "frames")
+                frame = board.compose(replay, k)
                 for writer in writers:
                     writer.send(frame)
     except OSError as error:
@@ -99,8 +97,8 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
 def draw_snapshots(run: LoggedRun) -> Figure:
     """Draw the arm at eight places of its first lap, or of the whole run (the paper's figure 8), even in time."""
     figure = Figure(figsize=(11.0, 4.7), layout="constrained")
-    chosen = np.linspace(0, _lap(run), PLACES).round().astype(int)
-    panels = figure.subplots(2, PLACES // 2).ravel()
+    chosen = np.linspace(0, _lap(run), SNAPSHOT_COUNT).round().astype(int)
+    panels = figure.subplots(2, SNAPSHOT_COUNT // 2).ravel()
     with Replay(run, fineness=2.0) as replay:
         for axes, k in zip(panels, chosen.tolist(), strict=True):
             replay.place(k)
@@ -118,16 +116,15 @@ def draw_frame(run: LoggedRun, k: int) -> ByteArray:
 
 
 class _Board:
-    """What stands around the pictures: drawn once, with the error's line and the numbers renewed in each frame."""
+    """A frame around the two pictures: its background is drawn once, the error's line and the numbers in each frame."""
 
     def __init__(self, run: LoggedRun) -> None:
         self._run = run
-        self._style = method_styles([run.row["controller"]])[run.row["controller"]]
-        self._error = 1000.0 * run.track.column("error_norm")
+        self._style, self._error = _style(run), run.track.error()
         with figure_style():
             figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
             self._figure = figure
-            self._canvas = _canvas_of(figure)
+            self._canvas = cast("Any", FigureCanvasAgg(figure))
             figure.text(0.01, 1 - HEAD / 2 / HEIGHT, _title(run), va="center", fontsize=11, fontweight="bold")
             self._axes = figure.add_axes((0.085, 0.075, 0.89, 0.2))
             self._prepare_axes()
@@ -150,7 +147,7 @@ class _Board:
         time = run.track.time
         self._line.set_data(time[: k + 1], self._error[: k + 1])
         self._now.set_data(time[k : k + 1], self._error[k : k + 1])
-        self._numbers.set_text(f"time  {time[k]:6.2f} s\nerror {self._error[k]:6.1f} mm")
+        self._numbers.set_text(f"time  {time[k]:6.2f} s\nerror {self._error[k]:6.1f} {run.track.error_unit[0]}")
         for artist in (self._line, self._now):
             self._axes.draw_artist(artist)
         self._figure.draw_artist(self._numbers)
@@ -164,71 +161,54 @@ class _Board:
         return frame
 
     def _prepare_axes(self) -> None:
-        axes, time = self._axes, self._run.track.time
+        axes, track, band = self._axes, self._run.track, self._run.track.settling_band
         positive = self._error[np.isfinite(self._error) & (self._error > 0.0)]
         if len(positive):
-            axes.set_yscale("log")
-            axes.set_ylim(
-                min(0.8 * positive.min(), 600 * SETTLING_BAND), 1.3 * max(positive.max(), 1000 * SETTLING_BAND)
-            )
-            axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-            axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
-        axes.set_xlim(0.0, max(float(time[-1]), 1e-3))
-        axes.axhline(1000 * SETTLING_BAND, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
-        axes.annotate(SETTLED, (0.995, 1000 * SETTLING_BAND), xycoords=("axes fraction", "data"), fontsize=8,
-                      color="0.3", ha="right", va="bottom")  # fmt: skip
-        axes.set(xlabel="time [s]", ylabel="true error [mm]")
+            plain_logarithms(axes)
+            axes.set_ylim(np.fmin(0.8 * positive.min(), 0.6 * band), 1.3 * np.fmax(positive.max(), band))
+        axes.set_xlim(0.0, max(float(track.time[-1]), 1e-3))
+        mark_settling_band(axes, track)
+        for line in axes.get_lines():
+            axes.annotate(str(line.get_label()), (0.995, band), xycoords=("axes fraction", "data"), fontsize=8,
+                          color="0.3", ha="right", va="bottom")  # fmt: skip
+        axes.set(xlabel="time [s]", ylabel=f"true error [{track.error_unit[0]}]")
         (self._line,) = axes.plot([], [], color=self._style.colour, linewidth=1.8, animated=True)
         (self._now,) = axes.plot([], [], color=self._style.colour, marker="o", markersize=6, animated=True)
 
 
-def _canvas_of(figure: Figure) -> Any:  # noqa: ANN401 - matplotlib leaves its canvas untyped
-    return FigureCanvasAgg(figure)
-
-
-def _frames(run: LoggedRun, step: int) -> Iterator[tuple[float, ByteArray]]:
-    """Yield how far it is and the next frame."""
-    board, count = _Board(run), len(run.track.table)
-    with Replay(run, fineness=FINENESS) as replay:
-        for k in range(0, count, step):
-            yield k / count, board.compose(replay, k)
+def _style(run: LoggedRun) -> MethodStyle:
+    name = run.track.row["controller"]
+    return method_styles([name])[name]
 
 
 def _trails(run: LoggedRun, k: int) -> list[Trail]:
-    colour = method_styles([run.row["controller"]])[run.row["controller"]].colour
-    red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(colour))
+    """Return the desired path, or a cross at a fixed target, and the ball's path up to period `k`."""
+    red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(_style(run).colour))
     desired = run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
-    if run.track.point_to_point:  # a cross at the target
-        arms = 0.03 * np.eye(3)
-        crosses = [Trail(desired[0] + np.stack([-arm, arm]), REFERENCE_COLOUR, 2) for arm in arms]
-        return [*crosses, Trail(run.ball[: k + 1], (red, green, blue), 3)]
-    return [Trail(desired, REFERENCE_COLOUR, 2), Trail(run.ball[: k + 1], (red, green, blue), 3)]
+    cross = [desired[0] + np.stack([-arm, arm]) for arm in 0.03 * np.eye(3)]
+    lines = cross if run.track.point_to_point else [desired]
+    return [*(Trail(line, REFERENCE_COLOUR, 2) for line in lines), Trail(run.ball[: k + 1], (red, green, blue), 3)]
 
 
 def _lap(run: LoggedRun) -> int:
     """Return the period in which the reference is back where it began; the last one if it never is."""
     distance = np.linalg.norm(run.reference - run.reference[0], axis=1)
     away = np.flatnonzero(distance > 0.5 * distance.max())
-    back = np.flatnonzero(distance <= NEAR * distance.max())
+    back = np.flatnonzero(distance <= CLOSED * distance.max())
     after = back[back > away[0]] if len(away) else back[:0]
     return int(after[0]) if len(after) else len(distance) - 1
 
 
 def _title(run: LoggedRun) -> str:
-    row = run.row
+    row = run.track.row
     return f"{row['controller']}: {row['task']} on {row['plant']}, mismatch {row['mismatch']}, seed {row['seed']}"
 
 
-def _frame_step(time: FloatArray) -> int:
-    """Return how many periods there are from frame to frame."""
+def _frame_rate(time: FloatArray) -> tuple[int, float]:
+    """Return the periods from frame to frame, and the frames a second at which the film lasts as long as the run."""
     period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return max(1, round(1.0 / (LARGEST_RATE * period)))
-
-
-def _rate(time: FloatArray, step: int) -> float:
-    """Return the frames a second at which the film lasts as long as the run."""
-    period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return 1.0 / (step * period)
+    step = max(1, round(1.0 / (MAX_RATE * period)))
+    return step, 1.0 / (step * period)
 
 
 def _ffmpeg() -> Any:  # noqa: ANN401 - the optional package has no types
@@ -244,7 +224,7 @@ def _ffmpeg() -> Any:  # noqa: ANN401 - the optional package has no types
 
 @contextmanager
 def _writer(ffmpeg: Any, kind: str, path: Path, rate: float) -> Iterator[Generator[None, ByteArray, None]]:  # noqa: ANN401
-    """Open ffmpeg on a file; frames are sent to what comes back."""
+    """Yield a generator that sends each frame to ffmpeg, which writes the file."""
     if kind == MP4:
         quality = ["-crf", "22", "-preset", "medium", "-movflags", "+faststart"]
         options = {"codec": "libx264", "quality": None, "output_params": quality, "macro_block_size": 16}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -13,39 +14,43 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from servobench.harness.analysis.statistics import Estimate
 from servobench.harness.pictures.style import MethodStyle
-from servobench.harness.pictures.tracks import Track, Tracks, label_of
-from servobench.harness.run.metrics import SETTLING_BAND
+from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
 from servobench.plant.checks import FloatArray
 
-MILLI = 1000.0
-SETTLED = f"settling band, {MILLI * SETTLING_BAND:g} mm"
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 CAMERA_TILT = -62.0  # deg; −90 looks along the optical axis, from which depth could not be seen
-NO_VALUES = "no values"
 SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
 ROW = 3  # panels
 EXACT = 1e-9  # relative error below which an estimate counts as the truth
 LEAST_DEPTH = 0.4  # of the widest axis, so that a flat path does not hide the depth axis
+DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
+END_MARK: dict[str, Any] = {"marker": END, "markersize": 14, "markeredgewidth": 2.0, "linestyle": "", "zorder": 12,
+                            "gid": ENDED}  # fmt: skip
 
 Styles = dict[str, MethodStyle]
 
 
 def draw_error(axes: Axes, tracks: Tracks, styles: Styles) -> None:
     """Draw the norm of the true error over time, logarithmic, with the band in which a run counts as settled."""
-    metres = all(name.endswith("_m") for track in tracks.values() for name in track.features)
-    _draw_over_time(axes, tracks, styles, "error_norm", MILLI if metres else 1.0)
-    if metres:
-        axes.axhline(MILLI * SETTLING_BAND, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=SETTLED)
-    axes.set_ylabel("true error [mm]" if metres else "true error")
+    first = next(iter(tracks.values()))
+    _draw_over_time(axes, tracks, styles, Track.error)
+    mark_settling_band(axes, first)
+    axes.set_ylabel(f"true error [{first.error_unit[0]}]")
     scale_by_size(axes)
+
+
+def mark_settling_band(axes: Axes, track: Track) -> None:
+    """Draw the error within which a run counts as settled, where the table of runs tells it."""
+    if np.isfinite(track.settling_band):
+        label = f"settling band, {track.settling_band:g} {track.error_unit[0]}"
+        axes.axhline(track.settling_band, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=label)
 
 
 def draw_jacobian(axes: Axes, tracks: Tracks, styles: Styles) -> None:
     """Draw the relative error of the estimated Jacobian over time, logarithmic."""
     exact = [name for name, track in tracks.items() if np.nanmax(track.column("jacobian_error"), initial=0.0) < EXACT]
-    _draw_over_time(
-        axes, {name: track for name, track in tracks.items() if name not in exact}, styles, "jacobian_error", 100.0
-    )
+    others = {name: track for name, track in tracks.items() if name not in exact}
+    _draw_over_time(axes, others, styles, lambda track: 100.0 * track.column("jacobian_error"))
     for name in exact:
         axes.plot([], [], label=f"{name} (exact)", **styles[name].line_arguments(1))
     axes.set_ylabel("Jacobian error [%]")
@@ -54,33 +59,30 @@ def draw_jacobian(axes: Axes, tracks: Tracks, styles: Styles) -> None:
 
 def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:
     """Draw a feature as it was measured, and the desired one."""
-    longest = max(tracks.values(), key=lambda track: len(track.table))
-    axes.plot(
-        longest.time, longest.column(f"reference_{feature}"), color="black", linewidth=3.0, alpha=0.3, label="desired"
-    )
-    _draw_over_time(axes, tracks, styles, f"feature_{feature}", 1.0)
+    whole = longest(tracks)
+    axes.plot(whole.time, whole.column(f"reference_{feature}"), **DESIRED)
+    _draw_over_time(axes, tracks, styles, lambda track: track.column(f"feature_{feature}"))
     axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
 def draw_path(axes: Axes3D, tracks: Tracks, styles: Styles) -> None:
     """Draw the true paths as the camera sees them, tilted a little: x right, y down, depth away from the reader."""
-    longest = max(tracks.values(), key=lambda track: len(track.table))
-    if len(longest.features) < 3:
+    whole = longest(tracks)
+    if len(whole.features) < 3:
         axes.set_axis_off()
         axes.text2D(0.5, 0.5, "fewer than three features", transform=axes.transAxes, ha="center")
         return
-    reference = longest.vectors("reference_")[:, :3]
-    if not longest.point_to_point:
-        axes.plot(*reference.T, color="black", linewidth=3.0, alpha=0.3, label="desired")
+    reference = whole.vectors("reference_")[:, :3]
+    if not whole.point_to_point:
+        axes.plot(*reference.T, **DESIRED)
     for name, track in tracks.items():
         points = _finite_rows(track.vectors("true_feature_")[:, :3])
         if len(points):
             axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
             if not track.completed:
-                axes.plot(*points[-1:].T, color=styles[name].colour, marker=END, markersize=14, markeredgewidth=2.0,
-                          linestyle="", zorder=12, gid=ENDED)  # fmt: skip
-    _draw_ends(axes, longest, reference)
-    _dress_space(axes, longest.features)
+                axes.plot(*points[-1:].T, color=styles[name].colour, **END_MARK)
+    _draw_ends(axes, whole, reference)
+    _label_space(axes, whole.features)
 
 
 def draw_places(
@@ -112,18 +114,10 @@ def draw_places(
             below = y - np.where(np.isfinite(low), low, np.nan)[known]
             above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y  # out of the picture
             axes.errorbar(
-                x[known],
-                y,
-                yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0),
-                color=style.colour,
-                linestyle=style.line if joined else "none",
-                marker=style.marker or "_",
-                markersize=4.5,
-                linewidth=1.2,
-                elinewidth=1.0,
-                capsize=2.0,
-                label=name,
-            )
+                x[known], y, yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0), color=style.colour,
+                linestyle=style.line if joined else "none", marker=style.marker or "_", markersize=4.5, linewidth=1.2,
+                elinewidth=1.0, capsize=2.0, label=name,
+            )  # fmt: skip
 
 
 def panel_grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
@@ -167,23 +161,27 @@ def scale_by_size(axes: Axes) -> None:
     """Make the value axis logarithmic with plain numbers, if there is anything above zero on it."""
     values = [np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.get_lines()]
     if any((part > 0.0).any() for part in values):
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+        plain_logarithms(axes)
     else:
-        axes.text(0.5, 0.5, NO_VALUES, transform=axes.transAxes, ha="center", va="center", color="0.4")
+        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color="0.4")
 
 
-def _draw_over_time(axes: Axes, tracks: Tracks, styles: Styles, column: str, factor: float) -> None:
+def plain_logarithms(axes: Axes) -> None:
+    """Make the value axis logarithmic with plain numbers."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+
+
+def _draw_over_time(axes: Axes, tracks: Tracks, styles: Styles, curve: Callable[[Track], FloatArray]) -> None:
     for name, track in tracks.items():
-        values = factor * track.column(column)
+        values = curve(track)
         if not np.isfinite(values).any():
             continue
         axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
         if not track.completed:
             last = np.flatnonzero(np.isfinite(values))[-1]
-            axes.plot(track.time[last], values[last], color=styles[name].colour, marker=END, markersize=14,
-                      markeredgewidth=2.0, linestyle="", zorder=12, gid=ENDED)  # fmt: skip
+            axes.plot(track.time[last], values[last], color=styles[name].colour, **END_MARK)
 
 
 def _draw_ends(axes: Axes3D, track: Track, reference: FloatArray) -> None:
@@ -195,7 +193,7 @@ def _draw_ends(axes: Axes3D, track: Track, reference: FloatArray) -> None:
                   label="target", zorder=11)  # fmt: skip
 
 
-def _dress_space(axes: Axes3D, features: list[str]) -> None:
+def _label_space(axes: Axes3D, features: list[str]) -> None:
     labels = [label_of(name) for name in features[:3]]
     axes.set(xlabel=labels[0], ylabel=labels[1], zlabel=labels[2].replace("z [", "depth z ["))
     lower, upper = axes.get_zlim()

@@ -1,7 +1,7 @@
-"""A logged run shown again: its joint positions put into the rendered scene, seen from aside and by its own camera.
+"""A logged run shown again: the rendered arm at its joint positions, seen from outside and by its own camera.
 
-The true robot is drawn anew from the run's mismatch and seed and compared with the values in the table. Nothing is
-simulated: the arm stands in each frame where the log says, and the ball is found in an image without noise.
+The true robot is sampled again from the run's mismatch and seed and compared with the values in the table. Nothing is
+simulated: each frame has the logged joint positions, and the ball is detected in an image without noise.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, fields, replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -32,23 +32,16 @@ if TYPE_CHECKING:
 
 EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame: from the front right, down to the workspace
 OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
-INSIDE = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
-PALE = 0.3  # share of its colour that a hidden part of a trail keeps
+SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
+HIDDEN_OPACITY = 0.3  # of the parts of a trail that are hidden
 
 
-@dataclass(frozen=True, eq=False)
-class Trail:
-    """A line in space to be drawn into the overview.
+class Trail(NamedTuple):
+    """A line in space to be drawn into the overview."""
 
-    Attributes:
-        points: (k, 3), m, base frame.
-        colour: red, green, blue.
-        width: px.
-    """
-
-    points: FloatArray
-    colour: tuple[int, int, int]
-    width: int
+    points: FloatArray  # (k, 3) [m], base frame
+    colour: tuple[int, int, int]  # red, green, blue
+    width: int  # [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +49,16 @@ class LoggedRun:
     """What is needed to show a run again.
 
     Attributes:
-        row: its row in the table of runs.
-        track: its steps.
+        track: its row in the table of runs, and its steps.
         model: the true arm and camera.
         moved: the same after the camera was moved in the middle of the run; None if it was not.
         moved_from: first period that the moved camera sees; the number of periods if none.
         config: the rendered plant's settings, for its camera.
-        joint_position: (k, n), rad, as reported.
-        ball: (k, 3), m, base frame.
-        reference: (k, 3), m, base frame.
+        joint_position: (k, n) [rad], as reported.
+        ball: (k, 3) [m], base frame.
+        reference: (k, 3) [m], base frame.
     """
 
-    row: dict[str, Any]
     track: Track
     model: HandEyeModel
     moved: HandEyeModel | None
@@ -79,7 +70,7 @@ class LoggedRun:
 
 
 def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[str, Any]) -> LoggedRun:
-    """Return a run made ready to be shown.
+    """Prepare a run to be shown.
 
     Args:
         row: its row in the table of runs.
@@ -96,7 +87,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         )
     if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
-    track = Track(run_id, row["status"], steps.reset_index(drop=True))
+    track = Track(row, steps.reset_index(drop=True))
     names = [f"joint_position_{name}_rad" for name in ur5.JOINT_NAMES]
     missing = [name for name in names if name not in steps]
     if missing:
@@ -114,8 +105,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         later = points[:0] if moved is None else moved.to_base(points[moved_from:])
         return np.concatenate([model.to_base(points[:moved_from]), later])
 
-    reference = in_base(track.vectors("reference_"))
-    return LoggedRun(row, track, model, moved, moved_from, config, q, in_base(ball), reference)
+    return LoggedRun(track, model, moved, moved_from, config, q, in_base(ball), in_base(track.vectors("reference_")))
 
 
 class Replay:
@@ -126,7 +116,7 @@ class Replay:
 
         Args:
             run: what to show.
-            fineness: pixels rendered for one of the overview, along each side; above 1 edges become smooth.
+            fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
         from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet prints a banner when it is imported
 
@@ -144,7 +134,7 @@ class Replay:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Leave the world."""
+        """Close the world."""
         self._scene.close()
 
     def place(self, k: int) -> None:
@@ -153,13 +143,13 @@ class Replay:
         self._scene.place(self._run.model.arm.joint_angle(self._run.joint_position[k]))
 
     def camera_view(self) -> ByteArray:
-        """Return what the run's camera sees, (h, w, 3), the detected ball marked."""
+        """Return the image of the run's camera with the detected ball marked, (h, w, 3)."""
         rgba, buffer = self._scene.render(self._camera, self._pose)
         found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
         return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
 
     def overview(self, trails: list[Trail]) -> ByteArray:
-        """Return the arm from aside, (480, 640, 3) times the fineness, with trails; what is hidden is pale."""
+        """Return the arm from outside with trails, pale where they are hidden: (480, 640, 3) times the fineness."""
         rgba, buffer = self._scene.render(self._overview, self._overview_pose)
         picture = np.ascontiguousarray(rgba[..., :3])
         depth = self._overview.metric_depth(buffer)
@@ -177,7 +167,7 @@ class Replay:
         pixels = camera.project(p_C)
         columns = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
         rows = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
-        hidden = p_C[:, 2] > depth[rows, columns] + INSIDE
+        hidden = p_C[:, 2] > depth[rows, columns] + SEEN_DEPTH
         corners = np.round(pixels * 16).astype(np.int32)
         width = max(1, round(trail.width * self._fineness))
         covered = hidden[1:] | hidden[:-1]
@@ -186,14 +176,14 @@ class Replay:
             for i in np.flatnonzero(covered == wanted):
                 cv2.line(layer, corners[i].tolist(), corners[i + 1].tolist(), trail.colour, width, cv2.LINE_AA, 4)
             if wanted:
-                cv2.addWeighted(layer, PALE, picture, 1 - PALE, 0.0, dst=picture)
+                cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
 
 
 def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]:
-    """Return the run's true robot, and what it was after its camera was moved; None if it was not.
+    """Return the run's true robot, and the one after its camera was moved; None if it was not.
 
     Raises:
-        ConfigurationError: its mismatch cannot be drawn, or other values come out than the table has.
+        ConfigurationError: its mismatch cannot be sampled, or its values are not those of the table.
     """
     try:
         mismatch = Mismatch.parse(row["mismatch"])

@@ -13,20 +13,9 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW, GREY, BLACK = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-    "#B8A900",
-    "#7F7F7F",
-    "#000000",
-)
+BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
+SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
 WINE = "#882255"  # of Tol's palette, which goes with it
-
-
 MARKS = 8  # on each line
 
 
@@ -58,13 +47,8 @@ class MethodStyle:
         return self._arguments() | {"markevery": np.unique(np.searchsorted(way, places)).tolist()}
 
     def _arguments(self) -> dict[str, Any]:
-        return {
-            "color": self.colour,
-            "linestyle": self.line,
-            "marker": self.marker,
-            "markersize": 4.5,
-            "linewidth": 1.4,
-        }
+        look = {"color": self.colour, "linestyle": self.line, "marker": self.marker}
+        return look | {"markersize": 4.5, "linewidth": 1.4}
 
 
 _STYLES = {

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import COMPLETED
@@ -22,48 +24,51 @@ class Track:
     """The steps of one run.
 
     Attributes:
-        run_id: the run's name.
-        status: how it ended.
-        table: its rows, at least one; columns without any value are left out.
+        row: its row in the table of runs.
+        table: its steps, at least one; columns without any value are left out.
     """
 
-    run_id: str
-    status: str
+    row: Mapping[str, Any]
     table: pd.DataFrame
 
     @property
     def completed(self) -> bool:
         """Whether the run reached its last period."""
-        return self.status == COMPLETED
+        return bool(self.row["status"] == COMPLETED)
 
     @property
     def time(self) -> FloatArray:
-        """Instants, (k,) s."""
+        """Instants, (k,) [s]."""
         return self.column("time_s")
 
     @property
     def features(self) -> list[str]:
         """Names of the features with their unit, such as `x_m`."""
-        return [name.removeprefix(FEATURE) for name in self.table.columns if name.startswith(FEATURE) and
-                f"reference_{name.removeprefix(FEATURE)}" in self.table.columns]  # fmt: skip
-
-    @property
-    def joints(self) -> list[str]:
-        """Names of the joints with their unit, such as `elbow_rad`."""
-        return [
-            name.removeprefix("joint_position_") for name in self.table.columns if name.startswith("joint_position_")
-        ]
+        names = [name.removeprefix(FEATURE) for name in self.table.columns if name.startswith(FEATURE)]
+        return [name for name in names if f"reference_{name}" in self.table.columns]
 
     @property
     def point_to_point(self) -> bool:
         """Whether the reference rests."""
         return bool(np.ptp(self.vectors("reference_"), axis=0).max(initial=0.0) == 0.0)
 
+    @property
+    def error_unit(self) -> tuple[str, float]:
+        """The unit in which errors are shown, and the factor to it from that of the feature."""
+        return handy_unit(self.row.get("feature_unit"))
+
+    @property
+    def settling_band(self) -> float:
+        """The error within which the run counts as settled [`error_unit`]; NaN if the table does not tell it."""
+        return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
+
+    def error(self) -> FloatArray:
+        """Return the norm of the true error, (k,) [`error_unit`]."""
+        return self.error_unit[1] * self.column("error_norm")
+
     def column(self, name: str) -> FloatArray:
         """Return a column as (k,) numbers; NaN where the run has none."""
-        if name not in self.table.columns:
-            return np.full(len(self.table), np.nan)
-        return np.asarray(self.table[name].to_numpy(dtype=np.float64))
+        return np.asarray(self.table.get(name, pd.Series(np.nan, self.table.index)), dtype=np.float64)
 
     def vectors(self, kind: str) -> FloatArray:
         """Return the features of a kind (`feature_`, `true_feature_`, `reference_`), (k, m) in their unit."""
@@ -116,8 +121,13 @@ def load_groups(folder: Path) -> Iterator[Group]:
         for row in chosen.to_dict("records"):
             if row["run_id"] in tables:
                 table = tables[row["run_id"]].dropna(axis=1, how="all").reset_index(drop=True)
-                tasks.setdefault(row["task"], {})[row["controller"]] = Track(row["run_id"], row["status"], table)
+                tasks.setdefault(row["task"], {})[row["controller"]] = Track({str(k): row[k] for k in row}, table)
         yield Group(str(plant), str(mismatch), int(chosen["seed"].iloc[0]), tasks)
+
+
+def longest(tracks: Tracks) -> Track:
+    """Return the track with the most periods."""
+    return max(tracks.values(), key=lambda track: len(track.table))
 
 
 def label_of(feature: str) -> str:

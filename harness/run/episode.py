@@ -14,7 +14,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.log import StepLog
 from servobench.harness.run.loop import run_loop
-from servobench.harness.run.metrics import judge_run
+from servobench.harness.run.metrics import SETTLING_BAND, judge_run
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.threads import one_thread
@@ -89,6 +89,7 @@ def carry_out(
         **request.as_row(),
         "task_kind": scenario.kind,
         "feature_unit": plant.spec.feature_unit,
+        "settling_band": SETTLING_BAND * plant.spec.feature.scale,
         "status": status,
         **metrics,
         "periods": len(logged),

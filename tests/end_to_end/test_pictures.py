@@ -132,12 +132,15 @@ def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_
 
 def test_a_plant_with_other_features_and_joints_is_drawn_under_its_own_names(tmp_path):
     steps = made_up_steps("a", features=("sway_angle_rad", "trolley_m"))
-    row = made_up_row("a", plant="fmu:/some where/crane.toml", mismatch="none", task="target")
+    row = made_up_row(
+        "a", plant="fmu:/some where/crane.toml", mismatch="none", task="target", feature_unit="rad", settling_band=0.1
+    )
     for named in folder_figures(write_folder(tmp_path / "out", [row], [steps])):
         assert set(named.stem) <= set("abcdefghijklmnopqrstuvwxyz_0123456789.")
         if named.kind == "errors":
             labels = [axes.get_ylabel() for axes in named.figure.axes]
-            assert labels == ["true error", "measured\nsway_angle [rad]", "measured\ntrolley [m]"]
+            assert labels == ["true error [rad]", "measured\nsway_angle [rad]", "measured\ntrolley [m]"]
+            assert "settling band, 0.1 rad" in legend_of(named.figure)
         if named.kind == "paths":
             assert "fewer than three features" in [text.get_text() for text in named.figure.axes[0].texts]
 
@@ -167,9 +170,9 @@ def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
     folder = write_folder(tmp_path / "out", rows, [made_up_steps(row["run_id"]) for row in rows])
     (group,) = load_groups(folder)
     assert group.seed == 3
-    assert group.tasks["exp1"]["ukf_mfac"].run_id == "run3"
+    assert group.tasks["exp1"]["ukf_mfac"].row["run_id"] == "run3"
 
 
 def test_a_resting_reference_is_told_from_a_moving_one():
-    assert Track("a", "completed", made_up_steps("a")).point_to_point
-    assert not Track("a", "completed", made_up_steps("a", curve=True)).point_to_point
+    assert Track({}, made_up_steps("a")).point_to_point
+    assert not Track({}, made_up_steps("a", curve=True)).point_to_point

@@ -15,7 +15,7 @@ from PIL import Image
 from kit.command import servobench
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.pictures import film as record
+from servobench.harness.pictures import film
 from servobench.harness.pictures.replay import Replay, Trail, logged_run
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
@@ -38,7 +38,7 @@ def run(result):
 def folder(tmp_path_factory, result):
     made = tmp_path_factory.mktemp("record") / "out"
     results.create_folder(made, {"configuration": {"bullet": {"width": 160, "height": 120}}})
-    results.write_part(made, 0, result.row, result.steps)
+    results.write_part(made, 0, [result])
     results.collect(made)
     return made
 
@@ -78,8 +78,8 @@ def test_a_trail_is_drawn_in_its_colour_and_pale_behind_the_arm(run):
 
 
 def test_a_frame_shows_the_time_grow(run):
-    first, last = record.draw_frame(run, 0), record.draw_frame(run, 39)
-    assert first.shape == last.shape == (record.HEIGHT, record.WIDTH, 3)
+    first, last = film.draw_frame(run, 0), film.draw_frame(run, 39)
+    assert first.shape == last.shape == (film.HEIGHT, film.WIDTH, 3)
     colour = np.array(mpl.colors.to_rgb(method_styles(["calibrated"])["calibrated"].colour)) * 255
     error_panel = (slice(550, 680), slice(90, 930))
     dark = [(np.abs(frame[error_panel] - colour).max(axis=2) < 30).sum() for frame in (first, last)]
@@ -91,7 +91,7 @@ def films(run, tmp_path_factory):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
     told = []
     stem = tmp_path_factory.mktemp("films") / "run"
-    paths = record.write_recording(run, stem, record.KINDS, lambda share, what: told.append((share, what)))
+    paths = film.write_recording(run, stem, film.KINDS, lambda share, what: told.append((share, what)))
     return paths, told
 
 
@@ -102,9 +102,9 @@ def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
     assert [path.name for path in paths] == ["run_snapshots.png", "run_snapshots.pdf", "run.mp4", "run.gif"]
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(paths[2]))
     assert (frames, seconds) == (40, pytest.approx(2.0, abs=0.05))
-    with Image.open(paths[3]) as film:
-        assert film.n_frames == 20
-        assert film.size[0] == record.GIF_WIDTH
+    with Image.open(paths[3]) as gif:
+        assert gif.n_frames == 20
+        assert gif.size[0] == film.GIF_WIDTH
     assert paths[3].stat().st_size < 6e6 * 2.0 / 20.0
     shares = [share for share, what in told if what == "frames"]
     assert shares == sorted(shares)
@@ -112,11 +112,11 @@ def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
 
 
 def test_snapshots_go_once_around(run):
-    assert record._lap(run) == 39
+    assert film._lap(run) == 39
     twice = replace(run, reference=np.concatenate([run.reference, run.reference]))
-    assert 38 <= record._lap(twice) <= 41
+    assert 38 <= film._lap(twice) <= 41
     resting = replace(run, reference=np.tile(run.reference[0], (40, 1)))
-    assert record._lap(resting) == 39
+    assert film._lap(resting) == 39
 
 
 def test_without_ffmpeg_there_is_one_line(monkeypatch, capsys, tmp_path, folder):
@@ -163,7 +163,7 @@ def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, folder, arguments,
 def test_a_folder_with_several_runs_wants_a_name(monkeypatch, capsys, tmp_path, result):
     results.create_folder(tmp_path / "out", {})
     for index, name in enumerate(("a", "b")):
-        results.write_part(tmp_path / "out", index, result.row | {"run_id": name}, result.steps)
+        results.write_part(tmp_path / "out", index, [replace(result, row=result.row | {"run_id": name})])
     assert servobench(monkeypatch, "record", str(tmp_path / "out")) == 2
     assert "holds 2 runs; name one with --run, such as a" in capsys.readouterr().err
 
@@ -208,7 +208,7 @@ def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
     np.testing.assert_allclose(np.ptp(before, axis=0), 0.0, atol=1e-9)
     np.testing.assert_allclose(np.ptp(after, axis=0), 0.0, atol=1e-9)
     assert np.linalg.norm(after[0] - before[0]) > 0.1
-    targets = [record._trails(shown, k)[0].points.mean(axis=0) for k in (0, 20, 21, 39)]
+    targets = [film._trails(shown, k)[0].points.mean(axis=0) for k in (0, 20, 21, 39)]
     np.testing.assert_allclose(targets, [before[0], before[0], after[0], after[0]], atol=1e-9)
     with Replay(shown) as replay:
         views = []

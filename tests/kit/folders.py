@@ -42,7 +42,7 @@ def made_up_row(run_id: str, **values: object) -> dict[str, object]:
         "steady_state_error": 0.001, "rms_error_evaluated": 0.002, "max_error": 0.5, "control_effort_rad": 3.0,
         "saturation_fraction": 0.1, "jacobian_error_mean": 0.3, "controller_time_median_us": 130.0,
         "controller_time_p99_us": 159.0, "periods": 60, "reason": "", "mismatch_values": "{}",
-        "task_kind": "point_to_point", "feature_unit": "m",
+        "task_kind": "point_to_point", "feature_unit": "m", "settling_band": 0.005,
     }  # fmt: skip
     return row | values
 
