@@ -95,7 +95,7 @@ class FmuWorld(World):
         self._has_joints = bool(mapping.joints)
         self._command = Port(find(mapping.inputs, "inputs"))
         self._result = Port(find((*mapping.joints, *mapping.features), "joints and features"))
-        self._write, self._read = instance.raw_writer(self._command), instance.raw_reader(self._result)
+        self._write, self._read = instance.access("Set", self._command), instance.access("Get", self._result)
         self._step = instance.stepper(self._own_step)
         self._split = self._result.values.size - self._spec.m
         self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]

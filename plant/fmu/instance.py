@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import platform
 import shutil
-import sys
 import tempfile
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
@@ -180,28 +178,20 @@ class Instance(ABC):
     def _buffer(self, port: Port) -> tuple[Any, ...]:
         """Return the arguments that pass a port's buffer to C."""
 
-    def raw_reader(self, port: Port) -> RawCall:
-        """Return a function that reads the port's variables into its buffer, for the inner loop."""
-        return self._access("Get", port)
-
-    def raw_writer(self, port: Port) -> RawCall:
-        """Return a function that writes the port's buffer into its variables, for the inner loop."""
-        return self._access("Set", port)
-
-    def _access(self, verb: str, port: Port) -> RawCall:
+    def access(self, verb: Literal["Get", "Set"], port: Port) -> RawCall:
+        """Return a function that reads or writes the port's variables by its buffer, for the inner loop."""
         function = self.function(f"{verb}{self.real}")
         return partial(function, self._component, *port.variables, *self._buffer(port))
 
     def reader(self, port: Port) -> Call:
         """Return a function that reads the port's variables into its buffer and checks the status."""
-        return self._checked(f"reading {port.summary}", self.raw_reader(port))
+        read = self.access("Get", port)
+        return lambda: self.check(f"reading {port.summary}", read())
 
     def writer(self, port: Port) -> Call:
         """Return a function that writes the port's buffer into its variables and checks the status."""
-        return self._checked(f"writing {port.summary}", self.raw_writer(port))
-
-    def _checked(self, what: str, call: RawCall) -> Call:
-        return lambda: self.check(what, call())
+        write = self.access("Set", port)
+        return lambda: self.check(f"writing {port.summary}", write())
 
     def derivative(self, unknowns: Port, knowns: Port) -> None:
         """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
@@ -273,23 +263,16 @@ class Instance(ABC):
             raise ValueError(f"the library in {file} does not export {self.prefix}{name}") from error
 
 
-def library_folders(version: int) -> tuple[str, ...]:
-    """Return the folders below binaries/ in which a library for this machine may be, by FMI version."""
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
-    system = {"win32": "windows"}.get(sys.platform, sys.platform)
-    old = {"linux": "linux64", "darwin": "darwin64", "windows": "win64"}.get(system, system)
-    return (f"{machine}-{system}", old) if version == 2 else (f"{machine}-{system}",)
-
-
 def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN401 - a ctypes library
     """Load the FMU's library for this machine.
 
     Raises:
         ValueError: there is none, or it cannot be loaded.
     """
-    suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
-    for folder in library_folders(description.version):
-        file = root / "binaries" / folder / f"{description.identifier}{suffix}"
+    import fmpy  # noqa: PLC0415 - see parse_description
+
+    for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
+        file = root / "binaries" / folder / f"{description.identifier}{fmpy.sharedLibraryExtension}"
         if file.is_file():
             try:
                 return ctypes.CDLL(str(file)) if not description.once_per_process else _load_copy(file)
@@ -299,7 +282,7 @@ def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN40
     there = sorted(folder.name for folder in binaries.iterdir()) if binaries.is_dir() else []
     raise ValueError(
         f"fmu file {description.path} has no library for this machine; "
-        f"wanted {library_folders(description.version)[0]}, it has: {', '.join(there) or 'none'}"
+        f"wanted {fmpy.platform_tuple}, it has: {', '.join(there) or 'none'}"
     )
 
 
@@ -311,6 +294,6 @@ def _load_copy(file: Path) -> ctypes.CDLL:
 
 def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library
     """Give the library back to the system."""
-    from fmpy import freeLibrary  # noqa: PLC0415 - see read_description
+    from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
 
     freeLibrary(library._handle)

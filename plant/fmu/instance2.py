@@ -94,7 +94,7 @@ class Instance2(Instance):
 
 def _callbacks(log: MessageLog) -> _Callbacks:
     """Return the callbacks of an instance; fmpy's proxy formats messages with printf arguments, which ctypes cannot."""
-    import fmpy  # noqa: PLC0415 - see read_description
+    import fmpy  # noqa: PLC0415 - see parse_description
 
     callbacks = _Callbacks(
         logger=_on_message,

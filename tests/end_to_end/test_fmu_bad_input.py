@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from kit.command import servobench
-from kit.foreign_fmu import build_crane, describe
+from kit.foreign_fmu import build_crane, describe_with
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
@@ -19,6 +19,9 @@ MAPPING = {
     2: f'inputs = ["push.slew", "push.luff"]\nfeatures = ["place.slew", "place.luff"]\n{JOINTS}\n',
     3: 'inputs = "push"\nfeatures = "place"\njoints = "wheel"\n',
 }
+
+FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
+EXCHANGE_ONLY = describe_with(2, "<CoSimulation", "<ModelExchange")
 
 
 @pytest.fixture
@@ -40,24 +43,10 @@ def run(monkeypatch, tmp_path: Path, version: int, more: str = "") -> tuple[int,
     return servobench(monkeypatch, *arguments), out
 
 
-def changed(version: int, old: str, new: str) -> str:
-    text = describe(version)
-    assert old in text
-    return text.replace(old, new)
-
-
 def write(path: Path, entries: dict[str, str]) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in entries.items():
             archive.writestr(name, content)
-
-
-def describe_fmi1() -> str:
-    return changed(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
-
-
-def describe_exchange_only() -> str:
-    return changed(2, "<CoSimulation", "<ModelExchange")
 
 
 # What is wrong before anything is loaded; all three commands say so.
@@ -72,7 +61,10 @@ ARCHIVES = {
     "no description": (lambda path: write(path, {"readme": "hello"}), "holds no modelDescription.xml"),
     "broken XML": (lambda path: build_crane(path, 2, description="<fmiModelDescription"), "a broken modelDescription"),
     "not FMI": (lambda path: build_crane(path, 2, description="<html/>"), "crane.fmu is of FMI none"),
-    "FMI 1": (lambda path: build_crane(path, 2, description=describe_fmi1()), "crane.fmu is of FMI 1.0; wanted FMI 2"),
+    "FMI 1": (
+        lambda path: build_crane(path, 2, description=FMI1),
+        "crane.fmu is of FMI 1.0; wanted FMI 2",
+    ),
 }
 
 
@@ -96,16 +88,21 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
     ("version", "arguments", "more", "message"),
     [
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
-        (2, {"description": describe_exchange_only()}, "", "offers model exchange only; wanted co-simulation"),
+        (
+            2,
+            {"description": EXCHANGE_ONLY},
+            "",
+            "offers model exchange only; wanted co-simulation",
+        ),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
         (2, {}, "[parameters]\nquirk = 5\n", "fmi2EnterInitializationMode returned error"),
         (
             3,
-            {"description": changed(3, 'start="2"', 'start="3"')},
+            {"description": describe_with(3, 'start="2"', 'start="3"')},
             "",
             "reading wheel[1], wheel[2], wheel[3], … returned",
         ),
-        (3, {"description": changed(3, 'start="2"', 'start="two"')}, "", "a broken modelDescription.xml: "),
+        (3, {"description": describe_with(3, 'start="2"', 'start="two"')}, "", "a broken modelDescription.xml: "),
         (
             3,
             {},

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kit.foreign_fmu import build_crane, describe
+from kit.foreign_fmu import build_crane, describe_with
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.faults import FmuError
@@ -25,37 +25,26 @@ from servobench.plant.signals import Command
 QUIET = FmuConfig(0, SensingConfig(0.0))
 START = np.array([0.3, 1.2])
 PERIOD = 0.05
-TOML = {
+ROLES = {
     2: """
-file = "crane.fmu"
 inputs = ["push.slew", "push.luff"]
 features = ["place.slew", "place.luff"]
 joints = ["wheel.slew", "wheel.luff"]
-period = 0.01
-[parameters]
-"arm.slew" = 0.6
-"arm.luff" = 0.3
-[limits]
-max_joint_speed = 2.0
-[names]
-joints = ["slew", "luff"]
-features = ["x", "y"]
+parameters = {"arm.slew" = 0.6, "arm.luff" = 0.3}
 """,
     3: """
-file = "crane.fmu"
 inputs = "push"
 features = ["place"]
 joints = ["wheel"]
-period = 0.01
-[parameters]
-arm = [0.6, 0.3]
-[limits]
-max_joint_speed = 2.0
-[names]
-joints = ["slew", "luff"]
-features = ["x", "y"]
+parameters = {arm = [0.6, 0.3]}
 """,
 }
+TOML = """
+file = "crane.fmu"
+period = 0.01
+limits = {max_joint_speed = 2.0}
+names = {joints = ["slew", "luff"], features = ["x", "y"]}
+"""
 NAMES = {
     2: {
         "inputs": ("push.slew", "push.luff"),
@@ -90,7 +79,7 @@ def place_of(q, arm=(0.5, 0.4)):
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_loop_closes_on_a_foreign_fmu_through_a_mapping_alone(tmp_path, version):
     build_crane(tmp_path / "crane.fmu", version)
-    (tmp_path / "crane.toml").write_text(TOML[version])
+    (tmp_path / "crane.toml").write_text(TOML + ROLES[version])
     entry = mapped_entry(tmp_path / "crane.toml")
     plant = entry.build(QUIET, PlantSetup(nominal_ur5(), START, PERIOD))
     assert plant.spec.joint_names == ("slew", "luff")
@@ -123,21 +112,6 @@ def test_without_joints_the_commands_are_integrated(tmp_path):
     for _ in range(3):
         observation = plant.step(Command([1.0, -3.0]))
     np.testing.assert_allclose(observation.joint_position, START + 3 * PERIOD * np.array([1.0, -2.0]), atol=1e-14)
-    plant.close()
-
-
-def test_feature_noise_has_the_configured_size_and_the_same_seed_gives_the_same_bits(tmp_path):
-    plant = crane(tmp_path, 2, FmuConfig(0, SensingConfig(0.01, 1, 0.1)))
-    runs = []
-    for _ in range(2):
-        first = plant.reset(3)
-        rows = [plant.step(Command([0.0, 0.0])) for _ in range(200)]
-        runs.append([first.feature.tolist(), *((row.feature.tolist(), row.feature_valid) for row in rows)])
-    assert runs[0] == runs[1]
-    spread = np.std([row.feature for row in rows if row.feature_valid], axis=0)
-    assert (spread > 0.007).all()
-    assert (spread < 0.013).all()
-    assert 0 < sum(not row.feature_valid for row in rows) < 50
     plant.close()
 
 
@@ -201,20 +175,6 @@ def test_a_mapping_that_does_not_fit_is_one_clear_error(tmp_path, changes, messa
         crane(tmp_path, 2, **changes)
 
 
-def test_an_fmu_that_refuses_its_start_is_a_value_error_to_the_registry(tmp_path):
-    build_crane(tmp_path / "crane.fmu", 2)
-    (tmp_path / "crane.toml").write_text(TOML[2].replace("[parameters]", "[parameters]\nquirk = 5"))
-    with pytest.raises(ValueError, match="fmi2EnterInitializationMode returned error"):
-        mapped_entry(tmp_path / "crane.toml").build(QUIET, PlantSetup(nominal_ur5(), START, PERIOD))
-
-
-def test_a_command_of_the_wrong_size_is_refused(tmp_path):
-    plant = crane(tmp_path, 2)
-    with pytest.raises(ValueError, match=r"joint_velocity must have shape \(2,\), got \(3,\)"):
-        plant.step(Command([0.0, 0.0, 0.0]))
-    plant.close()
-
-
 def test_a_state_that_cannot_be_serialised_is_kept_by_the_plant_that_saved_it():
     plant = build_ur5(Ur5FmuConfig(), PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
     plant.world.description = replace(plant.world.description, can_serialise=False)
@@ -245,28 +205,6 @@ def test_a_closed_plant_may_be_closed_again_but_not_stepped(tmp_path):
         plant.step(Command([0.0, 0.0]))
 
 
-def rewritten(version: int, old: str, new: str) -> str:
-    text = describe(version)
-    assert old in text
-    return text.replace(old, new)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"folder": "riscv64-plan9"}, "no library for this machine; wanted .*; ?it has: riscv64-plan9|riscv64-plan9"),
-        ({"description": "<fmiModelDescription"}, "broken modelDescription.xml"),
-        ({"description": rewritten(2, 'fmiVersion="2.0"', 'fmiVersion="1.0"')}, "FMI 1|broken"),
-        ({"description": rewritten(2, "<CoSimulation", "<ModelExchange")}, "offers model exchange only"),
-        ({"description": rewritten(2, '"crane"', '"other"')}, "no library for this machine"),
-    ],
-)
-def test_an_fmu_that_cannot_be_used_is_one_clear_error(tmp_path, arguments, message):
-    path = build_crane(tmp_path / "crane.fmu", 2, **arguments)
-    with pytest.raises(ValueError, match=message):
-        FmuWorld(FmuMapping(path, **NAMES[2]), START, PERIOD)
-
-
 def test_a_library_that_is_none_is_refused(tmp_path):
     path = build_crane(tmp_path / "crane.fmu", 2)
     with zipfile.ZipFile(path) as archive:
@@ -287,18 +225,6 @@ def test_an_archive_that_climbs_out_of_its_folder_is_refused(tmp_path, name):
     with pytest.raises(ValueError, match="would climb out"):
         extract_fmu(path)
     assert not list(tmp_path.rglob("evil.txt"))
-
-
-def test_what_is_not_an_archive_of_an_fmu_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="does not exist"):
-        extract_fmu(tmp_path / "missing.fmu")
-    (tmp_path / "text.fmu").write_text("hello")
-    with pytest.raises(ValueError, match="not a zip archive"):
-        extract_fmu(tmp_path / "text.fmu")
-    with zipfile.ZipFile(tmp_path / "empty.fmu", "w") as archive:
-        archive.writestr("readme", "hello")
-    with pytest.raises(ValueError, match="holds no modelDescription.xml"):
-        extract_fmu(tmp_path / "empty.fmu")
 
 
 def test_an_fmu_is_extracted_once_and_again_where_its_content_changes(tmp_path, cache):
@@ -329,7 +255,7 @@ def test_a_second_plant_of_an_fmu_reads_neither_archive_nor_description(tmp_path
 def test_an_fmu_that_bears_one_instance_a_process_gets_a_library_for_each(tmp_path, only_once):
     # The crane keeps its callbacks in a static variable, so in one library the second instance gets the messages.
     flag = f'canBeInstantiatedOnlyOncePerProcess="{str(only_once).lower()}"'
-    description = rewritten(2, "<CoSimulation", f"<CoSimulation {flag}")
+    description = describe_with(2, "<CoSimulation", f"<CoSimulation {flag}")
     path = build_crane(tmp_path / "crane.fmu", 2, description=description)
     mapping = FmuMapping(path, **NAMES[2], parameters={"quirk": np.array(1.0)})
     first, second = FmuWorld(mapping, START, PERIOD), FmuWorld(mapping, START, PERIOD)

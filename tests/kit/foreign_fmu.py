@@ -85,6 +85,13 @@ def describe(version: int) -> str:
     )
 
 
+def describe_with(version: int, old: str, new: str) -> str:
+    """Return the model description with `new` in place of `old`, which it has to hold."""
+    text = describe(version)
+    assert old in text
+    return text.replace(old, new)
+
+
 @cache
 def library(version: int) -> bytes:
     with tempfile.TemporaryDirectory() as folder:

@@ -125,36 +125,26 @@ def test_camera_and_base_frame_are_inverse_to_each_other():
     np.testing.assert_allclose(model.to_camera(points[0, 0]), homogeneous[:3], atol=1e-15)
 
 
-def calibration(tmp_path, change):
+def calibration(**changes):
+    """The text of a calibration file in which some blocks have other entries."""
     blocks = {name: dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1) for name in CALIBRATION_BLOCKS}
-    change(blocks)
-    path = tmp_path / "calibration.yaml"
-    path.write_text(yaml.safe_dump({"kinematics": blocks}), encoding="utf-8")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda blocks: blocks.pop("wrist_2"), "lacks 'wrist_2'; wanted 'kinematics' with the blocks shoulder"),
-        (lambda blocks: blocks["forearm"].pop("yaw"), "lacks 'yaw'"),
-        (lambda blocks: blocks["shoulder"].update(x="long"), "holds something that is not a number"),
-        (lambda blocks: blocks["shoulder"].update(x=[1.0]), "holds something that is not a number"),
-        (lambda blocks: blocks.update(shoulder=None), "holds something that is not a number"),
-        (lambda blocks: blocks["wrist_1"].update(z=float("nan")), "holds a number that is not finite"),
-        (lambda blocks: blocks["wrist_1"].update(z=float("inf")), "holds a number that is not finite"),
-    ],
-)
-def test_a_malformed_calibration_is_one_clear_error(tmp_path, change, message):
-    with pytest.raises(ValueError, match=message) as caught:
-        arm_from_calibration(calibration(tmp_path, change), TOOL, JOINT_NAMES)
-    assert "\n" not in str(caught.value)
-    assert "calibration.yaml" in str(caught.value)
+    blocks |= {name: entries and blocks[name] | entries for name, entries in changes.items()}
+    return yaml.safe_dump({"kinematics": blocks}).encode()
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        (
+            calibration().replace(b"wrist_2", b"wrist_7"),
+            "lacks 'wrist_2'; wanted 'kinematics' with the blocks",
+        ),
+        (calibration().replace(b"yaw", b"jaw"), "lacks 'yaw'"),
+        (calibration(shoulder={"x": "long"}), "holds something that is not a number"),
+        (calibration(shoulder={"x": [1.0]}), "holds something that is not a number"),
+        (calibration(shoulder=None), "holds something that is not a number"),
+        (calibration(wrist_1={"z": float("nan")}), "holds a number that is not finite"),
+        (calibration(wrist_1={"z": float("inf")}), "holds a number that is not finite"),
         (None, "cannot be read: No such file"),
         (b"{ not: [yaml", "is not valid YAML"),
         (b"", "holds something that is not a number"),
@@ -163,18 +153,13 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, change, message):
         (b"\xff\xfe\xfa\x00", "calibration file"),
     ],
 )
-def test_a_file_that_is_no_calibration_is_one_clear_error(tmp_path, content, message):
-    path = tmp_path / "other.yaml"
+def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
+    path = tmp_path / "calibration.yaml"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=f"calibration.yaml .*{message}|{message} .*calibration.yaml") as caught:
         arm_from_calibration(path, TOOL, JOINT_NAMES)
     assert "\n" not in str(caught.value)
-
-
-def test_a_well_formed_calibration_loads(tmp_path):
-    arm = arm_from_calibration(calibration(tmp_path, lambda blocks: None), TOOL, JOINT_NAMES)
-    assert arm.n == 6
 
 
 @pytest.mark.parametrize(

@@ -34,21 +34,11 @@ def record(plant, seed: int) -> list[tuple[float, bytes, bytes, bool]]:
     return [(o.time, o.joint_position.tobytes(), o.feature.tobytes(), o.feature_valid) for o in observations]
 
 
-def test_the_spec_tells_sizes_that_observations_have(plant):
+def test_a_run_begins_at_its_start_at_time_zero_and_time_counts_periods(plant):
     observation = plant.reset(0)
-    assert observation.joint_position.shape == (plant.spec.n,)
+    assert (observation.time, plant.spec.period) == (0.0, PERIOD)
     assert observation.feature.shape == (plant.spec.m,)
-    assert plant.spec.period == PERIOD
-
-
-def test_it_starts_where_it_was_told_to_at_time_zero(plant):
-    observation = plant.reset(0)
-    assert observation.time == 0.0
     np.testing.assert_allclose(observation.joint_position, HOME, atol=1e-6)
-
-
-def test_time_is_the_number_of_periods_times_the_period(plant):
-    plant.reset(0)
     assert [plant.step(Command(u)).time for u in COMMANDS] == [(k + 1) * PERIOD for k in range(len(COMMANDS))]
 
 
