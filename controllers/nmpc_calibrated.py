@@ -13,7 +13,7 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
 from servobench.controllers.laws.mpc.closed_form import decay_targets, move_weights
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
-from servobench.controllers.laws.mpc.qp import QpShape, QpSolution
+from servobench.controllers.laws.mpc.qp import QpShape, QpSolution, Solver
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, Share, settings
@@ -44,7 +44,7 @@ class NmpcCalibratedConfig:
     """[rad/s²] limit of the change between two commands; inf: none."""
     limit_position: bool = True
     """Keep the predicted joint positions within the plant's limits."""
-    solver: Literal["daqp", "qpoases"] = "daqp"
+    solver: Solver = "daqp"
     """Solver of the quadratic programs; "qpoases" for a cross-check."""
     fallback: Literal["hold", "raise"] = "hold"
     """Without a solution: zero velocity, or `SolverFailed`."""

@@ -16,7 +16,7 @@ learned while the command is limited.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import final
 
 import numpy as np
@@ -29,19 +29,29 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Observation
 
 
-@dataclass(frozen=True)
-class CorrectionGains:
-    """The settings of the correction, per period.
+@final
+@dataclass(eq=False)
+class LearnedCorrection:
+    """The law above. W, (n, m + n, N_h), lies in the row space of Ĵ, so that W = Ĵᵀ C is held by C, half its size.
+
+    C ← (1 − l) (ĴĴᵀ + δ²I)⁻¹ Ĵ(k) Ĵ(k−1)ᵀ C + α e(k+1) (ξ ⊗ h)
 
     Attributes:
+        network: has the hidden layer; its ξ must hold one error and one joint position.
+        posture: q_c, (n,), rad.
+        limit: of a joint step, (n,), rad.
         k: step size, 0 ≤ k < 2; 0 learns nothing.
         epsilon: ε, m⁴.
         leak: l, share of the weights that is forgotten per period.
-        error_share: γ.
-        posture_share: κ.
+        error_share: γ, per period.
+        posture_share: κ, per period.
         damping: δ, m/rad.
     """
 
+    network: ControllerNetwork
+    posture: FloatArray
+    limit: FloatArray
+    _: KW_ONLY
     k: float
     epsilon: float
     leak: float
@@ -49,29 +59,14 @@ class CorrectionGains:
     posture_share: float
     damping: float
 
-
-@final
-class LearnedCorrection:
-    """The law above. W, (n, m + n, N_h), lies in the row space of Ĵ, so that W = Ĵᵀ C is held by C, half its size.
-
-    C ← (1 − l) (ĴĴᵀ + δ²I)⁻¹ Ĵ(k) Ĵ(k−1)ᵀ C + α e(k+1) (ξ ⊗ h)
-    """
-
-    def __init__(
-        self, gains: CorrectionGains, network: ControllerNetwork, posture: FloatArray, limit: FloatArray
-    ) -> None:
-        """Take the hidden layer of `network`, q_c (n,), rad, and the limit of a joint step (n,), rad.
-
-        Raises:
-            ValueError: a network whose ξ holds more than one error and one joint position.
-        """
-        if (network.error_history, network.position_history) != (1, 1):
+    def __post_init__(self) -> None:
+        """Check the network and start without weights."""
+        if (self.network.error_history, self.network.position_history) != (1, 1):
             raise ValueError(
                 "error_history and position_history must be 1 for base 'jacobian', got "
-                f"{network.error_history} and {network.position_history}"
+                f"{self.network.error_history} and {self.network.position_history}"
             )
-        self._gains, self._network, self._posture = gains, network, posture
-        self._reach: FloatArray = 1.0 / limit
+        self._reach: FloatArray = 1.0 / self.limit
         self._forget()
 
     def reset(self, observation: Observation) -> None:
@@ -79,7 +74,7 @@ class LearnedCorrection:
         self._forget()
 
     def _forget(self) -> None:
-        network = self._network
+        network = self.network
         self._C: FloatArray = np.zeros((network.m, (network.m + network.n) * network.weights.shape[2]))
         self._jacobian: FloatArray = np.zeros((network.m, network.n))  # Ĵ of the last step
         self.step_size = 0.0
@@ -100,18 +95,17 @@ class LearnedCorrection:
         Returns:
             dq, (n,), rad.
         """
-        gains = self._gains
-        pinv = damped_inverse(jacobian, gains.damping)
-        away = self._posture - joint_position
-        wanted = step_with_posture(pinv, jacobian, gains.error_share * error, away, gains.posture_share)
+        pinv = damped_inverse(jacobian, self.damping)
+        away = self.posture - joint_position
+        wanted = step_with_posture(pinv, jacobian, self.error_share * error, away, self.posture_share)
         following = pinv.dot(forward)
-        if gains.k == 0.0:
+        if self.k == 0.0:
             return np.asarray(wanted + following)
-        kept = (1.0 - gains.leak) * self._jacobian.dot(pinv).T
+        kept = (1.0 - self.leak) * self._jacobian.dot(pinv).T
         C = self._C = kept.dot(self._C)
         self._jacobian = jacobian
         xi = np.concatenate([error, joint_position])
-        seen = np.multiply.outer(xi, self._network.features(xi)).ravel()  # ξ ⊗ h
+        seen = np.multiply.outer(xi, self.network.features(xi)).ravel()  # ξ ⊗ h
         wanted += C.dot(seen).dot(jacobian)
         excess = max(1.0, float(max(map(abs, (wanted * self._reach).tolist()))))
         ahead = self._predicted = error - jacobian.dot(wanted) / excess
@@ -120,14 +114,14 @@ class LearnedCorrection:
             return np.asarray(wanted + following)
         pull = ahead.dot(jacobian)
         others = float(seen.dot(seen))  # ‖G‖² without what Ĵᵀe adds
-        self.step_size = gains.k * float(ahead.dot(ahead)) / (gains.epsilon + float(pull.dot(pull)) * others)
+        self.step_size = self.k * float(ahead.dot(ahead)) / (self.epsilon + float(pull.dot(pull)) * others)
         C += np.multiply.outer(self.step_size * ahead, seen)
         return np.asarray(wanted + (self.step_size * others) * pull + following)
 
     @property
     def weights(self) -> FloatArray:
         """W as it is now, (n, m + n, N_h)."""
-        network = self._network
+        network = self.network
         return np.asarray(self._jacobian.T @ self._C).reshape(network.n, network.m + network.n, -1)
 
     def diagnostics(self) -> Diagnostics:

@@ -22,11 +22,12 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.inverses import damped_inverse
 from servobench.controllers.laws.law import Law, Stage
-from servobench.controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
+from servobench.controllers.laws.learned_correction import LearnedCorrection
 from servobench.controllers.laws.limit import largest_excess, redistribute, scale_to_limit
 from servobench.controllers.laws.prediction import Predictor, shifted
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.file import TrainedNetworks
+from servobench.controllers.networks.rbf import ControllerNetwork
 from servobench.controllers.rotation import nearest_rotation
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Count, NonNegative, Positive, Share, settings
@@ -79,11 +80,6 @@ class RbfnnBridgedConfig:
         if self.base == "network" and self.k == 0.0:
             raise ValueError("k must be above 0 for base 'network', got 0")
 
-    def gains(self, period: float) -> CorrectionGains:
-        """Return what the base "jacobian" needs, for a control period [s]."""
-        error_share, posture_share = (1.0 - math.exp(-gain * period) for gain in (self.gain, self.posture_gain))
-        return CorrectionGains(self.k, self.epsilon, self.leak, error_share, posture_share, self.damping)
-
 
 @final
 class RbfnnBridgedLaw(Law):
@@ -119,8 +115,7 @@ class RbfnnBridgedLaw(Law):
             settings = RbfnnConfig(config.horizon, config.k, config.epsilon, preview=not config.feedforward)
             self._law: LearnedCorrection | RbfnnLaw = RbfnnLaw(settings, knowledge, networks)
         else:
-            posture = centres.mean(axis=(0, 1))
-            self._law = LearnedCorrection(config.gains(spec.period), network, posture, self._limit)
+            self._law = self._correction(network, centres.mean(axis=(0, 1)))
         self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
         self._predictor = Predictor(
             spec.n,
@@ -132,6 +127,20 @@ class RbfnnBridgedLaw(Law):
             model_error=config.model_error,
         )
         self._wanted = np.zeros(self._n)
+
+    def _correction(self, network: ControllerNetwork, posture: FloatArray) -> LearnedCorrection:
+        config = self._config
+        return LearnedCorrection(
+            network,
+            posture,
+            self._limit,
+            k=config.k,
+            epsilon=config.epsilon,
+            leak=config.leak,
+            error_share=1.0 - math.exp(-config.gain * self._period),
+            posture_share=1.0 - math.exp(-config.posture_gain * self._period),
+            damping=config.damping,
+        )
 
     def reset(self, observation: Observation) -> None:
         """Forget everything that was learned and seen."""

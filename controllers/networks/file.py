@@ -14,6 +14,7 @@ from servobench.plant.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 1
+ARRAYS = ("centres", "widths", "weights")  # of either network
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,34 +60,26 @@ def save_networks(networks: TrainedNetworks, path: Path) -> None:
     write_atomically(path, write)
 
 
-def load_networks(
-    path: Path, *, n: int | None = None, m: int | None = None, digest: str | None = None
-) -> TrainedNetworks:
+def load_networks(path: Path, digest: str | None = None) -> TrainedNetworks:
     """Read networks from `path`.
 
     Args:
         path: as written by `save_networks`.
-        n: wanted number of joints, None for any.
-        m: wanted number of features, None for any.
-        digest: wanted hash of configuration and model, None for any.
+        digest: wanted hash of configuration, sizes and model; None for any.
 
     Raises:
-        ValueError: missing, corrupt, foreign, of another format version, of other sizes, or of another configuration.
+        ValueError: missing, corrupt, foreign, of another format version, or of another robot or configuration.
     """
     arrays = _read_arrays(path)
     try:
         networks = _from_arrays(arrays)
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(f"network file {path} is corrupt: {error}") from error
-    for name, wanted, came in (
-        ("joints", n, networks.jacobian.n),
-        ("features", m, networks.jacobian.m),
-        ("training digest", digest, networks.digest),
-    ):
-        if wanted is not None and wanted != came:
-            raise ValueError(
-                f"network file {path} is of another robot or configuration: {name} {came}, wanted {wanted}"
-            )
+    if digest is not None and digest != networks.digest:
+        raise ValueError(
+            f"network file {path} is of another robot or configuration: training digest {networks.digest}, "
+            f"wanted {digest}"
+        )
     return networks
 
 
@@ -117,27 +110,18 @@ def _as_arrays(networks: TrainedNetworks) -> dict[str, Any]:
         "history": np.array([controller.error_history, controller.position_history]),
         "kernel": np.array(controller.kernel),
         "held_out_error": np.array([networks.jacobian_error, networks.controller_error]),
-        "jacobian_centres": jacobian.centres,
-        "jacobian_widths": jacobian.widths,
-        "jacobian_weights": jacobian.weights,
-        "controller_centres": controller.centres,
-        "controller_widths": controller.widths,
-        "controller_weights": controller.weights,
+        **{f"jacobian_{name}": getattr(jacobian, name) for name in ARRAYS},
+        **{f"controller_{name}": getattr(controller, name) for name in ARRAYS},
     }
 
 
 def _from_arrays(arrays: dict[str, Any]) -> TrainedNetworks:
     error_history, position_history = (int(value) for value in arrays["history"])
     jacobian_error, controller_error = (float(value) for value in arrays["held_out_error"])
-    jacobian = JacobianNetwork(arrays["jacobian_centres"], arrays["jacobian_widths"], arrays["jacobian_weights"])
+    jacobian = JacobianNetwork(*(arrays[f"jacobian_{name}"] for name in ARRAYS))
     if tuple(arrays["sizes"].tolist()) != (jacobian.n, jacobian.m):
         raise ValueError(f"sizes must be {(jacobian.n, jacobian.m)}, got {arrays['sizes'].tolist()}")
-    controller = ControllerNetwork(
-        arrays["controller_centres"],
-        arrays["controller_widths"],
-        arrays["controller_weights"],
-        error_history,
-        position_history,
-        cast(Kernel, str(arrays["kernel"])),
-    )
+    centres, widths, weights = (arrays[f"controller_{name}"] for name in ARRAYS)
+    kernel = cast(Kernel, str(arrays["kernel"]))
+    controller = ControllerNetwork(centres, widths, weights, error_history, position_history, kernel)
     return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, str(arrays["digest"]))

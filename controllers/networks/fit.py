@@ -88,7 +88,7 @@ def train_cached(
     digest = training_digest(config, nominal_jacobian, spec)
     path = folder / f"networks-{digest[:16]}.npz"
     if path.exists():
-        return load_networks(path, n=spec.n, m=spec.m, digest=digest)
+        return load_networks(path, digest)
     networks = train(config, nominal_jacobian, spec, progress)
     save_networks(networks, path)
     return networks
@@ -156,7 +156,7 @@ def _train_jacobian(
     centres = joint_samples(choose_centres(pool, plan.centres, rng, placement), lower, upper)
     q = joint_samples(unit, lower, upper)
     J = _checked(nominal_jacobian, q, spec)
-    held = held_out_count(plan.samples, config.held_out)
+    held = max(1, round(plan.samples * config.held_out))
     spread = float(np.linalg.norm(upper - lower)) / 2.0
     squares: FloatArray = np.full(spec.n, np.inf)
     widths, weights = np.ones((spec.n, plan.centres)), np.zeros((spec.n, spec.m, plan.centres))
@@ -186,7 +186,7 @@ def _train_controller(
     pool_xi = controller_samples(pool, config, spec, nominal_jacobian).xi
     centres = choose_centres(pool_xi, plan.hidden, rng, plan.placement)
     wanted = samples.command
-    held = held_out_count(plan.samples, config.held_out)
+    held = max(1, round(plan.samples * config.held_out))
     spread = float(np.sqrt(np.mean(np.sum((pool_xi - pool_xi.mean(axis=0)) ** 2, axis=-1))))
     best, network = np.inf, None
     for index, scale in enumerate(plan.width_scales):
@@ -244,11 +244,6 @@ def ridge_path(features: FloatArray, targets: FloatArray, regularisations: tuple
     largest = eigenvalues[-1]
     for relative in regularisations:
         yield V @ (projected / (np.maximum(eigenvalues, 0.0) + relative * largest)[:, None])
-
-
-def held_out_count(samples: int, share: float) -> int:
-    """Return how many of the samples are held out, at least one."""
-    return max(1, round(samples * share))
 
 
 def _checked(nominal_jacobian: JacobianFunction, q: FloatArray, spec: PlantSpec) -> FloatArray:

@@ -114,17 +114,13 @@ class JacobianNetwork:
 
     def __post_init__(self) -> None:
         """Check that the three arrays fit together and freeze them."""
-        _freeze(self, ("centres", "widths", "weights"))
         if self.centres.ndim != 3 or self.weights.ndim != 3 or 0 in self.centres.shape + self.weights.shape:
             raise ValueError(
                 "centres and weights must be (n, L, n) and (n, m, L) with all sizes at least 1, "
                 f"got {self.centres.shape} and {self.weights.shape}"
             )
         n, units = self.centres.shape[:2]
-        _check_shape("centres", self.centres, (n, units, n))
-        _check_shape("widths", self.widths, (n, units))
-        _check_shape("weights", self.weights, (n, self.m, units))
-        _check_positive("widths", self.widths)
+        _freeze(self, centres=(n, units, n), widths=(n, units), weights=(n, self.m, units))
 
     @property
     def n(self) -> int:
@@ -196,15 +192,12 @@ class ControllerNetwork:
 
     def __post_init__(self) -> None:
         """Check that arrays and sizes fit together and freeze the arrays."""
-        _freeze(self, ("centres", "widths", "weights"))
         if self.kernel not in KERNELS:
             raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, got {self.kernel!r}")
         if self.weights.ndim != 3 or 0 in self.weights.shape:
             raise ValueError(f"weights must be (n, p, N_h) with all sizes at least 1, got {self.weights.shape}")
         n, p, hidden = self.weights.shape
-        _check_shape("centres", self.centres, (hidden, p))
-        _check_shape("widths", self.widths, (hidden,))
-        _check_positive("widths", self.widths)
+        _freeze(self, centres=(hidden, p), widths=(hidden,), weights=(n, p, hidden))
         left = p - n * self.position_history
         if self.error_history < 1 or self.position_history < 1 or left < 1 or left % self.error_history:
             raise ValueError(
@@ -244,20 +237,15 @@ class ControllerNetwork:
         return np.ones(self.centres.shape[1]), -1.0 / self.widths**2
 
 
-def _freeze(network: object, names: tuple[str, ...]) -> None:
-    for name in names:
+def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, ...]) -> None:
+    """Check shapes and values of the arrays of a network and make them read-only."""
+    for name, wanted in shapes.items():
         array = np.array(getattr(network, name), dtype=np.float64)
+        if array.shape != wanted:
+            raise ValueError(f"{name} must have shape {wanted}, got {array.shape}")
         if not np.isfinite(array).all():
             raise ValueError(f"{name} of a network must be finite")
         array.flags.writeable = False
         object.__setattr__(network, name, array)
-
-
-def _check_shape(name: str, array: FloatArray, wanted: tuple[int, ...]) -> None:
-    if array.shape != wanted:
-        raise ValueError(f"{name} must have shape {wanted}, got {array.shape}")
-
-
-def _check_positive(name: str, array: FloatArray) -> None:
-    if not (array > 0.0).all():
-        raise ValueError(f"{name} must be positive, the smallest is {array.min()}")
+    if not (network.widths > 0.0).all():
+        raise ValueError(f"widths must be positive, the smallest is {network.widths.min()}")

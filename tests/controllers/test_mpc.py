@@ -331,5 +331,3 @@ def test_settings_that_do_not_fit_the_plant_are_named():
         MpcLaw(replace(config, view_tangent=(0.5, 0.5)), RobotKnowledge(make_spec(m=2), 10))
     with pytest.raises(ValueError, match=r"joint_weight must have shape \(6,\), got \(2,\)"):
         MpcLaw(replace(config, joint_weight=(1.0, 2.0)), RobotKnowledge(make_spec(), 10))
-    with pytest.raises(ValueError, match="solver must be one of daqp, qpoases, got 'osqp'"):
-        QpProgram(program()[1], "osqp")

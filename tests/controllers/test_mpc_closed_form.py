@@ -147,17 +147,3 @@ def test_decay_targets_leave_the_share_beta_of_the_error():
     reference_step = np.array([[0.01, 0.0], [0.02, 0.0]])
     left = e + reference_step - decay_targets(e, reference_step, 0.5)
     np.testing.assert_allclose(left, np.exp(-0.5 * np.array([[1.0], [2.0]])) * e, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((0, 0.9, 0.1), "horizon must be above 0, got 0"),
-        ((5, 0.0, 0.1), "alpha must be above 0 and at most 1, got 0.0"),
-        ((5, 1.1, 0.1), "alpha must be above 0 and at most 1, got 1.1"),
-        ((5, 0.9, -0.1), "rho must be at least 0, got -0.1"),
-    ],
-)
-def test_an_argument_out_of_bounds_is_named(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        horizon_integrals(*arguments)

@@ -11,7 +11,7 @@ from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.inverses import damped_inverse
-from servobench.controllers.laws.learned_correction import CorrectionGains, LearnedCorrection
+from servobench.controllers.laws.learned_correction import LearnedCorrection
 from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, update_step
 from servobench.controllers.networks.rbf import ControllerNetwork
@@ -62,11 +62,11 @@ def test_without_redistribution_a_command_that_exceeds_the_limit_is_scaled_as_a_
 
 def gains(**changes):
     settings = {"k": 0.3, "epsilon": 0.0, "leak": 0.0, "error_share": 0.4, "posture_share": 0.0}
-    return CorrectionGains(**{**settings, "damping": 1e-9, **changes})
+    return {**settings, "damping": 1e-9, **changes}
 
 
 def correction(**changes):
-    return LearnedCorrection(gains(**changes), networks().controller, np.zeros(N), np.full(N, 10.0))
+    return LearnedCorrection(networks().controller, np.zeros(N), np.full(N, 10.0), **gains(**changes))
 
 
 def learned_before(made, rng, scale):
@@ -237,4 +237,4 @@ def test_what_does_not_fit_together_is_refused():
     with pytest.raises(
         ValueError, match="error_history and position_history must be 1 for base 'jacobian', got 2 and 1"
     ):
-        LearnedCorrection(gains(), longer, np.zeros(N), np.ones(N))
+        LearnedCorrection(longer, np.zeros(N), np.ones(N), **gains())

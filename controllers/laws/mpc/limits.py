@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, QpSolution
+from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, QpSolution, Solver
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import PlantSpec
 
@@ -58,12 +58,8 @@ class LimitedProgram:
     Rows that no feasible plan touches change nothing but the time: they are a third of it for six joints and ten moves.
     """
 
-    def __init__(self, shape: QpShape, solver: str) -> None:
-        """Build the program, twice where the shape limits positions.
-
-        Raises:
-            ValueError: an unknown solver.
-        """
+    def __init__(self, shape: QpShape, solver: Solver) -> None:
+        """Build the program, twice where the shape limits positions."""
         self._horizon = shape.horizon
         self._without = QpProgram(replace(shape, limit_position=False), solver)
         self._with = QpProgram(shape, solver) if shape.limit_position else self._without

@@ -22,7 +22,7 @@ from servobench.controllers.laws.mpc.closed_form import (
     preview_weights,
 )
 from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
-from servobench.controllers.laws.mpc.qp import QpBounds, QpShape, QpSolution
+from servobench.controllers.laws.mpc.qp import QpBounds, QpShape, QpSolution, Solver
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, settings
@@ -59,7 +59,7 @@ class MpcConfig:
     """Keep the predicted joint positions within the plant's limits."""
     view_tangent: tuple[Positive, ...] = ()
     """[1] (horizontal, vertical): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty: no limit."""
-    solver: Literal["daqp", "qpoases"] = "daqp"
+    solver: Solver = "daqp"
     """Solver of the quadratic programs: the fastest of CasADi's here, or another for a cross-check."""
     fallback: Literal["hold", "closed_form", "raise"] = "hold"
     """Without a solution: zero velocity, the law without limits scaled to the speed limit, or `SolverFailed`."""
@@ -121,7 +121,18 @@ class MpcLaw(Law):
         self._preview_weights = preview_weights(config.horizon, config.alpha)
         self._gain = self._integrals.a + config.terminal_weight * config.horizon**2
         self._view = _view_rows(config.view_tangent, spec.m)
-        self._program = LimitedProgram(self._shape(), config.solver)
+        constant = config.mode == "constant"
+        shape = QpShape(
+            n=spec.n,
+            m=spec.m,
+            weights=self._weights,
+            move_weight=self._Q,
+            constant_gain=self._gain if constant else None,
+            limit_acceleration=math.isfinite(config.joint_acceleration_limit) and not constant,
+            limit_position=config.limit_position,
+            view_rows=self._view,
+        )
+        self._program = LimitedProgram(shape, config.solver)
         self._forget()
 
     def reset(self, observation: Observation) -> None:
@@ -162,20 +173,6 @@ class MpcLaw(Law):
         self._sent: deque[FloatArray] = deque([np.zeros(n)] * delay, maxlen=delay)
         self._fallbacks = 0
         self._diagnostics: dict[str, float] = {}
-
-    def _shape(self) -> QpShape:
-        config = self._config
-        constant = config.mode == "constant"
-        return QpShape(
-            n=self._spec.n,
-            m=self._spec.m,
-            weights=self._weights,
-            move_weight=self._Q,
-            constant_gain=self._gain if constant else None,
-            limit_acceleration=math.isfinite(config.joint_acceleration_limit) and not constant,
-            limit_position=config.limit_position,
-            view_rows=self._view,
-        )
 
     def _program_targets(self, error: FloatArray, travel: FloatArray) -> FloatArray:
         """The targets of the program, (H, m) m, or integrated over the horizon, (1, m), in constant-move mode."""

@@ -17,18 +17,18 @@ from __future__ import annotations
 import contextlib
 import io
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 
 from servobench.plant.checks import FloatArray
 
+Solver: TypeAlias = Literal["daqp", "qpoases"]
 # Tolerances are those of the constraints in rad: far below an encoder step, far above rounding.
-_SOLVER_OPTIONS: Final[dict[str, dict[str, Any]]] = {
+_SOLVER_OPTIONS: Final[dict[Solver, dict[str, Any]]] = {
     "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}},
     "qpoases": {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12},
 }
-SOLVERS: Final = tuple(_SOLVER_OPTIONS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,18 +119,13 @@ class QpProgram:
     horizon: ∫ τ α^τ target(τ) dτ.
     """
 
-    def __init__(self, shape: QpShape, solver: str) -> None:
+    def __init__(self, shape: QpShape, solver: Solver) -> None:
         """Build the program.
 
         Args:
             shape: sizes, weights and the kinds of rows.
-            solver: one of `SOLVERS`.
-
-        Raises:
-            ValueError: an unknown solver.
+            solver: its name.
         """
-        if solver not in SOLVERS:
-            raise ValueError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
         self._shape = shape
         self._solver = solver
         self.x, self.p, self.objective, self.rows = _expressions(shape)
