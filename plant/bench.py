@@ -22,7 +22,7 @@ from servobench.plant.faults import FeatureLost
 from servobench.plant.plant import Abilities, ImageArray, Plant, TrueModel
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import NonNegative, Periods, ShareBelowOne, settings
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth, trusted_observation
+from servobench.plant.signals import Command, Observation, Truth, trusted_observation
 
 Config = TypeVar("Config")
 
@@ -130,18 +130,13 @@ class Bench(Plant):
         self.world = world
         self._delay, self._sensing = command_delay_periods, sensing
         self._noise_scale = sensing.noise_factor * sensing.feature_noise
-        spec = self._spec = world.spec
+        spec = self.spec = world.spec
         self._shape, self._period = (spec.n,), spec.period
         self._lower, self._upper = spec.command.lower, spec.command.upper
         self._all_valid, self._none_valid = np.ones(spec.m, dtype=np.bool_), np.zeros(spec.m, dtype=np.bool_)
         for mask in (self._all_valid, self._none_valid):
             mask.setflags(write=False)
         self._k = -1
-
-    @property
-    def spec(self) -> PlantSpec:
-        """Sizes, names, limits and period."""
-        return self._spec
 
     def reset(self, seed: int) -> Observation:
         """Return to the start; feature noise and lost frames get random streams of their own. See `Plant.reset`."""
@@ -151,7 +146,7 @@ class Bench(Plant):
         first = self._expose()
         if first is None:
             raise FeatureLost(self.world.why_unseen())
-        rest = np.zeros(self._spec.n)
+        rest = np.zeros(self.spec.n)
         rest.setflags(write=False)
         self._commands = deque([rest] * self._delay)
         self._frames: deque[FloatArray | None] = deque([first] * self._sensing.latency_periods)

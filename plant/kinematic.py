@@ -22,7 +22,7 @@ from servobench.plant.faults import PlantDiverged
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.settings import NonNegative, Periods, Positive, nested, settings
-from servobench.plant.signals import PlantSpec, Truth
+from servobench.plant.signals import Truth
 
 
 @settings
@@ -74,21 +74,16 @@ class KinematicWorld(World):
         """
         self._model, start = setup.robot()
         self._X_BC = self._model.X_BC
-        self._spec = hand_eye_spec(self._model, setup.period, config.max_joint_speed, config.joint_range)
-        self._start = as_vector("start", start, self._spec.n)
+        self.spec = hand_eye_spec(self._model, setup.period, config.max_joint_speed, config.joint_range)
+        self._start = as_vector("start", start, self.spec.n)
         A, B = discretise_lag(config.lag, setup.period)
         self._coefficients = float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1])
         self._truth: Truth | None = None
 
-    @property
-    def spec(self) -> PlantSpec:
-        """Sizes, names, limits and period."""
-        return self._spec
-
     def reset(self, seed: int) -> FloatArray:
         """Go back to the start at rest; nothing here is random."""
         self.move_camera(self._X_BC)
-        self._q, self._v = self._start, np.zeros(self._spec.n)
+        self._q, self._v = self._start, np.zeros(self.spec.n)
         return self._q
 
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
@@ -98,7 +93,7 @@ class KinematicWorld(World):
         v = kept * self._v + to_v * joint_velocity
         if not math.isfinite(sum(q.tolist())):
             raise PlantDiverged(f"joint positions are not finite: {q.tolist()}")
-        self._q = np.minimum(np.maximum(q, self._spec.joint_lower), self._spec.joint_upper)
+        self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
         self._v = np.where(self._q == q, v, 0.0)
         self._q.setflags(write=False)
         self._truth = None

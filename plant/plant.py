@@ -39,10 +39,8 @@ class TrueModel:
 class Abilities(ABC):
     """What a plant and a world can do beside moving; what neither is bound to know has a default."""
 
-    @property
-    @abstractmethod
-    def spec(self) -> PlantSpec:
-        """Sizes, names, limits and period."""
+    spec: PlantSpec
+    """Sizes, names, limits and period; set on construction."""
 
     @abstractmethod
     def truth(self) -> Truth:

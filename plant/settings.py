@@ -46,14 +46,6 @@ Periods: TypeAlias = Annotated[int, Ge(0)]
 """A whole number of control periods, or another count that may be 0."""
 
 
-def _as_names(value: Any) -> Any:  # noqa: ANN401 - what a file holds
-    return (value,) if isinstance(value, str) else value
-
-
-def _as_path(value: Any) -> Any:  # noqa: ANN401 - what a file holds
-    return Path(value) if isinstance(value, str) else value
-
-
 def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
     if isinstance(value, np.ndarray):
         return value.astype(np.float64)
@@ -63,11 +55,11 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
     return np.array(value, dtype=np.float64)
 
 
-Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(_as_names)]
+Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(lambda name: (name,) if isinstance(name, str) else name)]
 """One name or several."""
 Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
 """An array of numbers; in a file, a number or a list of numbers."""
-File: TypeAlias = Annotated[Path, BeforeValidator(_as_path)]
+File: TypeAlias = Annotated[Path, BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)]
 """The path of a file."""
 
 Class = TypeVar("Class", bound=type)

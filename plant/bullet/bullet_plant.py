@@ -30,7 +30,7 @@ from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
-from servobench.plant.signals import PlantSpec, Truth
+from servobench.plant.signals import Truth
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import Scene
@@ -147,8 +147,8 @@ class BulletWorld(World):
 
         model, start = setup.robot()
         self._config, self._model = config, model
-        self._spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
-        self._start = as_vector("start", start, self._spec.n)
+        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
+        self._start = as_vector("start", start, self.spec.n)
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
         if not model.arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {model.arm.gear_ratio.tolist()}")
@@ -157,16 +157,11 @@ class BulletWorld(World):
         self._X_BC = model.X_BC
         self._scene: Scene = Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view)
 
-    @property
-    def spec(self) -> PlantSpec:
-        """Sizes, names, limits and period."""
-        return self._spec
-
     def reset(self, seed: int) -> FloatArray:
         """Go back to the start at rest; the depth noise gets a random stream of its own. See `World.reset`."""
         self._noise = named_generator(seed, "depth_noise")
         self.move_camera(self._X_BC)
-        self._v = np.zeros(self._spec.n)
+        self._v = np.zeros(self.spec.n)
         self._periods = 0
         self._scene.place(self._model.arm.joint_angle(self._start))
         self._started = time.perf_counter()
@@ -175,7 +170,7 @@ class BulletWorld(World):
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
         """Hold a command for one period; see `World.advance`."""
         q = self._joint_position()
-        room = np.minimum(self._spec.joint_lower - q, 0.0), np.maximum(self._spec.joint_upper - q, 0.0)
+        room = np.minimum(self.spec.joint_lower - q, 0.0), np.maximum(self.spec.joint_upper - q, 0.0)
         targets = velocity_targets(self._v, joint_velocity, self._decay, self._steps, room)
         self._v = targets[-1]
         self._scene.advance((targets * self._model.arm.gear_ratio).tolist())
@@ -250,7 +245,7 @@ class BulletWorld(World):
 
     def _keep_pace(self) -> None:
         """Wait until the wall clock has come as far as the run; only with a window."""
-        time.sleep(max(0.0, self._started + self._periods * self._spec.period - time.perf_counter()))
+        time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
 
 
 def build_bullet(config: BulletConfig, setup: PlantSetup) -> Bench:

@@ -59,8 +59,8 @@ class Patch:
 
 
 @dataclass(frozen=True, eq=False)
-class SphereFit:
-    """A sphere of known radius fitted to depths.
+class Detection:
+    """A ball as a sphere of known radius fitted to depths.
 
     Attributes:
         centre: (3,), m, camera frame.
@@ -73,21 +73,6 @@ class SphereFit:
     residual: float
     used: int
     uncertainty: float
-
-
-@dataclass(frozen=True, eq=False)
-class Detection:
-    """A ball that was found.
-
-    Attributes:
-        centre: (3,), m, camera frame.
-        fit: how well the sphere fits.
-        visible: share of the ball's disc that is seen, about 1 where nothing hides it.
-    """
-
-    centre: FloatArray
-    fit: SphereFit
-    visible: float
 
 
 def find_patch(rgb: ByteArray) -> Patch | None:
@@ -137,7 +122,7 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
     visible = len(depth) / disc_area(fit.centre, camera, radius)
     plausible = fit.residual <= MAX_RESIDUAL * radius and fit.uncertainty <= MAX_UNCERTAINTY * radius
     complete = MIN_VISIBLE <= visible <= MAX_VISIBLE and fit.used >= 0.5 * len(depth)
-    return Detection(fit.centre, fit, visible) if plausible and complete else None
+    return fit if plausible and complete else None
 
 
 def find_ball(
@@ -169,7 +154,7 @@ def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float
     return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
 
 
-def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> SphereFit | None:
+def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: float) -> Detection | None:
     """Fit the centre of a sphere of known radius to depths along rays.
 
     Args:
@@ -201,7 +186,7 @@ def fit_sphere(rays: FloatArray, depth: FloatArray, start: FloatArray, radius: f
             break
     residual = math.sqrt(e @ e / len(e))
     # The inverse of Gauss-Newton's normal matrix is the centre's covariance for unit noise.
-    return SphereFit(centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal))))
+    return Detection(centre, residual, len(e), residual * math.sqrt(np.trace(np.linalg.inv(normal))))
 
 
 def first_hit(rays: FloatArray, centre: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:

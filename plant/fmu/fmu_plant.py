@@ -28,7 +28,7 @@ from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.plant import PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.settings import Names, Periods, nested, settings
-from servobench.plant.signals import PlantSpec, Truth
+from servobench.plant.signals import Truth
 
 
 @settings
@@ -78,9 +78,9 @@ class FmuWorld(World):
         self._mapping = mapping
         root = extract_fmu(mapping.file)
         self.description = read_description(mapping.file, root)
-        self._spec = mapping_spec(mapping, self.description, period)
+        self.spec = mapping_spec(mapping, self.description, period)
         self._has_start = start is not None
-        self._start = as_vector("start", np.zeros(self._spec.n) if start is None else start, self._spec.n)
+        self._start = as_vector("start", np.zeros(self.spec.n) if start is None else start, self.spec.n)
         self._instance = open_instance(self.description, root)
         try:
             self._connect(mapping)
@@ -97,7 +97,7 @@ class FmuWorld(World):
         self._result = Port(find((*mapping.joints, *mapping.features), "joints and features"))
         self._write, self._read = instance.access("Set", self._command), instance.access("Get", self._result)
         self._step = instance.stepper(self._own_step)
-        self._split = self._result.values.size - self._spec.m
+        self._split = self._result.values.size - self.spec.m
         self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
         if mapping.home is not None and self._has_start:
             self._parameters.append(self._parameter(mapping.home, self._start))
@@ -118,11 +118,6 @@ class FmuWorld(World):
     def _port(self, names: Names) -> tuple[Port, Call]:
         port = Port(self.description.select(names, "truth"))
         return port, self._instance.reader(port)
-
-    @property
-    def spec(self) -> PlantSpec:
-        """Sizes, names, limits and period."""
-        return self._spec
 
     def reset(self, seed: int) -> FloatArray:
         """Go back to the start; nothing here is random."""
@@ -200,7 +195,7 @@ class FmuWorld(World):
         if self._true_jacobian is not None:
             matrix, read_matrix = self._true_jacobian
             read_matrix()
-            jacobian = matrix.values.reshape(self._spec.m, self._spec.n).copy()
+            jacobian = matrix.values.reshape(self.spec.m, self.spec.n).copy()
         elif self._true is not None and self._has_joints:
             jacobian = self._true.jacobian(self._joints)
         return Truth(port.values.copy(), jacobian)

@@ -1,35 +1,12 @@
 """The roles of an FMU's variables: commands, joints, features and parameters; given in Python or in a TOML file.
 
-file = "crane.fmu"                 # beside the TOML file
-inputs = ["v[1]", "v[2]"]          # joint velocity commands, rad/s
-features = ["hook"]                # an array, or all of hook[1], hook[2], ...
-joints = ["q"]                     # optional; without them commands are integrated
-home = "q0"                        # optional: the parameter that takes the joint positions at the start
-start = [0.3, 1.2]                 # optional: these joint positions, rad; needs a home, or that there are no joints
-camera = ["p", "rpy"]              # optional: parameters that take the camera's position, m, and its roll, pitch, yaw
-period = 0.01                      # optional: the FMU's own step, s
+    file = "crane.fmu"                      # beside the TOML file
+    inputs = ["v[1]", "v[2]"]
+    features = ["hook"]
+    parameters = {mass = 12.5, gains = [1.0, 2.0]}
+    limits.max_joint_speed = 2.0
 
-[parameters]
-mass = 12.5
-gains = [1.0, 2.0]
-
-[nominal]                          # optional: values that controllers believe where they differ from [parameters];
-mass = 10.0                        # needs model exchange with directional derivatives
-
-[truth]                            # optional, for the log and upper bounds only
-features = ["hook"]
-jacobian = ["J"]                   # row-major
-states = ["q"]                     # of the model-exchange side: those that are the joint positions
-
-[limits]                           # optional
-max_joint_speed = 1.0              # rad/s
-joint_lower = -3.1                 # rad
-joint_upper = 3.1                  # rad
-
-[names]                            # optional, for the log
-joints = ["slew", "luff"]
-features = ["x", "y"]
-feature_unit = "m"
+The keys are the fields of `FmuMapping`, its sections the fields of their own classes.
 """
 
 from __future__ import annotations
@@ -107,7 +84,7 @@ class FmuMapping:
     parameters: Mapping[str, Numbers] = nested(dict)
     """Values by name, set before every run."""
     nominal: Mapping[str, Numbers] | None = None
-    """The values that controllers believe, where they differ; None: there is no nominal model."""
+    """What controllers believe where it differs; needs directional derivatives. None: there is no nominal model."""
     period: Positive | None = None
     """[s] the FMU's step; None for the control period."""
     limits: JointLimits = nested(JointLimits)

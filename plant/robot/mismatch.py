@@ -27,7 +27,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from servobench.plant.checks import FloatArray, check_number
-from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, ur5_arm_from_calibration
 from servobench.plant.seeds import named_generator
@@ -267,8 +266,14 @@ def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple
     if mismatch.profile == "factory":
         file = mismatch.calibration
         arm = ur5_arm_from_calibration(None if file is None else Path(file).expanduser())
-    camera = _turn_camera(model.X_BC, sample.camera_angle * sample.camera_axis)
-    return HandEyeModel(_perturb_arm(arm, sample), camera), sample
+    true = replace(
+        arm,
+        translation=arm.translation * sample.link_scale,
+        joint_offset=arm.joint_offset + sample.joint_offset,
+        gear_ratio=arm.gear_ratio * sample.gear_ratio,
+        tool=arm.tool + sample.tool_offset,
+    )
+    return HandEyeModel(true, _turn_camera(model.X_BC, sample.camera_angle * sample.camera_axis)), sample
 
 
 def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
@@ -284,23 +289,8 @@ def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Genera
     return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
 
 
-def _perturb_arm(arm: SerialArm, sample: MismatchSample) -> SerialArm:
-    return replace(
-        arm,
-        translation=arm.translation * sample.link_scale,
-        joint_offset=arm.joint_offset + sample.joint_offset,
-        gear_ratio=arm.gear_ratio * sample.gear_ratio,
-        tool=arm.tool + sample.tool_offset,
-    )
-
-
 def _turn_camera(X_BC: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Turn the camera about the middle of the workspace, whose camera coordinates stay the same.
-
-    Args:
-        X_BC: (4, 4), its pose.
-        rotation: (3,), rad, rotation vector in the camera frame.
-    """
+    """Return the pose X_BC (4, 4) turned by a rotation vector, (3,) rad, about the middle of the workspace."""
     centre = np.asarray(WORKSPACE_CENTRE)
     centre_C = X_BC[:3, :3].T @ (centre - X_BC[:3, 3])
     turned = np.eye(4)

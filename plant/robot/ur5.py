@@ -52,7 +52,6 @@ SIDE_STEP = (0.0, 0.136, 0.0165, 0.0, 0.0, 0.0)  # m
 TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
 BALL_RADIUS = 0.035  # m
 
-# The camera hangs above the workspace and looks straight down; image up is +x of the base.
 # The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
 HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
 
@@ -62,6 +61,7 @@ TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
 
 WORKSPACE_CENTRE = (0.5, 0.0, 0.25)  # m, base frame
 CAMERA_DISTANCE = 1.3  # m, from the camera to the workspace's centre
+# The camera hangs above the workspace and looks straight down; image up is +x of the base.
 R_BC_DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 
 
