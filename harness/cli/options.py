@@ -19,6 +19,9 @@ SchedulerOption = Annotated[str | None, typer.Option(help="Address of a Dask sch
 TimeoutOption = Annotated[
     float | None, typer.Option(min=0.001, help="Time limit of a run [s]; a run that takes longer becomes a failed row.")
 ]
+NamesOption = Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")]
+SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
+FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.")]
 
 

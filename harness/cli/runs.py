@@ -11,19 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli.options import (
-    INTERRUPTED,
-    ConfigOption,
-    ResumeOption,
-    SchedulerOption,
-    SetOption,
-    TimeoutOption,
-    WorkersOption,
-    split_controllers,
-    split_plants,
-    split_tasks,
-    split_words,
-)
+from servobench.harness.cli import options
 from servobench.harness.cli.show import make_report
 from servobench.harness.cli.terminal import console, print_tables
 
@@ -45,8 +33,8 @@ def run(
         "moderate"
     ),
     seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
-    set_: SetOption = None,
-    config: ConfigOption = None,
+    set_: options.SetOption = None,
+    config: options.ConfigOption = None,
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
@@ -68,17 +56,17 @@ def run(
 
 
 def compare(
-    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic",
-    controllers: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "all",
-    tasks: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "exp1,exp2,exp3,exp4,circle",
+    plants: options.NamesOption = "kinematic",
+    controllers: options.NamesOption = "all",
+    tasks: options.NamesOption = "exp1,exp2,exp3,exp4,circle",
     mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
-    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "1",
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    run_timeout: TimeoutOption = None,
-    resume: ResumeOption = False,
-    set_: SetOption = None,
-    config: ConfigOption = None,
+    seeds: options.SeedsOption = "1",
+    workers: options.WorkersOption = None,
+    scheduler: options.SchedulerOption = None,
+    run_timeout: options.TimeoutOption = None,
+    resume: options.ResumeOption = False,
+    set_: options.SetOption = None,
+    config: options.ConfigOption = None,
     out: OutOption = None,
     with_report: ReportOption = True,
 ) -> None:
@@ -88,10 +76,10 @@ def compare(
     from servobench.harness.config.settings import ConfigurationError, read_settings
 
     batch = Batch(
-        split_plants(plants),
-        split_controllers(controllers),
-        split_tasks(tasks),
-        split_words(mismatch),
+        options.split_plants(plants),
+        options.split_controllers(controllers),
+        options.split_tasks(tasks),
+        options.split_words(mismatch),
         parse_seeds(seeds),
     )
     if resume and out is None:
@@ -102,8 +90,8 @@ def compare(
 
 def train(
     controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
-    set_: SetOption = None,
-    config: ConfigOption = None,
+    set_: options.SetOption = None,
+    config: options.ConfigOption = None,
 ) -> None:
     """Train the networks of a controller on the nominal model, unless they are kept already; print their errors."""
     from rich.table import Table
@@ -167,7 +155,7 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
     console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
     if interrupted:
         console.print(f"interrupted: {len(runs)} of {len(campaign.cells)} runs were finished and kept")
-        sys.exit(INTERRUPTED)
+        sys.exit(options.INTERRUPTED)
     if with_report:
         try:
             make_report(folder)

@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli.options import (
-    INTERRUPTED,
-    ConfigOption,
-    ResumeOption,
-    SchedulerOption,
-    SetOption,
-    TimeoutOption,
-    WorkersOption,
-    split_controllers,
-    split_names,
-    split_plants,
-    split_words,
-)
+from servobench.harness.cli import options
 from servobench.harness.cli.terminal import console
 
 if TYPE_CHECKING:
@@ -37,16 +25,16 @@ EXIT_DIFFERENT = 1
 
 
 def robustness(
-    out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")],
+    out: options.FolderOption,
     plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
-    controllers: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = DEFAULT_CONTROLLERS,
-    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "40",
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    run_timeout: TimeoutOption = None,
-    resume: ResumeOption = False,
-    set_: SetOption = None,
-    config: ConfigOption = None,
+    controllers: options.NamesOption = DEFAULT_CONTROLLERS,
+    seeds: options.SeedsOption = "40",
+    workers: options.WorkersOption = None,
+    scheduler: options.SchedulerOption = None,
+    run_timeout: options.TimeoutOption = None,
+    resume: options.ResumeOption = False,
+    set_: options.SetOption = None,
+    config: options.ConfigOption = None,
 ) -> None:
     """Draw the robustness map: success and settling time along seven axes, each varied by itself."""
     from servobench.harness.batch.campaign import Execution
@@ -56,8 +44,8 @@ def robustness(
     from servobench.harness.studies.robustness import make_map
 
     settings = read_settings(config, set_ or [])
-    names = split_controllers(controllers)
-    where = split_plants(plant, "plant")[0]
+    names = options.split_controllers(controllers)
+    where = options.split_plants(plant, "plant")[0]
     with watching(console, out) as observer:
         how = Execution(workers, scheduler, run_timeout, resume, observer)
         files = make_map(out, where, names, parse_seeds(seeds), settings, how)
@@ -65,13 +53,13 @@ def robustness(
 
 
 def claims(
-    out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")],
-    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic,fmu",
+    out: options.FolderOption,
+    plants: options.NamesOption = "kinematic,fmu",
     seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 100,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    run_timeout: TimeoutOption = None,
-    resume: ResumeOption = False,
+    workers: options.WorkersOption = None,
+    scheduler: options.SchedulerOption = None,
+    run_timeout: options.TimeoutOption = None,
+    resume: options.ResumeOption = False,
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
@@ -80,7 +68,7 @@ def claims(
     from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
     from servobench.harness.studies.claims.table import ANSWERS, differences, read_answers
 
-    names = split_plants(plants)
+    names = options.split_plants(plants)
     wanted = None if check is None else read_answers(check)
     with watching(console, out) as observer:
         answers = reproduce(out, names, seeds, Execution(workers, scheduler, run_timeout, resume, observer))
@@ -101,10 +89,10 @@ def tune(
     controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
     trials: Annotated[int, typer.Option(help="Trials of each method, that of the defaults included.")] = 100,
     seeds: Annotated[int, typer.Option(help="Moves of a trial on each plant; half as many circles are added.")] = 8,
-    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic",
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    run_timeout: TimeoutOption = None,
+    plants: options.NamesOption = "kinematic",
+    workers: options.WorkersOption = None,
+    scheduler: options.SchedulerOption = None,
+    run_timeout: options.TimeoutOption = None,
     offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
     study_seed: Annotated[int, typer.Option(help="Seed of the sampler.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
@@ -119,9 +107,9 @@ def tune(
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
     from servobench.harness.studies.tuning.study import TuningPlan, check_study_folder, open_studies, write_outcomes
 
-    names = split_names("controllers", controllers, tuple(SPACES), find_tunable)
+    names = options.split_names("controllers", controllers, tuple(SPACES), find_tunable)
     try:
-        plan = TuningPlan(names, trials, TuningSet(split_words(plants), seeds, offset), study_seed)
+        plan = TuningPlan(names, trials, TuningSet(options.split_words(plants), seeds, offset), study_seed)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     check_study_folder(out)
@@ -133,7 +121,7 @@ def tune(
     console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
     if interrupted:
         console.print("interrupted; the same call continues where it stopped")
-        sys.exit(INTERRUPTED)
+        sys.exit(options.INTERRUPTED)
 
 
 def _advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> bool:

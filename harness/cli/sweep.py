@@ -3,35 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, TypeVar
 
 import typer
 
-from servobench.harness.cli.options import (
-    ConfigOption,
-    ResumeOption,
-    SchedulerOption,
-    SetOption,
-    TimeoutOption,
-    WorkersOption,
-    split_controllers,
-    split_plants,
-    split_tasks,
-    split_words,
-)
+from servobench.harness.cli import options
 from servobench.harness.cli.terminal import console, print_tables
 
 Value = TypeVar("Value", int, float)
 
 
 def sweep(
-    out: Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")],
-    plants: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "kinematic",
-    controllers: Annotated[
-        str, typer.Option(help="Comma-separated names, or 'all'.")
-    ] = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
-    tasks: Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")] = "random",
+    out: options.FolderOption,
+    plants: options.NamesOption = "kinematic",
+    controllers: options.NamesOption = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
+    tasks: options.NamesOption = "random",
     mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
     vary: Annotated[
         list[str] | None,
@@ -41,13 +27,13 @@ def sweep(
     latency: Annotated[
         str, typer.Option(help="Comma-separated camera latencies [periods]; default: the plant's.")
     ] = "",
-    seeds: Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")] = "10",
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    run_timeout: TimeoutOption = None,
-    resume: ResumeOption = False,
-    set_: SetOption = None,
-    config: ConfigOption = None,
+    seeds: options.SeedsOption = "10",
+    workers: options.WorkersOption = None,
+    scheduler: options.SchedulerOption = None,
+    run_timeout: options.TimeoutOption = None,
+    resume: options.ResumeOption = False,
+    set_: options.SetOption = None,
+    config: options.ConfigOption = None,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
     from servobench.harness.analysis.tables import SWEEP_LEGEND, sweep_tables
@@ -60,10 +46,10 @@ def sweep(
 
     plan = SweepPlan(
         Batch(
-            split_plants(plants),
-            split_controllers(controllers),
-            split_tasks(tasks),
-            split_words(mismatch),
+            options.split_plants(plants),
+            options.split_controllers(controllers),
+            options.split_tasks(tasks),
+            options.split_words(mismatch),
             parse_seeds(seeds),
         ),
         tuple(parse_variation(text) for text in vary or []),

@@ -5,21 +5,12 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from kit.command import servobench
+from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
-
-
-def judged_columns(table: pd.DataFrame) -> pd.DataFrame:
-    """Everything but the wall-clock times."""
-    return table[[name for name in table.columns if not name.startswith(("controller_time", "plant_time"))]]
 
 
 @pytest.mark.parametrize(
@@ -96,7 +87,7 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
             )
             == 0
         )  # fmt: skip
-        tables.append([judged_columns(pd.read_parquet(out / name)) for name in ("runs.parquet", "steps.parquet")])
+        tables.append([judged(pd.read_parquet(out / name)) for name in ("runs.parquet", "steps.parquet")])
     for single, double in zip(*tables, strict=True):
         assert len(single) >= 4
         pd.testing.assert_frame_equal(single, double, check_exact=True)
@@ -151,47 +142,36 @@ def test_an_existing_results_folder_is_left_alone(monkeypatch, capsys, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
 
 
-def start_batch(out: Path) -> subprocess.Popen[str]:
-    command = [
-        sys.executable,
-        "-m",
-        "servobench.harness.cli.main",
-        "compare",
-        "--plants",
-        "kinematic",
-        "--seeds",
-        "200",
-    ]
-    command += ["--controllers", "constant", "--tasks", "exp2", "--workers", "2", "--out", str(out)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
-    deadline = time.monotonic() + 120
-    while len(list((out / results.PARTS).glob(f"[0-9]*.{results.RUNS}"))) < 3:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    return process
+BATCH = ("compare", "--seeds", "100", "--controllers", "constant", "--tasks", "exp2", "--workers", "2")
 
 
 def test_ctrl_c_keeps_what_is_finished(tmp_path):
     out = tmp_path / "out"
-    process = start_batch(out)
+    process = start(*BATCH, "--out", str(out))
+    wait_for(lambda: part_count(out) >= 3)
     os.killpg(process.pid, signal.SIGINT)
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 130, output
+    code, output = finish(process)
+    assert code == 130, output
     assert "Traceback" not in output
     runs = pd.read_parquet(out / "runs.parquet")
-    assert 3 <= len(runs) < 200
+    assert 3 <= len(runs) < 100
     assert set(pd.read_parquet(out / "steps.parquet")["run_id"]) == set(runs["run_id"])
 
 
-def test_a_killed_batch_keeps_every_finished_run(monkeypatch, tmp_path):
+def test_a_killed_batch_keeps_every_finished_run_and_can_be_resumed(monkeypatch, capsys, tmp_path):
     out = tmp_path / "out"
-    process = start_batch(out)
+    process = start(*BATCH, "--out", str(out))
+    wait_for(lambda: part_count(out) >= 3)
+    assert servobench(monkeypatch, *BATCH, "--out", str(out), "--resume") == 2
+    assert "is being written by another process" in capsys.readouterr().err
     os.killpg(process.pid, signal.SIGKILL)
-    process.communicate(timeout=120)
-    finished = len(results.load_runs(out))
-    assert finished >= 3
+    finish(process)
+    finished = results.load_runs(out)
     assert servobench(monkeypatch, "collect", str(out)) == 0
-    assert len(pd.read_parquet(out / "runs.parquet")) == finished
+    assert len(pd.read_parquet(out / "runs.parquet")) == len(finished)
+    assert servobench(monkeypatch, *BATCH, "--out", str(out), "--resume", "--no-report") == 0
+    runs = pd.read_parquet(out / "runs.parquet")
+    assert 3 <= len(finished) < len(runs) == 100
+    kept = runs[runs["run_id"].isin(finished["run_id"])].reset_index(drop=True)
+    pd.testing.assert_frame_equal(kept, finished)  # with the times: these runs were not carried out again
+    assert set(pd.read_parquet(out / "steps.parquet")["run_id"]) == set(runs["run_id"])

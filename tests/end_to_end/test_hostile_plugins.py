@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from kit.command import finish, start
 from servobench.harness.batch import results
 from servobench.harness.studies.tuning.files import read_tuned
-
-PACKAGE = Path(__file__).parents[2] / ".package"
 
 HOSTILE = """
 import os
@@ -76,19 +72,17 @@ def plugin(tmp_path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("how", REASONS)
-@pytest.mark.parametrize("command", COMMANDS)
-def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how):
+@pytest.mark.parametrize(
+    ("command", "how", "workers"),
+    [*((command, how, "2") for command in COMMANDS for how in REASONS), ("sweep", "hang", "1")],
+)
+def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how, workers):
     out = tmp_path / "out"
+    arguments = ("--plants", "hostile", "--controllers", "constant", "--workers", workers, *COMMANDS[command])
     limit = ("--run-timeout", "8") if how == "hang" else ()
-    finished = subprocess.run(
-        [sys.executable, "-m", "servobench", command, "--plants", "hostile", "--controllers", "constant",
-         "--workers", "2", *COMMANDS[command], *limit, "--out", str(out)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(PACKAGE), str(plugin))), "HOSTILE": how},
-        capture_output=True, text=True, check=False, timeout=300,
-    )  # fmt: skip
-    assert finished.returncode == 0, finished.stderr
-    assert "Traceback" not in finished.stderr
+    code, output = finish(start(command, *arguments, *limit, "--out", str(out), path=plugin, HOSTILE=how))
+    assert code == 0, output
+    assert "Traceback" not in output
     if command == "tune":
         assert 0.0 < read_tuned(out / "constant.toml").score < 4.0
         assert "[2.0" in (out / "constant.journal").read_text() or ", 2.0" in (out / "constant.journal").read_text()
@@ -99,14 +93,3 @@ def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_pa
     assert 0 < len(failed) < 4
     assert set(zip(failed["status"], failed["reason"], strict=True)) == {REASONS[how]}
     assert not (out / results.PARTS).exists()
-
-
-def test_a_time_limit_holds_with_one_worker_too(plugin, tmp_path):
-    out = tmp_path / "out"
-    subprocess.run(
-        [sys.executable, "-m", "servobench", "sweep", "--plants", "hostile", "--controllers", "constant",
-         "--workers", "1", *COMMANDS["sweep"], "--run-timeout", "8", "--out", str(out)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(PACKAGE), str(plugin))), "HOSTILE": "hang"},
-        capture_output=True, check=True, timeout=300,
-    )  # fmt: skip
-    assert set(results.load_runs(out)["status"]) == {"completed", "timed_out"}

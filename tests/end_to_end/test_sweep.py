@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from kit.command import servobench
+from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import CHUNK
 from servobench.harness.batch.compare import Batch
@@ -20,7 +17,6 @@ from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import RunResult
 
-PACKAGE = Path(__file__).parents[2] / ".package"
 SWEEP = (
     "sweep", "--controllers", "constant,broyden", "--vary", "camera_rotation=0:40:20deg", "--noise", "1,2",
     "--seeds", "4", "--workers", "2", "--set", "random.duration=2",
@@ -28,28 +24,21 @@ SWEEP = (
 RUNS = 48
 
 
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "servobench", *arguments]
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(PACKAGE)}
-
-
-def judged(folder: Path) -> pd.DataFrame:
-    table = results.load_runs(folder)
-    return table[[name for name in table.columns if not name.startswith(("controller_time", "plant_time"))]]
+def assert_same_runs(*folders: Path) -> None:
+    one, other = (judged(results.load_runs(folder)) for folder in folders)
+    pd.testing.assert_frame_equal(one, other, check_exact=True)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("sweep") / "whole"
-    subprocess.run(command(*SWEEP, "--out", str(out)), env=environment(), check=True, capture_output=True)
+    code, output = finish(start(*SWEEP, "--out", str(out)))
+    assert code == 0, output
     return out
 
 
 def test_every_combination_is_a_row_and_says_where_it_stands(undisturbed):
-    table = judged(undisturbed)
+    table = judged(results.load_runs(undisturbed))
     assert len(table) == RUNS
     assert table["run_id"].is_unique
     assert (table["status"] == "completed").all()
@@ -64,17 +53,13 @@ def test_every_combination_is_a_row_and_says_where_it_stands(undisturbed):
 
 def test_a_killed_sweep_that_is_resumed_gives_the_table_of_an_undisturbed_one(undisturbed, tmp_path, monkeypatch):
     out = tmp_path / "killed"
-    process = subprocess.Popen(
-        command(*SWEEP, "--out", str(out)), env=environment(), stdout=subprocess.DEVNULL, start_new_session=True
-    )
-    deadline = time.monotonic() + 120
-    while not list((out / results.PARTS).glob("[0-9]*")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    process = start(*SWEEP, "--out", str(out))
+    wait_for(lambda: part_count(out) > 0)
     os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    finish(process)
     assert 0 < len(results.load_runs(out)) < RUNS
     assert servobench(monkeypatch, *SWEEP, "--out", str(out), "--resume") == 0
-    pd.testing.assert_frame_equal(judged(out), judged(undisturbed), check_exact=True)
+    assert_same_runs(out, undisturbed)
 
 
 def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(undisturbed, tmp_path, monkeypatch):
@@ -86,7 +71,7 @@ def test_a_sweep_that_is_collected_half_way_can_still_be_resumed(undisturbed, tm
     assert servobench(monkeypatch, "collect", str(out)) == 0
     assert len(results.load_runs(out)) == CHUNK
     assert servobench(monkeypatch, *SWEEP, "--out", str(out), "--resume") == 0
-    pd.testing.assert_frame_equal(judged(out), judged(undisturbed), check_exact=True)
+    assert_same_runs(out, undisturbed)
 
 
 def test_a_finished_sweep_is_not_run_again(undisturbed, monkeypatch, capsys):
@@ -98,17 +83,13 @@ def test_a_finished_sweep_is_not_run_again(undisturbed, monkeypatch, capsys):
 
 def test_ctrl_c_keeps_what_is_finished(tmp_path):
     out = tmp_path / "stopped"
-    process = subprocess.Popen(
-        command(*SWEEP, "--out", str(out)), env=environment(), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + 120
-    while not list((out / results.PARTS).glob("[0-9]*")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    process = start(*SWEEP, "--out", str(out))
+    wait_for(lambda: part_count(out) > 0)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert b"Traceback" not in errors
-    assert b"--resume" in errors
+    code, output = finish(process)
+    assert code == 130
+    assert "Traceback" not in output
+    assert "--resume" in output
     assert len(results.load_runs(out)) >= CHUNK
 
 

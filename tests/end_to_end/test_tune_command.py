@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import time
 
 import pytest
 
-from kit.command import servobench
+from kit.command import finish, servobench, start, wait_for
 from servobench.harness.studies.tuning.files import read_tuned
 from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
 
@@ -72,19 +69,12 @@ def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(monk
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_ctrl_c_keeps_the_study(tmp_path, workers):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "servobench", "tune", "--controllers", "constant", "--seeds", "4"]
-    command += ["--workers", workers, "--trials", "500", "--out", str(out)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
-    journal, deadline = out / "constant.journal", time.monotonic() + 120
-    while not journal.exists() or journal.read_text().count('"values":[') < 2:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    arguments = ("tune", "--controllers", "constant", "--seeds", "4", "--workers", workers, "--trials", "500")
+    process, journal = start(*arguments, "--out", str(out)), out / "constant.journal"
+    wait_for(lambda: journal.exists() and journal.read_text().count('"values":[') >= 2)
     os.killpg(process.pid, signal.SIGINT)
-    output, _ = process.communicate(timeout=120)
-    assert process.returncode == 130, output
+    code, output = finish(process)
+    assert code == 130, output
     assert "Traceback" not in output
     assert "interrupted; the same call continues where it stopped" in output
     assert 2 <= read_tuned(out / "constant.toml").trials < 500

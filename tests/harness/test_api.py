@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import servobench
+from kit.command import PACKAGE
 
-PACKAGE = Path(__file__).parents[2] / ".package"
 SHORT = {"exp1": {"duration": 0.5}}
 
 

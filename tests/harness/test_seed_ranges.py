@@ -6,7 +6,7 @@ from servobench.harness.batch.compare import TUNING, refuse_tuning_seeds, tuning
 from servobench.harness.config.settings import ConfigurationError
 
 
-@given(count=st.integers(1, 500), offset=st.integers(0, 9000))
+@given(count=st.integers(1, 500), offset=st.integers(0, 9500))
 def test_every_tuning_seed_is_refused_for_judging(count, offset):
     seeds = tuning_seeds(count, offset)
     assert len(set(seeds)) == count
@@ -17,13 +17,7 @@ def test_every_tuning_seed_is_refused_for_judging(count, offset):
 
 
 def test_seeds_outside_the_tuning_range_judge():
-    refused = []
-    for seed in (0, TUNING.start - 1, TUNING.start, TUNING.stop - 1, TUNING.stop, 10**9):
-        try:
-            refuse_tuning_seeds([seed])
-        except ConfigurationError:
-            refused.append(seed)
-    assert refused == [TUNING.start, TUNING.stop - 1]
+    refuse_tuning_seeds([0, TUNING.start - 1, TUNING.stop, 10**9])
 
 
 def test_the_refusal_counts_the_others_and_says_what_to_take():

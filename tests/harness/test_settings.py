@@ -58,11 +58,6 @@ def test_assignments_win_over_the_file(tmp_path):
     assert got == Outer(count=6, inner=Inner(4.0))
 
 
-def test_a_section_that_names_a_file_keeps_its_dots():
-    settings = read_settings(None, ["fmu:some.where/outer.toml.inner.gain=2.0"])
-    assert settings.resolve("fmu:some.where/outer.toml", Outer()) == Outer(inner=Inner(2.0))
-
-
 def test_a_default_that_differs_from_the_class_is_kept():
     assert Settings({"outer": {"on": True}}).resolve("outer", Outer(count=9)) == Outer(count=9, on=True)
 
@@ -112,15 +107,15 @@ def test_an_unknown_section_is_refused_with_the_nearest_name():
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("[outer\n", "is not valid TOML"), ("count = 1\n", "'count' stands outside a")],
+    [
+        ("[outer\n", "is not valid TOML"),
+        ("count = 1\n", "'count' stands outside a"),
+        (None, "settings.toml cannot be read"),
+    ],
 )
-def test_a_malformed_file_is_refused(tmp_path, text, message):
+def test_a_missing_or_malformed_file_is_refused(tmp_path, text, message):
     file = tmp_path / "settings.toml"
-    file.write_text(text)
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(ConfigurationError, match=message):
         read_settings(file, [])
-
-
-def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="none.toml cannot be read"):
-        read_settings(tmp_path / "none.toml", [])

@@ -1,12 +1,21 @@
-"""The command line as a user meets it, within the process of the test."""
+"""The command line as a user meets it, within the process of the test and in processes of its own."""
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
 
+import pandas as pd
 import pytest
 
+from servobench.harness.batch import results
 from servobench.harness.cli.main import main
+
+PACKAGE = Path(__file__).parents[2] / ".package"
 
 
 def servobench(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -15,3 +24,36 @@ def servobench(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     with pytest.raises(SystemExit) as stop:
         main()
     return int(stop.value.code or 0)
+
+
+def start(*arguments: str, path: Path = PACKAGE, **environment: str) -> subprocess.Popen[str]:
+    """Start `servobench` with arguments in a process group of its own; `path` is searched for packages, too."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "servobench", *arguments], text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{path}", **environment},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Wait for a process and return its exit code and what it wrote to standard output and error."""
+    output, errors = process.communicate(timeout=300)
+    return process.returncode, output + errors
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def part_count(folder: Path) -> int:
+    """Return how many parts a batch has finished so far."""
+    return len(list((folder / results.PARTS).glob(f"[0-9]*.{results.RUNS}")))
+
+
+def judged(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table without the wall-clock times, which differ between two runs of the same seed."""
+    return table[[name for name in table.columns if not name.startswith(("controller_time", "plant_time"))]]
