@@ -11,8 +11,6 @@ one of a chunk, the runs of that chunk are carried out again one by one, so that
 
 from __future__ import annotations
 
-import hashlib
-import json
 import pickle
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,7 +21,6 @@ from queue import SimpleQueue
 from typing import Any, Final
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.manifest import describe_batch
@@ -32,7 +29,7 @@ from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run import episode
 from servobench.harness.run.episode import CRASHED, TIMED_OUT, RunResult, describe_error, failed_row
-from servobench.harness.run.experiment import build
+from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, known_sections, resolve_sections, select
 
@@ -55,14 +52,12 @@ class Chunk:
     """Consecutive cells with their settings, and controllers that the registry does not know."""
 
     index: int  # of the first cell
-    cells: tuple[Cell, ...]
-    runs: tuple[ResolvedRun, ...]  # one for each cell
+    jobs: tuple[tuple[Cell, ResolvedRun], ...]
     entries: tuple[ControllerEntry, ...] = ()
 
     def singly(self) -> list[Chunk]:
         """Return each run as a chunk of its own."""
-        pairs = zip(self.cells, self.runs, strict=True)
-        return [Chunk(self.index + i, (cell,), (run,), self.entries) for i, (cell, run) in enumerate(pairs)]
+        return [Chunk(self.index + i, (job,), self.entries) for i, job in enumerate(self.jobs)]
 
 
 @dataclass(frozen=True)
@@ -99,21 +94,13 @@ class Observer:
 
 @dataclass(frozen=True)
 class Execution:
-    """How the runs of a campaign are carried out.
+    """How the runs of a campaign are carried out."""
 
-    Attributes:
-        workers: number of processes; None for the number of processors.
-        scheduler: address of a Dask scheduler; None for processes of this machine.
-        run_timeout: [s] time limit of a run; None for no limit.
-        resume: carry out what is missing in the folder.
-        observer: receives the progress.
-    """
-
-    workers: int | None = None
-    scheduler: str | None = None
-    run_timeout: float | None = None
-    resume: bool = False
-    observer: Observer = field(default_factory=Observer)
+    workers: int | None = None  # number of processes; None for the number of processors
+    scheduler: str | None = None  # address of a Dask scheduler; None for processes of this machine
+    run_timeout: float | None = None  # [s] time limit of a run; None for no limit
+    resume: bool = False  # carry out what is missing in the folder
+    observer: Observer = field(default_factory=Observer)  # receives the progress
 
     def of_part(self, folder: Path) -> Execution:
         """Return how a part of a study is carried out: one that was not begun cannot be resumed."""
@@ -135,7 +122,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     """
     with offering(campaign.entries):
         sections = check_campaign(campaign, how.observer)
-    manifest = describe_campaign(campaign, sections)
+    manifest = describe_batch([cell.request for cell in campaign.cells], sections, steps=campaign.steps)
     if how.resume:
         results.read_manifest(folder)
     names = {"plants": manifest["plants"], "controllers": manifest["controllers"]}
@@ -188,38 +175,6 @@ def check_campaign(campaign: Campaign, observer: Observer) -> dict[str, Any]:
             build_once(select(request, sections), observer.training)
             built |= new
     return sections
-
-
-def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
-    """Build a run and throw it away: this refuses what is configured wrongly, and trains networks.
-
-    Whatever else fails is left to the run, whose row says so.
-
-    Args:
-        run: what to build.
-        progress: receives how much of a training of networks is done.
-
-    Raises:
-        ConfigurationError: a setting, mismatch or seed that cannot be used.
-    """
-    try:
-        build(run, progress=progress).plant.close()
-    except ConfigurationError:
-        raise
-    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
-        return
-
-
-def describe_campaign(campaign: Campaign, sections: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the manifest: that of a batch, the number of runs, and a digest by which `resume` recognises them."""
-    manifest = describe_batch([cell.request for cell in campaign.cells], sections)
-    identity = {
-        "runs": [cell.request.run_id for cell in campaign.cells],
-        "configuration": manifest["configuration"],
-        **({"steps": True} if campaign.steps else {}),
-    }
-    digest = hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()
-    return {**manifest, "run_count": len(campaign.cells), "campaign": digest}
 
 
 def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Observer) -> None:
@@ -286,7 +241,7 @@ def _outcome(chunk: Chunk, future: Any, workers: Workers) -> list[RunResult] | N
         if not isinstance(answer, str):
             return answer
         status, reason = CRASHED, answer
-    return [_failed(chunk.cells[0], status, reason)] if len(chunk.cells) == 1 else None
+    return [_failed(chunk.jobs[0][0], status, reason)] if len(chunk.jobs) == 1 else None
 
 
 def _missing_chunks(campaign: Campaign, sections: dict[str, Any], done: set[int], size: int) -> Iterator[Chunk]:
@@ -298,15 +253,15 @@ def _missing_chunks(campaign: Campaign, sections: dict[str, Any], done: set[int]
         else:
             chunks.append([index])
     for own in chunks:
-        cells = tuple(campaign.cells[i] for i in own)
-        yield Chunk(own[0], cells, tuple(select(cell.request, sections) for cell in cells), campaign.entries)
+        cells = [campaign.cells[i] for i in own]
+        yield Chunk(own[0], tuple((cell, select(cell.request, sections)) for cell in cells), campaign.entries)
 
 
 def _pack(chunk: Chunk, steps: bool, keep: Path | None) -> bytes:
     try:
         return pickle.dumps((chunk, steps, keep))
     except Exception as error:
-        what = f"the run {chunk.cells[0].request.run_id} cannot be sent to another process"
+        what = f"the run {chunk.jobs[0][0].request.run_id} cannot be sent to another process"
         raise ConfigurationError(f"{what}: {error}; use one worker") from error
 
 
@@ -321,7 +276,7 @@ def _unpack(task: bytes) -> list[RunResult] | str:
 
 def _carry_out(chunk: Chunk, steps: bool, keep: Path | None) -> list[RunResult]:
     with offering(chunk.entries):
-        return [_carry_out_run(*pair, steps, keep) for pair in zip(chunk.cells, chunk.runs, strict=True)]
+        return [_carry_out_run(cell, run, steps, keep) for cell, run in chunk.jobs]
 
 
 def _carry_out_run(cell: Cell, run: ResolvedRun, steps: bool, keep: Path | None) -> RunResult:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import platform
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -28,13 +30,19 @@ PACKAGES = (
 )
 
 
-def describe_batch(requests: Sequence[RunRequest], sections: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the manifest of a batch.
+def describe_batch(
+    requests: Sequence[RunRequest], sections: Mapping[str, Any], *, steps: bool = False
+) -> dict[str, Any]:
+    """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
     Args:
         requests: the runs asked for.
         sections: their typed settings by section, as `servobench.harness.run.resolved.resolve_sections` returns them.
+        steps: the table of steps is kept, too.
     """
+    configuration = {name: flatten(config) for name, config in sections.items()}
+    identity = {"runs": [request.run_id for request in requests], "configuration": configuration}
+    text = json.dumps({**identity, **({"steps": True} if steps else {})}, sort_keys=True, default=str)
 
     def used(kind: str) -> list[str]:
         return list(dict.fromkeys(str(getattr(request, kind)) for request in requests))
@@ -46,11 +54,13 @@ def describe_batch(requests: Sequence[RunRequest], sections: Mapping[str, Any]) 
         "tasks": used("task"),
         "mismatches": used("mismatch"),
         "seeds": sorted({request.seed for request in requests}),
-        "configuration": {name: flatten(config) for name, config in sections.items()},
+        "configuration": configuration,
         "packages": {name: _version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
         "git_commit": _git_commit(),
+        "run_count": len(requests),
+        "campaign": hashlib.sha256(text.encode()).hexdigest(),
     }
 
 

@@ -97,6 +97,19 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
     return Experiment(plant, controller, scenario, run, sample, moved)
 
 
+def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
+    """Build a run and throw it away: this refuses what is configured wrongly, and trains networks.
+
+    Whatever else fails is left to the run, whose row says so. Arguments and errors are those of `build`.
+    """
+    try:
+        build(run, progress=progress).plant.close()
+    except ConfigurationError:
+        raise
+    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
+        return
+
+
 def train_networks(controller: str, settings: Settings, progress: Progress) -> TrainedNetworks:
     """Return the networks that a controller of this name starts from, trained where the cache has none.
 

@@ -126,7 +126,7 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Worke
     """
     pairs = [(t, r) for r in range(len(runs)) for t in range(len(trials))]
     resolved = [trials[t].resolved(runs[r]) for t, r in pairs]
-    chunks = [Chunk(index, (Cell(run.request),), (run,)) for index, run in enumerate(resolved)]
+    chunks = [Chunk(index, ((Cell(run.request), run),)) for index, run in enumerate(resolved)]
     for chunk, (result,) in carry_out_chunks(chunks, workers):
         t, r = pairs[chunk.index]
         yield t, r, run_cost(runs[r].task, result.row)

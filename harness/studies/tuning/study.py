@@ -26,11 +26,11 @@ from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from servobench.harness.batch.campaign import build_once
 from servobench.harness.batch.results import LOCK
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.files import TunedValues, write_tuned
