@@ -63,34 +63,3 @@ def test_without_noise_nothing_is_drawn_and_nothing_changes():
     z = np.array([1.0, 1.1])
     np.testing.assert_array_equal(DepthNoise("none", depth_quantisation=0.0).apply(z, CAMERA, generator), z)
     assert generator.random() == untouched.random()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"width": 0}, "width must be at least 1, got 0"),
-        ({"height": -2}, "height must be at least 1"),
-        ({"vertical_fov": 0.0}, "vertical_fov must be above 0"),
-        ({"vertical_fov": 180.0}, "vertical_fov must be below 180"),
-        ({"near": 0.0}, "near must be above 0"),
-        ({"far": 0.05}, "far must be above near, 0.1 m, got 0.05 m"),
-    ],
-)
-def test_a_bad_camera_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        PinholeCamera(**change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"depth_noise": "kinect"}, "depth_noise must be one of none, stereo, structured_light, got 'kinect'"),
-        ({"depth_subpixel": -0.1}, "depth_subpixel must be at least 0"),
-        ({"depth_baseline": 0.0}, "depth_baseline must be above 0"),
-        ({"native_width": 0}, "native_width must be at least 1"),
-        ({"depth_quantisation": -0.001}, "depth_quantisation must be at least 0"),
-    ],
-)
-def test_a_bad_noise_model_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        DepthNoise(**change)
