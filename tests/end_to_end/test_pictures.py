@@ -14,13 +14,9 @@ from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import draw_figures, folder_figures, picture_of
 from servobench.harness.pictures.panels import ENDED
 from servobench.harness.pictures.style import method_styles
-from servobench.harness.pictures.tracks import Track, load_groups
+from servobench.harness.pictures.tracks import load_groups
 
 OTHERS = [f"method_{i}" for i in range(20)]
-
-
-def drawn(folder):
-    return {f"{named.kind} {named.stem}": named for named in folder_figures(folder)}
 
 
 def kinds(folder):
@@ -158,10 +154,7 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     assert labels == ["latency [periods]", "camera rotation [deg]"]
     share = np.asarray(figure.axes[1].containers[0].lines[0].get_ydata(), dtype=float)
     np.testing.assert_allclose(share, [100.0, 100 * 4 / 6, 50.0])
-
-
-def test_nothing_is_drawn_over_conditions_that_do_not_vary(tmp_path):
-    moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "out")))
+    moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "same")))
     assert draw_conditions(moves, method_styles(CONTROLLERS)) is None
 
 
@@ -171,8 +164,3 @@ def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
     (group,) = load_groups(folder)
     assert group.seed == 3
     assert group.tasks["exp1"]["ukf_mfac"].row["run_id"] == "run3"
-
-
-def test_a_resting_reference_is_told_from_a_moving_one():
-    assert Track({}, made_up_steps("a")).point_to_point
-    assert not Track({}, made_up_steps("a", curve=True)).point_to_point
