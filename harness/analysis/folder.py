@@ -46,7 +46,7 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def _listed(values: list[Any]) -> str:
-    words = [str(value) for value in values[:MAX_LISTED]]
+    words = ["as configured" if pd.isna(value) else str(value) for value in values[:MAX_LISTED]]
     return ", ".join(words) + (f" and {len(values) - MAX_LISTED} more" if len(values) > MAX_LISTED else "")
 
 
