@@ -17,6 +17,7 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kit.plants import mismatched, setup
 from servobench.fmus import compile as compiling
 from servobench.fmus import export
 from servobench.fmus.compile import (
@@ -34,20 +35,10 @@ from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.validate import validate_fmu
 from servobench.fmus.variables import model_of, parameters_of
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.arm import rotation_from_rpy, rpy_from_rotation
-from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME, JOINT_NAMES, nominal_ur5
+from servobench.plant.robot.ur5 import JOINT_NAMES, nominal_ur5
 
 VERSIONS = [2, 3]
-
-
-def mismatched(text: str, seed: int = 3):
-    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[0]
-
-
-def setup(text: str = "none", period: float = 0.05) -> PlantSetup:
-    return PlantSetup(mismatched(text), np.array(HOME), period)
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -13,15 +13,14 @@ import numpy as np
 import pytest
 from fmpy import simulate_fmu
 
-from kit.plants import configure
+from kit.plants import configure, mismatched
 from servobench.fmus.export import arm_layout, default_actuation
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import PlantSetup
-from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 from servobench.plant.signals import Command
 
 PERIOD = 0.05
@@ -33,22 +32,18 @@ COMMANDS.setflags(write=False)
 
 
 @cache
-def model_of(mismatch: str):
-    return sample_mismatch(Mismatch.parse(mismatch), nominal_ur5(), 3)[0]
-
-
 @cache
 def oracle(mismatch: str):
     """Return joint positions and true features after each step, (STEPS, 9), by numpy."""
     config = configure(KinematicConfig, feature_noise=0.0, command_delay_periods=0)
-    plant = build_kinematic(config, PlantSetup(model_of(mismatch), np.array(HOME), PERIOD))
+    plant = build_kinematic(config, PlantSetup(mismatched(mismatch), np.array(HOME), PERIOD))
     plant.reset(0)
     rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in COMMANDS]
     return np.array(rows)
 
 
 def parameters(mismatch: str):
-    return parameters_of(model_of(mismatch), default_actuation())
+    return parameters_of(mismatched(mismatch), default_actuation())
 
 
 def scalars(mismatch: str) -> dict[str, float]:

@@ -1,12 +1,27 @@
-"""Plant settings from flat keywords: those of the nested section `sensing` are sorted into it."""
+"""Robots and settings of plants for tests."""
 
 from dataclasses import fields, replace
 
+import numpy as np
+
 from servobench.plant.bench import SensingConfig
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
+
+
+def mismatched(text, seed=3):
+    """Return the true robot of a mismatch."""
+    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[0]
+
+
+def setup(text="none", period=0.05):
+    """Return what a plant is built from, at home."""
+    return PlantSetup(mismatched(text), np.array(HOME), period)
 
 
 def configure(kind, **values):
-    """Return settings of class `kind`; what is not given has its default."""
+    """Return settings of class `kind` from flat keywords; those of the section `sensing` are sorted into it."""
     default = kind()
     names = {field.name for field in fields(SensingConfig)}
     sensing = replace(default.sensing, **{name: value for name, value in values.items() if name in names})
