@@ -21,12 +21,7 @@ from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective, study
 from servobench.harness.studies.tuning.files import read_tuned, write_tuned
 from servobench.harness.studies.tuning.objective import CURVE, MOVE, Trial, TuningSet, evaluate, run_cost, score
-from servobench.harness.studies.tuning.spaces import (
-    SPACES,
-    default_values,
-    find_tunable,
-    nested_settings,
-)
+from servobench.harness.studies.tuning.spaces import SPACES, default_values, find_tunable, nested_settings
 from servobench.harness.studies.tuning.study import TuningPlan, advance, open_studies, write_outcomes
 
 CORNERS = 64

@@ -25,12 +25,7 @@ from servobench.harness.studies.claims.studies import (
     PROPOSED,
     studies,
 )
-from servobench.harness.studies.claims.table import (
-    differences,
-    markdown_table,
-    read_answers,
-    write_tables,
-)
+from servobench.harness.studies.claims.table import differences, markdown_table, read_answers, write_tables
 
 METHODS = (PROPOSED, "rbf_pid", "ukf_mfac", "ukf_mpc")
 SEEDS = range(20)

@@ -61,10 +61,7 @@ ARCHIVES = {
     "no description": (lambda path: write(path, {"readme": "hello"}), "holds no modelDescription.xml"),
     "broken XML": (lambda path: build_crane(path, 2, description="<fmiModelDescription"), "a broken modelDescription"),
     "not FMI": (lambda path: build_crane(path, 2, description="<html/>"), "crane.fmu is of FMI none"),
-    "FMI 1": (
-        lambda path: build_crane(path, 2, description=FMI1),
-        "crane.fmu is of FMI 1.0; wanted FMI 2",
-    ),
+    "FMI 1": (lambda path: build_crane(path, 2, description=FMI1), "crane.fmu is of FMI 1.0; wanted FMI 2"),
 }
 
 
@@ -88,12 +85,7 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
     ("version", "arguments", "more", "message"),
     [
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
-        (
-            2,
-            {"description": EXCHANGE_ONLY},
-            "",
-            "offers model exchange only; wanted co-simulation",
-        ),
+        (2, {"description": EXCHANGE_ONLY}, "", "offers model exchange only; wanted co-simulation"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
         (2, {}, "[parameters]\nquirk = 5\n", "fmi2EnterInitializationMode returned error"),
         (

@@ -135,10 +135,7 @@ def calibration(**changes):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (
-            calibration().replace(b"wrist_2", b"wrist_7"),
-            "lacks 'wrist_2'; wanted 'kinematics' with the blocks",
-        ),
+        (calibration().replace(b"wrist_2", b"wrist_7"), "lacks 'wrist_2'; wanted 'kinematics' with the blocks"),
         (calibration().replace(b"yaw", b"jaw"), "lacks 'yaw'"),
         (calibration(shoulder={"x": "long"}), "holds something that is not a number"),
         (calibration(shoulder={"x": [1.0]}), "holds something that is not a number"),
