@@ -21,7 +21,7 @@ test: lint
 
 # Too long for every change: hours. The same call goes on after an interruption; docs/experiments.md names its last figures.
 nightly: $(VENV)/ready
-	$(BIN)/python tests/nightly.py $(NIGHTLY)
+	PYTHONPATH=tests $(BIN)/python docs/nightly.py $(NIGHTLY)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff format --check .

@@ -1,6 +1,6 @@
-"""Checks that take hours: every pair of law and estimator, 100 robots in each world, the claims.
+"""Checks of the pages that take hours: every pair of law and estimator, 100 robots in each world, the claims.
 
-    make nightly        # or: python tests/nightly.py FOLDER
+    make nightly        # or: PYTHONPATH=tests python docs/nightly.py FOLDER
 
 The same call goes on after an interruption. The figures that it expects are those of the pages: the table "Where they
 break, in numbers" of docs/methods.md and docs/claims/answers.csv. Exit code 1 and a line each where they do not hold.
@@ -36,8 +36,18 @@ SWEEPS = {
     "pairs": ("--plants", "kinematic", "--controllers", PAIRS, "--seeds", "500:504"),
     "worse": ("--plants", "fmu", "--controllers", METHODS, "--seeds", SEEDS, "--mismatch", ",".join(MISMATCHES)),
     "late": ("--plants", "fmu", "--controllers", METHODS, "--seeds", SEEDS, "--latency", "1,2"),
-    "moved": ("--plants", "fmu", "--controllers", METHODS, "--seeds", SEEDS, "--mismatch", MOVE)
-    + ("--set", "random.duration=16"),
+    "moved": (
+        "--plants",
+        "fmu",
+        "--controllers",
+        METHODS,
+        "--seeds",
+        SEEDS,
+        "--mismatch",
+        MOVE,
+        "--set",
+        "random.duration=16",
+    ),
 }
 
 
