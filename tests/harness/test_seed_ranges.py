@@ -17,7 +17,7 @@ def test_every_tuning_seed_is_refused_for_judging(count, offset):
 
 
 def test_seeds_outside_the_tuning_range_judge():
-    refuse_tuning_seeds([0, TUNING.start - 1, TUNING.stop, 10**9])
+    assert refuse_tuning_seeds([0, TUNING.start - 1, TUNING.stop, 10**9]) is None
 
 
 def test_the_refusal_counts_the_others_and_says_what_to_take():
