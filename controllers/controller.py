@@ -15,13 +15,14 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.signals import Command, Observation, PlantSpec
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 SymbolicFeature: TypeAlias = Callable[[Any], Any]
-Diagnostics: TypeAlias = Mapping[str, float]
+Diagnostics: TypeAlias = Mapping[str, npt.ArrayLike]
 
 
 @dataclass(frozen=True)

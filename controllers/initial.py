@@ -10,15 +10,20 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Literal, final
+from typing import ClassVar, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import ControllerDiverged
+from servobench.plant.lanes import branch, transposed
 from servobench.plant.settings import Count, Number, Periods, Positive, settings
-from servobench.plant.signals import Observation, PlantSpec
+from servobench.plant.signals import BoolArray, Observation, PlantSpec
+
+State = TypeVar("State")
+IntArray = npt.NDArray[np.int_]
 
 
 @settings
@@ -39,56 +44,98 @@ class InitialConfig:
     """[m/rad] m rows of n entries; only for source "given"."""
 
 
-class InitialJacobian(ABC):
-    """Provides Ĵ₀, at once or after some moves of its own."""
+class InitialJacobian(ABC, Generic[State]):
+    """Provides Ĵ₀, at once or after some moves of its own; pure, with leading axes, as estimators are.
+
+    Attributes:
+        immediate: whether Ĵ₀ is known from the start, so that `step` is never called.
+    """
+
+    immediate: ClassVar[bool]
 
     @abstractmethod
-    def reset(self, observation: Observation) -> None:
-        """Forget everything and prepare for a run that starts with `observation`."""
+    def start(self, observation: Observation) -> State:
+        """Return the state at the start of a run that begins with `observation`."""
 
     @abstractmethod
-    def step(self, observation: Observation) -> FloatArray | None:
-        """Return the joint velocity (n,), rad/s, of a probing move, or None once the Jacobian is known."""
+    def step(self, state: State, observation: Observation) -> tuple[State, FloatArray, BoolArray]:
+        """Return the new state, a velocity (..., n) [rad/s] of a probing move, and whether Ĵ₀ is known now, (...)."""
 
     @abstractmethod
-    def jacobian(self) -> FloatArray:
-        """Return Ĵ₀, (m, n), m/rad; only after `step` has returned None."""
+    def jacobian(self, state: State) -> FloatArray:
+        """Return Ĵ₀, (..., m, n), m/rad; only where it is known."""
+
+
+class KnownState(NamedTuple):
+    """Ĵ₀, (..., m, n), m/rad."""
+
+    jacobian: FloatArray
 
 
 @final
-class KnownJacobian(InitialJacobian):
+class KnownJacobian(InitialJacobian[KnownState]):
     """Ĵ₀ = J(q(0)) of a model, which may be constant."""
 
+    immediate = True
+
     def __init__(self, model: JacobianFunction, spec: PlantSpec) -> None:
-        """Take the model, (n,) rad -> (m, n) m/rad, and the sizes that it must have."""
+        """Take the model, (..., n) rad -> (..., m, n) m/rad, and the sizes that it must have."""
         self._model = model
         self._shape = (spec.m, spec.n)
 
-    def reset(self, observation: Observation) -> None:
+    def start(self, observation: Observation) -> KnownState:
         """Evaluate the model at the start.
 
         Raises:
             ValueError: the model is that of another robot.
         """
-        self._jacobian = np.array(self._model(observation.joint_position), dtype=np.float64)
-        if self._jacobian.shape != self._shape:
-            raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {self._jacobian.shape}")
+        jacobian = np.array(self._model(observation.joint_position), dtype=np.float64)
+        if jacobian.shape[-2:] != self._shape:
+            raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {jacobian.shape}")
+        return KnownState(jacobian)
 
-    def step(self, observation: Observation) -> None:
-        """Return None: nothing has to move."""
+    def step(self, state: KnownState, observation: Observation) -> tuple[KnownState, FloatArray, BoolArray]:
+        """Return zero: nothing has to move."""
+        return state, np.zeros_like(observation.joint_position), np.full(observation.feature.shape[:-1], True)
 
-    def jacobian(self) -> FloatArray:
-        """Return Ĵ₀, (m, n), m/rad."""
-        return self._jacobian.copy()
+    def jacobian(self, state: KnownState) -> FloatArray:
+        """Return Ĵ₀, (..., m, n), m/rad."""
+        return state.jacobian
+
+
+class ProbeState(NamedTuple):
+    """How far the probing has come.
+
+    Attributes:
+        rests: (...), rests that are over, the start included.
+        rest_positions: (..., n+1, n) [rad], mean joint positions of the rests.
+        rest_features: (..., n+1, m), mean features of the rests.
+        gathered: (...), observations gathered at the present rest.
+        positions: (..., a, n) [rad], their joint positions.
+        features: (..., a, m), their features.
+        phase: (...) [periods] since the present move began.
+        rest_begins: (...) [periods] from its begin to its end.
+    """
+
+    rests: IntArray
+    rest_positions: FloatArray
+    rest_features: FloatArray
+    gathered: IntArray
+    positions: FloatArray
+    features: FloatArray
+    phase: IntArray
+    rest_begins: IntArray
 
 
 @final
-class ProbedJacobian(InitialJacobian):
+class ProbedJacobian(InitialJacobian[ProbeState]):
     """Ĵ₀ = ΔY ΔQ⁺ from one small move of each joint, rest to rest.
 
     Encoder readings are used for ΔQ, so a joint that falls short of its command does no harm. Lost frames prolong a
     rest: it ends with the wanted number of valid features.
     """
+
+    immediate = False
 
     def __init__(self, config: InitialConfig, spec: PlantSpec) -> None:
         """Plan the moves.
@@ -111,48 +158,77 @@ class ProbedJacobian(InitialJacobian):
             raise ValueError(
                 f"probe_step must be at most half the joint range of {narrowest:g} rad, got {config.probe_step:g}"
             )
-        self._forget()
 
-    def _forget(self) -> None:
-        self._rests: list[tuple[FloatArray, FloatArray]] = []
-        self._gathered: list[tuple[FloatArray, FloatArray]] = []
-        self._phase = self._config.settle_periods  # the arm starts at rest
-        self._rest_begins = 0
+    def start(self, observation: Observation) -> ProbeState:
+        """Return the state of one that rests: the start is the first rest."""
+        lead, (m, n), count = observation.feature.shape[:-1], (self._spec.m, self._spec.n), self._config.average_periods
+        return ProbeState(
+            rests=np.zeros(lead, dtype=np.int_),
+            rest_positions=np.zeros((*lead, n + 1, n)),
+            rest_features=np.zeros((*lead, n + 1, m)),
+            gathered=np.zeros(lead, dtype=np.int_),
+            positions=np.zeros((*lead, count, n)),
+            features=np.zeros((*lead, count, m)),
+            phase=np.full(lead, self._config.settle_periods),  # the arm starts at rest
+            rest_begins=np.zeros(lead, dtype=np.int_),
+        )
 
-    def reset(self, observation: Observation) -> None:
-        """Forget all moves; the start is the first rest."""
-        self._forget()
+    def step(self, state: ProbeState, observation: Observation) -> tuple[ProbeState, FloatArray, BoolArray]:
+        """Return the velocity of the probing move, zero while resting or done, and whether all joints have moved."""
+        config, n = self._config, self._spec.n
+        settled = (state.phase >= state.rest_begins + config.settle_periods) & observation.feature_valid
+        state = branch(settled, self._gather, state, observation)
+        state = branch(state.gathered == config.average_periods, self._end_rest, state)
+        done = state.rests == n + 1
+        joint = np.minimum(state.rests, n) - 1
+        moves = (state.phase < state.rest_begins) & ~done
+        chosen = np.arange(n) == np.asarray(joint)[..., None]
+        last = _entry(state.rest_positions, joint)
+        room = ((last + config.probe_step <= self._spec.joint_upper) & chosen).any(axis=-1)
+        speed = np.where(room, self._speed, -self._speed) * moves
+        return state._replace(phase=state.phase + 1), np.asarray(chosen * np.asarray(speed)[..., None]), done
 
-    def step(self, observation: Observation) -> FloatArray | None:
-        """Return the velocity of the probing move, zero while resting, None when all joints have moved."""
-        if self._phase >= self._rest_begins + self._config.settle_periods and observation.feature_valid:
-            self._gathered.append((observation.joint_position, observation.feature))
-        if len(self._gathered) == self._config.average_periods:
-            positions, features = (np.mean(values, axis=0) for values in zip(*self._gathered, strict=True))
-            self._rests.append((positions, features))
-            self._gathered, self._phase, self._rest_begins = [], 0, self._config.probe_periods
-        joint = len(self._rests) - 1
-        if joint == self._spec.n:
-            return None
-        u = np.zeros(self._spec.n)
-        if self._phase < self._rest_begins:
-            room_above = self._rests[-1][0][joint] + self._config.probe_step <= self._spec.joint_upper[joint]
-            u[joint] = self._speed if room_above else -self._speed
-        self._phase += 1
-        return u
+    def _gather(self, state: ProbeState, observation: Observation) -> ProbeState:
+        return state._replace(
+            positions=_with_entry(state.positions, state.gathered, observation.joint_position),
+            features=_with_entry(state.features, state.gathered, observation.feature),
+            gathered=state.gathered + 1,
+        )
 
-    def jacobian(self) -> FloatArray:
-        """Return Ĵ₀, (m, n), m/rad.
+    def _end_rest(self, state: ProbeState) -> ProbeState:
+        zero = np.zeros_like(state.phase)
+        return state._replace(
+            rest_positions=_with_entry(state.rest_positions, state.rests, state.positions.mean(axis=-2)),
+            rest_features=_with_entry(state.rest_features, state.rests, state.features.mean(axis=-2)),
+            rests=state.rests + 1,
+            gathered=zero,
+            phase=zero,
+            rest_begins=zero + self._config.probe_periods,
+        )
+
+    def jacobian(self, state: ProbeState) -> FloatArray:
+        """Return Ĵ₀, (..., m, n), m/rad.
 
         Raises:
             ControllerDiverged: a joint did not move, so its column is unknown.
         """
-        Q, Y = (np.diff(np.array(values), axis=0) for values in zip(*self._rests, strict=True))
-        if np.linalg.svd(Q, compute_uv=False)[-1] < 0.1 * self._config.probe_step:
+        Q, Y = np.diff(state.rest_positions, axis=-2), np.diff(state.rest_features, axis=-2)
+        if (np.linalg.svd(Q, compute_uv=False)[..., -1] < 0.1 * self._config.probe_step).any():
             raise ControllerDiverged(
                 f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
-        return np.asarray(np.linalg.lstsq(Q, Y, rcond=None)[0].T)
+        return transposed(np.linalg.solve(Q, Y))
+
+
+def _entry(rows: FloatArray, index: IntArray) -> FloatArray:
+    """Return row `index`, (...), of rows (..., k, n): (..., n)."""
+    return np.take_along_axis(rows, np.asarray(index)[..., None, None], axis=-2)[..., 0, :]
+
+
+def _with_entry(rows: FloatArray, index: IntArray, row: FloatArray) -> FloatArray:
+    """Return rows (..., k, n) in which row `index`, (...), is `row`, (..., n)."""
+    chosen = np.arange(rows.shape[-2]) == np.asarray(index)[..., None]
+    return np.where(chosen[..., None], row[..., None, :], rows)
 
 
 def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> InitialJacobian:
@@ -168,7 +244,8 @@ def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> Initia
         lengths = [len(row) for row in config.given]
         if lengths != [spec.n] * spec.m:
             raise ValueError(f"given must hold {spec.m} rows of {spec.n} entries, got rows of length {lengths}")
-        return KnownJacobian(lambda _: np.array(config.given), spec)
+        given = np.array(config.given)
+        return KnownJacobian(lambda q: np.broadcast_to(given, (*q.shape[:-1], *given.shape)), spec)
     if model is None:
         raise ValueError(
             "source 'nominal' needs a nominal model, and this plant has none; take 'probe' or 'given' instead"

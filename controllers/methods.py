@@ -15,7 +15,7 @@ from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.parts import ESTIMATORS, LAWS, Part
-from servobench.controllers.servo import ServoController
+from servobench.controllers.servo import Servo, ServoController
 
 Kind = TypeVar("Kind")
 
@@ -82,12 +82,13 @@ class Method:
         """Return the controller for these settings and this robot."""
         law, estimator = self._parts()
         networks = [obtain_networks(config.training, knowledge)] if isinstance(config, TrainedMethodConfig) else []
-        return ServoController(
+        servo = Servo(
             estimator.make(config.estimator, knowledge, *(networks if estimator.trained else ())),
             law.make(config.law, knowledge, *(networks if law.trained else ())),
             initial_jacobian(config.initial, knowledge),
             knowledge,
         )
+        return ServoController(servo)
 
     def entry(self) -> ControllerEntry:
         """Return the method as the registry lists it.

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.checks import FloatArray, as_vector, is_finite
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -147,18 +147,20 @@ class PlantSpec:
 class Observation:
     """What a controller sees at an instant.
 
+    Many runs side by side share one observation, whose arrays have a leading axis; the bench makes it.
+
     Attributes:
         time: s, k times the period.
-        joint_position: (n,), rad, as the encoders report it.
-        feature: (m,), in the unit of the plant's feature; the last valid one where `feature_valid` is false.
-        feature_valid: whether all of `feature` was measured for this instant.
-        valid: (m,), the same for each feature; if it is given, `feature_valid` follows from it, else the reverse.
+        joint_position: (..., n), rad, as the encoders report it.
+        feature: (..., m), in the unit of the plant's feature; the last valid one where `feature_valid` is false.
+        feature_valid: (...), whether all of `feature` was measured for this instant.
+        valid: (..., m), the same for each feature; if it is given, `feature_valid` follows from it, else the reverse.
     """
 
     time: float
     joint_position: FloatArray
     feature: FloatArray
-    feature_valid: bool = True
+    feature_valid: bool | BoolArray = True
     valid: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def __post_init__(self) -> None:
@@ -176,21 +178,30 @@ class Observation:
         object.__setattr__(self, "valid", valid)
         object.__setattr__(self, "feature_valid", bool(valid.all()))
 
+    def seen_as(self, joint_position: FloatArray, feature: FloatArray) -> Observation:
+        """Return this observation with other joint positions and another feature, which are finite."""
+        return trusted_observation(self.time, joint_position, feature, self.feature_valid, self.valid)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
     """The joint velocities that a controller asks for over the next period.
 
     Attributes:
-        joint_velocity: (n,), rad/s.
+        joint_velocity: (n,), rad/s; (..., n) for runs side by side.
     """
 
     joint_velocity: FloatArray
 
     def __post_init__(self) -> None:
         """Check that everything is finite and freeze the array."""
-        value = self.joint_velocity
-        object.__setattr__(self, "joint_velocity", as_vector("joint_velocity", value, len(value)))
+        value = np.array(self.joint_velocity, dtype=np.float64)
+        if value.ndim == 0:
+            raise ValueError(f"joint_velocity must have shape (n,), got {value}")
+        if not is_finite(value):
+            raise ValueError(f"joint_velocity must be finite, got {value.tolist()}")
+        value.flags.writeable = False
+        object.__setattr__(self, "joint_velocity", value)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,7 +218,7 @@ class Truth:
 
 
 def trusted_observation(
-    time: float, joints: FloatArray, feature: FloatArray, feature_valid: bool, valid: BoolArray
+    time: float, joints: FloatArray, feature: FloatArray, feature_valid: bool | BoolArray, valid: BoolArray
 ) -> Observation:
     """Return an observation of arrays that are known to be fresh, finite, float64 and read-only.
 

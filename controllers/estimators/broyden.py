@@ -8,7 +8,7 @@ M. Jägersand, O. Fuentes, R. Nelson, 1997. η = 1 satisfies ĴΔq = Δy exactly
 
 from __future__ import annotations
 
-from typing import Annotated, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 from annotated_types import Le
@@ -16,7 +16,9 @@ from annotated_types import Le
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch, norm, outer
 from servobench.plant.settings import Positive, settings
+from servobench.plant.signals import BoolArray
 
 
 @settings
@@ -35,38 +37,47 @@ def projection_update(
     """Return J + η (Δy − JΔq) Δqᵀ / (μ + ‖Δq‖²); Broyden's update for μ = 0, the compact-form one for μ > 0.
 
     Args:
-        J: (m, n), m/rad.
-        joint_step: Δq, (n,), rad.
-        feature_step: Δy, (m,), m.
+        J: (..., m, n), m/rad.
+        joint_step: Δq, (..., n), rad.
+        feature_step: Δy, (..., m), m.
         step_factor: η.
         regularisation: μ, rad².
     """
-    gain = step_factor * joint_step / (regularisation + joint_step @ joint_step)
-    return np.asarray(J + np.outer(feature_step - J @ joint_step, gain))
+    square = np.vecdot(joint_step, joint_step)
+    gain = step_factor * joint_step / (regularisation + square)[..., None]
+    return np.asarray(J + outer(feature_step - np.matvec(J, joint_step), gain))
+
+
+class BroydenState(NamedTuple):
+    """Ĵ, (..., m, n), m/rad, and whether the last motion was used, (...)."""
+
+    J: FloatArray
+    updated: BoolArray
 
 
 @final
-class BroydenEstimator(Estimator):
+class BroydenEstimator(Estimator[BroydenState]):
     """Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / ‖Δq‖² for every motion above a minimum ‖Δq‖."""
 
     def __init__(self, config: BroydenConfig, knowledge: RobotKnowledge | None = None) -> None:
         """Take the settings; nothing about the robot is needed."""
         self._config = config
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Start from Ĵ₀, (m, n), m/rad."""
-        self._J = jacobian.copy()
-        self._updated = False
+    def start(self, jacobian: FloatArray) -> BroydenState:
+        """Start from Ĵ₀, (..., m, n), m/rad."""
+        return BroydenState(jacobian, np.full(jacobian.shape[:-2], False))
 
-    def update(self, motion: Motion) -> None:
+    def update(self, state: BroydenState, motion: Motion) -> BroydenState:
         """Correct by one motion."""
-        config = self._config
-        self._updated = bool(np.linalg.norm(motion.joint_step) >= config.min_joint_step)
-        if self._updated:
-            self._J = projection_update(
-                self._J, motion.joint_step, motion.feature_step, step_factor=config.step_factor, regularisation=0.0
-            )
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        return branch(large, self._correct, state._replace(updated=large), motion)
 
-    def diagnostics(self) -> Diagnostics:
+    def _correct(self, state: BroydenState, motion: Motion) -> BroydenState:
+        dq, dy = motion.joint_step, motion.feature_step
+        return state._replace(
+            J=projection_update(state.J, dq, dy, step_factor=self._config.step_factor, regularisation=0.0)
+        )
+
+    def diagnostics(self, state: BroydenState) -> Diagnostics:
         """Return whether the last motion was used."""
-        return {"estimator_updated": float(self._updated)}
+        return {"estimator_updated": state.updated}

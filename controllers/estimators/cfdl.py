@@ -8,7 +8,7 @@ Source: Z. Hou, S. Jin, "Model Free Adaptive Control: Theory and Applications", 
 
 from __future__ import annotations
 
-from typing import Annotated, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 from annotated_types import Lt
@@ -17,7 +17,9 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.broyden import projection_update
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch, norm, where
 from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.signals import BoolArray
 
 
 @settings
@@ -36,8 +38,17 @@ class CfdlConfig:
     """[m/rad] ‖Φ‖ below which Φ counts as vanished."""
 
 
+class CfdlState(NamedTuple):
+    """Φ and Φ₀, (..., m, n), m/rad; whether the last motion was used and how often Φ was reset, (...)."""
+
+    J: FloatArray
+    J0: FloatArray
+    updated: BoolArray
+    resets: FloatArray
+
+
 @final
-class CfdlEstimator(Estimator):
+class CfdlEstimator(Estimator[CfdlState]):
     """Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²), back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
 
     Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly
@@ -49,27 +60,24 @@ class CfdlEstimator(Estimator):
         """Take the settings; nothing about the robot is needed."""
         self._config = config
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Start from Φ₀, (m, n), m/rad."""
-        self._J0 = jacobian.copy()
-        self._J = jacobian.copy()
-        self._updated = False
-        self._resets = 0
+    def start(self, jacobian: FloatArray) -> CfdlState:
+        """Start from Φ₀, (..., m, n), m/rad."""
+        lead = jacobian.shape[:-2]
+        return CfdlState(jacobian, jacobian, np.full(lead, False), np.zeros(lead))
 
-    def update(self, motion: Motion) -> None:
+    def update(self, state: CfdlState, motion: Motion) -> CfdlState:
         """Correct by one motion."""
-        config, dq = self._config, motion.joint_step
-        self._updated = bool(np.linalg.norm(dq) >= config.min_joint_step)
-        if not self._updated:
-            return
-        self._J = projection_update(
-            self._J, dq, motion.feature_step, step_factor=config.step_factor, regularisation=config.regularisation
-        )
-        lost = np.sum(self._J * self._J0) <= 0.0 or np.linalg.norm(self._J) < config.reset_norm
-        if config.reset and lost:
-            self._J = self._J0.copy()
-            self._resets += 1
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        return branch(large, self._correct, state._replace(updated=large), motion)
 
-    def diagnostics(self) -> Diagnostics:
+    def _correct(self, state: CfdlState, motion: Motion) -> CfdlState:
+        config, dq, dy = self._config, motion.joint_step, motion.feature_step
+        J = projection_update(state.J, dq, dy, step_factor=config.step_factor, regularisation=config.regularisation)
+        both = J * state.J0
+        vanished = norm(J.reshape(*J.shape[:-2], -1)) < config.reset_norm
+        lost = config.reset & ((both.reshape(*both.shape[:-2], -1).sum(axis=-1) <= 0.0) | vanished)
+        return state._replace(J=where(lost, state.J0, J), resets=state.resets + lost)
+
+    def diagnostics(self, state: CfdlState) -> Diagnostics:
         """Return whether the last motion was used and how often Φ was reset in this run."""
-        return {"estimator_updated": float(self._updated), "jacobian_resets": float(self._resets)}
+        return {"estimator_updated": state.updated, "jacobian_resets": state.resets}

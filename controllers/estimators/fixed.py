@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 
@@ -17,19 +17,26 @@ class ConstantConfig:
     """The constant estimator has no settings; its Ĵ₀ is set under `initial`."""
 
 
+class ConstantState(NamedTuple):
+    """Ĵ₀, (..., m, n), m/rad."""
+
+    J: FloatArray
+
+
 @final
-class ConstantEstimator(Estimator):
+class ConstantEstimator(Estimator[ConstantState]):
     """Ĵ(k) = Ĵ₀ for ever."""
 
     def __init__(self, config: ConstantConfig | None = None, knowledge: RobotKnowledge | None = None) -> None:
         """Take nothing: there are no settings, and nothing about the robot is needed."""
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Keep Ĵ₀, (m, n), m/rad."""
-        self._J = jacobian.copy()
+    def start(self, jacobian: FloatArray) -> ConstantState:
+        """Keep Ĵ₀, (..., m, n), m/rad."""
+        return ConstantState(jacobian)
 
-    def update(self, motion: Motion) -> None:
+    def update(self, state: ConstantState, motion: Motion) -> ConstantState:
         """Learn nothing."""
+        return state
 
 
 @settings
@@ -37,8 +44,14 @@ class TrueConfig:
     """The true Jacobian has no settings."""
 
 
+class TrueState(NamedTuple):
+    """The true robot, whose arrays have the leading axes; it is called with joint positions (..., n), rad."""
+
+    true_jacobian: Any
+
+
 @final
-class TrueEstimator(Estimator):
+class TrueEstimator(Estimator[TrueState]):
     """Ĵ(k) = J(q(k)), the Jacobian of the true robot."""
 
     def __init__(self, config: TrueConfig, knowledge: RobotKnowledge) -> None:
@@ -51,12 +64,14 @@ class TrueEstimator(Estimator):
             raise ValueError("true_jacobian must be known for the estimator 'true'; this plant does not provide it")
         self._true_jacobian = knowledge.true_jacobian
 
-    def reset(self, jacobian: FloatArray) -> None:
+    def start(self, jacobian: FloatArray) -> TrueState:
         """Ignore Ĵ₀: the truth is known."""
+        return TrueState(self._true_jacobian)
 
-    def update(self, motion: Motion) -> None:
+    def update(self, state: TrueState, motion: Motion) -> TrueState:
         """Learn nothing: there is nothing to learn."""
+        return state
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return J(q), (m, n), m/rad."""
-        return np.array(self._true_jacobian(joint_position), dtype=np.float64)
+    def jacobian(self, state: TrueState, joint_position: FloatArray) -> FloatArray:
+        """Return J(q), (..., m, n), m/rad."""
+        return np.asarray(state.true_jacobian(joint_position), dtype=np.float64)

@@ -11,9 +11,8 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from typing import Literal, final
+from typing import Literal, NamedTuple, final
 
 import numpy as np
 
@@ -21,7 +20,9 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import FilterDiverged
+from servobench.plant.lanes import branch, norm, outer, plus_diagonal, transposed
 from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.signals import BoolArray
 
 
 @settings
@@ -41,10 +42,10 @@ class KalmanConfig:
 
 
 def cholesky_of(P: FloatArray) -> FloatArray:
-    """Return the lower Cholesky factor of a covariance.
+    """Return the lower Cholesky factor of covariances (..., s, s).
 
     Raises:
-        FilterDiverged: P is not finite or not positive definite.
+        FilterDiverged: one of them is not finite or not positive definite.
     """
     try:
         L = np.asarray(np.linalg.cholesky(P))
@@ -52,13 +53,16 @@ def cholesky_of(P: FloatArray) -> FloatArray:
         lowest = float(np.linalg.eigvalsh(P).min())
         raise FilterDiverged(f"covariance is not positive definite: smallest eigenvalue {lowest:.3e}") from error
     if not is_finite(L):  # LAPACK lets NaN pass
-        raise FilterDiverged(f"covariance is not finite: diagonal {np.diag(P).tolist()}")
+        raise FilterDiverged(f"covariance is not finite: diagonal {np.diagonal(P, axis1=-2, axis2=-1).tolist()}")
     return L
 
 
 def measurement_matrix(joint_step: FloatArray, m: int) -> FloatArray:
-    """Return H = I_m ⊗ Δqᵀ, (m, mn), for Δq (n,)."""
-    return np.asarray(np.kron(np.eye(m), joint_step[None, :]), dtype=np.float64)
+    """Return H = I_m ⊗ Δqᵀ, (..., m, mn), for Δq (..., n)."""
+    H = np.zeros((*joint_step.shape[:-1], m, m, joint_step.shape[-1]))
+    for i in range(m):
+        H[..., i, i, :] = joint_step
+    return H.reshape(*H.shape[:-2], -1)
 
 
 def kalman_update(
@@ -67,10 +71,10 @@ def kalman_update(
     """Predict a random walk and correct it by one measurement, covariance in Joseph form.
 
     Args:
-        x: state, (s,).
-        P: its covariance, (s, s).
-        H: measurement matrix, (m, s).
-        z: measurement, (m,).
+        x: state, (..., s).
+        P: its covariance, (..., s, s).
+        H: measurement matrix, (..., m, s).
+        z: measurement, (..., m).
         Q: process covariance, (s, s).
         R: measurement covariance, (m, m).
 
@@ -78,11 +82,11 @@ def kalman_update(
         The new state and covariance.
     """
     P = P + Q
-    S = H @ P @ H.T + R
-    K = np.linalg.solve(S, H @ P).T
-    A = np.eye(x.size) - K @ H
-    P = A @ P @ A.T + K @ R @ K.T
-    return x + K @ (z - H @ x), (P + P.T) / 2
+    HP = H @ P
+    K = transposed(np.linalg.solve(HP @ transposed(H) + R, HP))
+    A = np.eye(x.shape[-1]) - K @ H
+    P = A @ P @ transposed(A) + K @ R @ transposed(K)
+    return x + np.matvec(K, z - np.matvec(H, x)), (P + transposed(P)) / 2
 
 
 def split_update(
@@ -93,42 +97,55 @@ def split_update(
         P ← P + q I,   K = PΔq / (ΔqᵀPΔq + r),   J ← J + (Δy − JΔq) Kᵀ,   P ← (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ
 
     Args:
-        J: Jacobian, (m, n), m/rad.
-        P: covariance of each of its rows, (n, n), (m/rad)².
-        joint_step: Δq, (n,), rad.
-        feature_step: Δy, (m,), m.
+        J: Jacobian, (..., m, n), m/rad.
+        P: covariance of each of its rows, (..., n, n), (m/rad)².
+        joint_step: Δq, (..., n), rad.
+        feature_step: Δy, (..., m), m.
         q: variance of the walk, (m/rad)².
         r: variance of Δy, m².
 
     Returns:
         The new Jacobian and covariance.
     """
-    P = P.copy()
-    P.flat[:: P.shape[0] + 1] += q
-    PH = P @ joint_step
-    S = joint_step @ PH + r
-    K = PH / S
+    P = plus_diagonal(P, q)
+    PH = np.matvec(P, joint_step)
+    K = PH / (np.vecdot(joint_step, PH) + r)[..., None]
     # (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ with A = P − K PHᵀ multiplied out: A − (A Δq) Kᵀ + r K Kᵀ
-    A = P - np.outer(K, PH)
-    P = A + np.outer(r * K - A @ joint_step, K)
-    return J + np.outer(feature_step - J @ joint_step, K), (P + P.T) / 2
+    A = P - outer(K, PH)
+    P = A + outer(r * K - np.matvec(A, joint_step), K)
+    return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
 
 
 def full_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, Q: FloatArray, R: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Do the same by `kalman_update`, for P, (mn, mn), of all entries.
+    """Do the same by `kalman_update`, for P, (..., mn, mn), of all entries.
 
     Raises:
         FilterDiverged: the covariance is no longer positive definite.
     """
-    x, P = kalman_update(J.ravel(), P, measurement_matrix(joint_step, len(J)), feature_step, Q=Q, R=R)
+    H = measurement_matrix(joint_step, J.shape[-2])
+    x, P = kalman_update(J.reshape(*J.shape[:-2], -1), P, H, feature_step, Q=Q, R=R)
     cholesky_of(P)
     return x.reshape(J.shape), P
 
 
+class KalmanState(NamedTuple):
+    """The state of the filter.
+
+    Attributes:
+        J: Ĵ, (..., m, n), m/rad.
+        P: covariance, (m/rad)², of every row, (..., n, n), or of all entries, (..., mn, mn).
+        updated: (...), whether the last motion was used.
+    """
+
+    J: FloatArray
+    P: FloatArray
+    updated: BoolArray
+
+
 @final
-class KalmanEstimator(Estimator):
+class KalmanEstimator(Estimator[KalmanState]):
     """x ← x + K (Δy − H x), K = P Hᵀ (H P Hᵀ + R)⁻¹, P in Joseph form; motions below a minimum ‖Δq‖ are left out.
 
     J changes only where the arm moves, so a motion that is left out adds no process noise either.
@@ -145,38 +162,38 @@ class KalmanEstimator(Estimator):
         self._q = config.process_deviation**2
         self._r = 2.0 * config.feature_noise**2
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Start from Ĵ₀, (m, n), m/rad, with the configured covariance."""
-        m, n = jacobian.shape
+    def start(self, jacobian: FloatArray) -> KalmanState:
+        """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance."""
+        *lead, m, n = jacobian.shape
         size = n if self._config.form == "split" else m * n
-        self._J = jacobian.copy()
-        self._P = np.eye(size) * self._config.initial_deviation**2
-        self._Q, self._R = np.eye(size) * self._q, np.eye(m) * self._r
-        self._updated = False
+        P = np.broadcast_to(np.eye(size) * self._config.initial_deviation**2, (*lead, size, size))
+        return KalmanState(jacobian, P, np.full(lead, False))
 
-    def update(self, motion: Motion) -> None:
+    def update(self, state: KalmanState, motion: Motion) -> KalmanState:
         """Correct by one motion.
 
         Raises:
-            FilterDiverged: the covariance is no longer positive definite.
+            FilterDiverged: a covariance is no longer positive definite.
         """
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        return branch(large, self._correct, state._replace(updated=large), motion)
+
+    def _correct(self, state: KalmanState, motion: Motion) -> KalmanState:
         dq, dy = motion.joint_step, motion.feature_step
-        self._updated = math.sqrt(dq.dot(dq)) >= self._config.min_joint_step
-        if not self._updated:
-            return
         if self._config.form == "split":
-            self._J, self._P = split_update(self._J, self._P, dq, dy, q=self._q, r=self._r)
-            cholesky_of(self._P)
+            J, P = split_update(state.J, state.P, dq, dy, q=self._q, r=self._r)
+            cholesky_of(P)
         else:
-            self._J, self._P = self._full_update(self._J, self._P, dq, dy, Q=self._Q, R=self._R)
+            Q, R = self._q * np.eye(state.P.shape[-1]), self._r * np.eye(state.J.shape[-2])
+            J, P = self._full_update(state.J, state.P, dq, dy, Q=Q, R=R)
+        return state._replace(J=J, P=P)
 
-    def covariance(self) -> FloatArray:
-        """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)²."""
-        return np.asarray(np.kron(np.eye(self._J.size // len(self._P)), self._P), dtype=np.float64)
-
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: KalmanState) -> Diagnostics:
         """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
-        return {
-            "estimator_updated": float(self._updated),
-            "jacobian_deviation": math.sqrt(self._P.trace() / len(self._P)),
-        }
+        deviation = np.sqrt(state.P.trace(axis1=-2, axis2=-1) / state.P.shape[-1])
+        return {"estimator_updated": state.updated, "jacobian_deviation": deviation}
+
+
+def covariance_of(state: KalmanState) -> FloatArray:
+    """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)², of one run."""
+    return np.asarray(np.kron(np.eye(state.J.size // len(state.P)), state.P), dtype=np.float64)

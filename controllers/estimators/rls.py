@@ -8,7 +8,7 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from __future__ import annotations
 
-from typing import Annotated, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 from annotated_types import Le
@@ -17,7 +17,9 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch, norm, outer, transposed
 from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.signals import BoolArray
 
 
 @settings
@@ -48,24 +50,32 @@ def rls_update(
     """Correct by one motion, P in Joseph form.
 
     Args:
-        J: (m, n), m/rad.
-        P: (n, n), 1/rad².
-        joint_step: Δq, (n,), rad.
-        feature_step: Δy, (m,), m.
+        J: (..., m, n), m/rad.
+        P: (..., n, n), 1/rad².
+        joint_step: Δq, (..., n), rad.
+        feature_step: Δy, (..., m), m.
         forgetting: λ.
 
     Returns:
         The new Jacobian and P.
     """
-    PH = P @ joint_step
-    K = PH / (forgetting + joint_step @ PH)
-    A = P - np.outer(K, PH)
-    P = (A + np.outer(forgetting * K - A @ joint_step, K)) / forgetting
-    return J + np.outer(feature_step - J @ joint_step, K), (P + P.T) / 2
+    PH = np.matvec(P, joint_step)
+    K = PH / (forgetting + np.vecdot(joint_step, PH))[..., None]
+    A = P - outer(K, PH)
+    P = (A + outer(forgetting * K - np.matvec(A, joint_step), K)) / forgetting
+    return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
+
+
+class RlsState(NamedTuple):
+    """Ĵ, (..., m, n), m/rad; P, (..., n, n), 1/rad²; and whether the last motion was used, (...)."""
+
+    J: FloatArray
+    P: FloatArray
+    updated: BoolArray
 
 
 @final
-class RlsEstimator(Estimator):
+class RlsEstimator(Estimator[RlsState]):
     """Ĵ ← Ĵ + (Δy − ĴΔq) Kᵀ with forgetting λ; motions below a minimum ‖Δq‖ are left out.
 
     Forgetting inflates P in directions in which nothing moves, without bound. So P is scaled back to a mean diagonal
@@ -76,29 +86,32 @@ class RlsEstimator(Estimator):
         """Take the settings; nothing about the robot is needed."""
         self._config = config
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Start from Ĵ₀, (m, n), m/rad."""
-        self._J = jacobian.copy()
-        self._P = np.eye(jacobian.shape[1]) * self._config.initial_covariance
-        self._updated = False
+    def start(self, jacobian: FloatArray) -> RlsState:
+        """Start from Ĵ₀, (..., m, n), m/rad."""
+        lead, n = jacobian.shape[:-2], jacobian.shape[-1]
+        P = np.broadcast_to(np.eye(n) * self._config.initial_covariance, (*lead, n, n))
+        return RlsState(jacobian, P, np.full(lead, False))
 
-    def update(self, motion: Motion) -> None:
+    def update(self, state: RlsState, motion: Motion) -> RlsState:
         """Correct by one motion.
 
         Raises:
             FilterDiverged: P is no longer positive definite.
         """
-        config, dq = self._config, motion.joint_step
-        self._updated = bool(np.linalg.norm(dq) >= config.min_joint_step)
-        if not self._updated:
-            return
-        self._J, self._P = rls_update(self._J, self._P, dq, motion.feature_step, forgetting=config.forgetting)
-        self._P *= min(1.0, config.covariance_limit / self._mean_diagonal())
-        cholesky_of(self._P)
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        return branch(large, self._correct, state._replace(updated=large), motion)
 
-    def diagnostics(self) -> Diagnostics:
+    def _correct(self, state: RlsState, motion: Motion) -> RlsState:
+        config, dq, dy = self._config, motion.joint_step, motion.feature_step
+        J, P = rls_update(state.J, state.P, dq, dy, forgetting=config.forgetting)
+        P = P * np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))[..., None, None]
+        cholesky_of(P)
+        return state._replace(J=J, P=P)
+
+    def diagnostics(self, state: RlsState) -> Diagnostics:
         """Return whether the last motion was used and the mean of P's diagonal, 1/rad²."""
-        return {"estimator_updated": float(self._updated), "covariance_mean": self._mean_diagonal()}
+        return {"estimator_updated": state.updated, "covariance_mean": _mean_diagonal(state.P)}
 
-    def _mean_diagonal(self) -> float:
-        return float(np.trace(self._P) / self._P.shape[0])
+
+def _mean_diagonal(P: FloatArray) -> FloatArray:
+    return np.asarray(P.trace(axis1=-2, axis2=-1) / P.shape[-1])

@@ -24,6 +24,7 @@ import numpy as np
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator, cholesky_of
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import transposed
 from servobench.plant.settings import NonNegative, Positive, settings
 
 
@@ -88,10 +89,10 @@ def unscented_update(
     """Predict the random walk and correct it by one motion with sigma points.
 
     Args:
-        J: Jacobian, (m, n), m/rad.
-        P: covariance of vec(J) by rows, (mn, mn), (m/rad)².
-        joint_step: Δq, (n,), rad.
-        feature_step: Δy, (m,), m.
+        J: Jacobian, (..., m, n), m/rad.
+        P: covariance of vec(J) by rows, (..., mn, mn), (m/rad)².
+        joint_step: Δq, (..., n), rad.
+        feature_step: Δy, (..., m), m.
         Q: process covariance, (mn, mn), (m/rad)².
         R: covariance of Δy, (m, m), m².
         weights: from `sigma_weights` with s = mn.
@@ -102,23 +103,20 @@ def unscented_update(
     Raises:
         FilterDiverged: P + Q is not positive definite.
     """
-    size, P = J.size, P + Q
-    offsets = np.zeros((2 * size + 1, size))
-    np.multiply(weights.reach, cholesky_of(P).T, out=offsets[1 : size + 1])
-    np.negative(offsets[1 : size + 1], out=offsets[size + 1 :])
-    points = J.ravel() + offsets
-    Z = points.reshape(-1, joint_step.size).dot(joint_step).reshape(len(points), -1)  # every point is m rows of J
-    z = weights.mean.dot(Z)
-    deviations = Z - z
+    *lead, m, n = J.shape
+    size, P = m * n, P + Q
+    reach = weights.reach * transposed(cholesky_of(P))
+    offsets = np.concatenate([np.zeros((*lead, 1, size)), reach, -reach], axis=-2)
+    points = J.reshape(*lead, 1, size) + offsets
+    Z = np.matvec(points.reshape(*lead, 2 * size + 1, m, n), joint_step[..., None, :])  # a point is m rows of J
+    z = np.vecmat(weights.mean, Z)
+    deviations = Z - z[..., None, :]
     weighted = weights.covariance[:, None] * deviations
-    S = deviations.T.dot(weighted)
-    S += R
-    C = offsets.T.dot(weighted)
-    K = np.linalg.solve(S, C.T).T
-    P -= K.dot(C.T)  # K S = C
-    P = P + P.T
-    P *= 0.5
-    return J + K.dot(feature_step - z).reshape(J.shape), P
+    S = transposed(deviations) @ weighted + R
+    C = transposed(offsets) @ weighted
+    K = transposed(np.linalg.solve(S, transposed(C)))
+    P = P - K @ transposed(C)  # K S = C
+    return J + np.matvec(K, feature_step - z).reshape(J.shape), (P + transposed(P)) / 2
 
 
 def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> KalmanEstimator:
@@ -129,7 +127,7 @@ def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) ->
     """
 
     def update(J: FloatArray, *arguments: FloatArray, **noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        weights = sigma_weights(J.size, config.alpha, config.beta, config.kappa)
+        weights = sigma_weights(J.shape[-2] * J.shape[-1], config.alpha, config.beta, config.kappa)
         return unscented_update(J, *arguments, **noise, weights=weights)
 
     walk = config.initial_deviation, config.process_deviation, config.feature_noise, config.min_joint_step

@@ -1,9 +1,13 @@
-"""The contract of a control law: estimate, observation and reference in, joint velocity out."""
+"""The contract of a control law: estimate, observation and reference in, joint velocity out.
+
+Laws are pure, as estimators are: the state goes in and comes out, a tree of arrays with leading axes
+(`servobench.plant.lanes`), and no array of it is ever changed.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimate import Estimate
@@ -11,9 +15,10 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.signals import Observation
 
 Stage: TypeAlias = Literal["predict", "posture", "limit"]
+State = TypeVar("State")
 
 
-class Law(ABC):
+class Law(ABC, Generic[State]):
     """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator.
 
     Attributes:
@@ -23,22 +28,28 @@ class Law(ABC):
     owns: ClassVar[frozenset[Stage]] = frozenset({"limit"})
 
     @abstractmethod
-    def reset(self, observation: Observation) -> None:
-        """Forget everything and prepare for a run that starts with `observation`."""
+    def start(self, observation: Observation) -> State:
+        """Return the state at the start of a run that begins with `observation`."""
 
     @abstractmethod
-    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return the joint velocity for the period that begins now.
+    def command(
+        self, state: State, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[State, FloatArray]:
+        """Return the new state and the joint velocity for the period that begins now.
 
         Args:
+            state: after the last command.
             estimate: the Jacobian, and delay and noise where they are identified.
             observation: what is seen now.
-            reference: (1 + preview, m): row 0 is now, the rest are the next control instants.
+            reference: (..., 1 + preview, m): row 0 is now, the rest are the next control instants.
 
         Returns:
-            (n,), rad/s, within the joint-speed limits.
+            The state, and (..., n), rad/s, within the joint-speed limits.
+
+        Raises:
+            RunFault: it cannot go on in at least one lane.
         """
 
     @abstractmethod
-    def diagnostics(self) -> Diagnostics:
-        """Return named numbers about the last command; for the log only."""
+    def diagnostics(self, state: State) -> Diagnostics:
+        """Return named numbers (...) about the last command; for the log only."""

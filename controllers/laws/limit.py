@@ -16,9 +16,9 @@ MIN_ROOM = 1e-9  # [1] of its limit; a joint with less room is left out
 REMAINDER_TOLERANCE = 1e-6  # [1] of the step that may be left undone
 
 
-def largest_excess(joint_velocity: FloatArray, limit: FloatArray) -> float:
-    """Return the largest |u_i| / limit_i of a joint velocity (n,); above 1 some joint exceeds its limit."""
-    return float(np.maximum.reduce(np.abs(joint_velocity) / limit))
+def largest_excess(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
+    """Return the largest |u_i| / limit_i, (...), of joint velocities (..., n); above 1 some joint exceeds its limit."""
+    return np.asarray(np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1))
 
 
 def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:

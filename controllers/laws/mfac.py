@@ -8,7 +8,7 @@ newest measured error is used. Along a singular value σ of Ĵ the loop gain a p
 
 from __future__ import annotations
 
-from typing import Annotated, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
 from annotated_types import Le
@@ -18,8 +18,9 @@ from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.limit import largest_excess
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import plus_diagonal, transposed
 from servobench.plant.settings import Positive, settings
-from servobench.plant.signals import Observation
+from servobench.plant.signals import BoolArray, Observation
 
 
 @settings
@@ -38,21 +39,26 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
     """Return dq = ρ Jᵀ (λI + JJᵀ)⁻¹ e, the form of eq. 45 that solves m equations instead of n.
 
     Args:
-        J: (m, n), m/rad.
-        e: y_ref − y, (m,), m.
+        J: (..., m, n), m/rad.
+        e: y_ref − y, (..., m), m.
         step_factor: ρ.
         step_weight: λ, m²/rad².
 
     Returns:
-        The joint step of one period, (n,), rad.
+        The joint step of one period, (..., n), rad.
     """
-    square = J.dot(J.T)
-    square.flat[:: len(J) + 1] += step_weight
-    return np.asarray(step_factor * J.T.dot(np.linalg.solve(square, e)))
+    square = plus_diagonal(J @ transposed(J), step_weight)
+    return np.asarray(step_factor * np.vecmat(np.linalg.solve(square, e[..., None])[..., 0], J))
+
+
+class MfacState(NamedTuple):
+    """Whether the last command was limited, (...); the law itself has no state."""
+
+    saturated: BoolArray
 
 
 @final
-class MfacLaw(Law):
+class MfacLaw(Law[MfacState]):
     """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 45), limited as a whole so that the direction stays.
 
     With `feedforward` the motion of the reference over the coming period is added without the factor ρ:
@@ -70,23 +76,23 @@ class MfacLaw(Law):
         self._config = config
         self._limit = knowledge.spec.joint_velocity_limit
         self._dt = knowledge.spec.period
-        self._saturated = False
 
-    def reset(self, observation: Observation) -> None:
-        """Forget the last command; the law itself has no state."""
-        self._saturated = False
+    def start(self, observation: Observation) -> MfacState:
+        """No command was limited yet."""
+        return MfacState(np.full(observation.feature.shape[:-1], False))
 
-    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return u, (n,), rad/s; see `Law.command`."""
-        config, jacobian = self._config, estimate.jacobian
-        dq = mfac_step(jacobian, reference[0] - observation.feature, config.step_factor, config.step_weight)
+    def command(
+        self, state: MfacState, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[MfacState, FloatArray]:
+        """Return u, (..., n), rad/s; see `Law.command`."""
+        config, J = self._config, estimate.jacobian
+        dq = mfac_step(J, reference[..., 0, :] - observation.feature, config.step_factor, config.step_weight)
         if config.feedforward:
-            dq = dq + mfac_step(jacobian, reference[1] - reference[0], 1.0, config.step_weight)
+            dq = dq + mfac_step(J, reference[..., 1, :] - reference[..., 0, :], 1.0, config.step_weight)
         wanted = dq / self._dt
         excess = largest_excess(wanted, self._limit)
-        self._saturated = excess > 1.0
-        return np.asarray(wanted / max(excess, 1.0))
+        return MfacState(excess > 1.0), np.asarray(wanted / np.maximum(excess, 1.0)[..., None])
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: MfacState) -> Diagnostics:
         """Return whether the last command was limited."""
-        return {"saturated": float(self._saturated)}
+        return {"saturated": state.saturated}

@@ -1,0 +1,133 @@
+"""Many runs side by side: arrays with leading axes, a lane a run; a single run has no leading axis.
+
+Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. What is to happen in some lanes
+only goes through `branch`, so that no part writes a mask. A state is a tree of arrays: named tuples, tuples and
+dataclasses, of which every array has the leading axes; whatever else is in them is shared by all lanes.
+
+A lane has the same bits whatever its neighbours are, as long as no leading axis becomes an axis of a matrix: products
+are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over the last, contiguous axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.checks import FloatArray
+
+Tree = TypeVar("Tree")
+Lanes = Any  # an index of the leading axes
+
+
+def _map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  # noqa: ANN401 - any tree
+    """Return the tree with `function` applied to its arrays, and to those at the same place of the other trees."""
+    if isinstance(tree, np.ndarray):
+        return function(tree, *others)
+    if isinstance(tree, tuple):
+        entries = [_map(function, *each) for each in zip(tree, *others, strict=True)]
+        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        new = object.__new__(type(tree))
+        for name in (field.name for field in fields(tree)):
+            object.__setattr__(new, name, _map(function, *(getattr(each, name) for each in (tree, *others))))
+        return new
+    return tree
+
+
+def take(tree: Tree, lanes: Lanes) -> Tree:
+    """Return a tree with the lanes that an index names; a single number gives the tree of a single run."""
+    taken: Tree = _map(lambda array: array[lanes], tree)
+    return taken
+
+
+def put(tree: Tree, lanes: Lanes, part: Tree) -> Tree:
+    """Return a copy of a tree in which the lanes that an index names are those of `part`."""
+
+    def replaced(array: FloatArray, values: FloatArray) -> FloatArray:
+        new = array.copy()
+        new[lanes] = values
+        return new
+
+    changed: Tree = _map(replaced, tree, part)
+    return changed
+
+
+def stack(trees: Sequence[Tree]) -> Tree:
+    """Return the trees of single runs as one tree with a leading axis; what is no array is that of the first one."""
+    stacked: Tree = _map(lambda *arrays: np.stack(arrays), *trees)
+    return stacked
+
+
+def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
+    """Return `function(tree, *arguments)` in the lanes that are chosen and `tree` in all others.
+
+    Args:
+        chosen: (...), bool.
+        function: returns a tree like its first argument; it sees only lanes that are chosen, along one axis.
+        tree: what may change.
+        arguments: further trees that the function needs.
+    """
+    if np.ndim(chosen) == 0:
+        return function(tree, *arguments) if chosen else tree
+    mask = np.asarray(chosen)
+    count = np.count_nonzero(mask)
+    if count == 0:
+        return tree
+    if count == mask.size:
+        return function(tree, *arguments)
+    lanes = np.nonzero(mask)
+    return put(tree, lanes, function(take(tree, lanes), *(take(each, lanes) for each in arguments)))
+
+
+def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Mark a function that is written for single runs: it is called for one lane after the other.
+
+    Args:
+        signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
+    """
+    ranks = [len(part.strip("() ").split(",")) if part.strip("() ") else 0
+             for part in signature.split("->", maxsplit=1)[0].replace("),(", ")|(").split("|")]  # fmt: skip
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        over_lanes = np.vectorize(function, signature=signature)
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:  # noqa: ANN401 - those of the function
+            if all(np.ndim(each) == rank for each, rank in zip(arguments, ranks, strict=True)):
+                return function(*arguments)
+            return over_lanes(*arguments)
+
+        return call
+
+    return decorate
+
+
+def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return `one` in the lanes that are chosen, (...), and `other` elsewhere; both may have further axes."""
+    mask = np.asarray(chosen)
+    return np.where(mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)), one, other)
+
+
+def outer(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a bᵀ, (..., m, n), for a (..., m) and b (..., n)."""
+    return np.asarray(a[..., :, None] * b[..., None, :])
+
+
+def norm(x: FloatArray) -> FloatArray:
+    """Return ‖x‖, (...), for x (..., n)."""
+    return np.asarray(np.sqrt(np.vecdot(x, x)))
+
+
+def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:
+    """Return A + diag(value), (..., n, n), for A (..., n, n) and one number, (n,) or (..., n)."""
+    return np.asarray(A + np.eye(A.shape[-1]) * np.atleast_1d(value)[..., None, :])
+
+
+def transposed(A: FloatArray) -> FloatArray:
+    """Return Aᵀ, (..., n, m), for A (..., m, n)."""
+    return np.swapaxes(A, -1, -2)
