@@ -1,6 +1,6 @@
 """The standard deviation of the feature's noise, estimated online from innovations.
 
-    E ‖ν‖²/m = a σ² + b        ν innovation (m,), m; a how often multiple of σ² in it; b its other variance, m²
+    E ‖ν‖²/m = a σ² + b        ν innovation (m,), m; a the multiple of σ² in it; b its other variance, m²
     sample = (‖ν‖²/m − b)/a,   weight = (a σ²/(a σ² + b))²:   a sample counts less where b is large
     σ² = Σ weight · sample / Σ weight, with forgetting, from an initial guess that counts as `GUESS_SAMPLES`
 
@@ -10,7 +10,12 @@ the cap is higher in proportion, so that a wrong guess is corrected at once.
 
 from __future__ import annotations
 
-from typing import final
+from typing import NamedTuple
+
+import numpy as np
+
+from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch
 
 GUESS_SAMPLES = 1.0  # [samples] weight of the initial guess
 WARM_UP_SAMPLES = 10.0  # [samples] the guess included
@@ -19,30 +24,48 @@ MAX_SAMPLE_RATIO = 9.0  # [1] of a sample to σ²
 MIN_VARIANCE_RATIO = 1e-2  # [1] floor of σ² relative to the initial guess
 
 
-@final
-class NoiseLevel:
-    """The estimate above; `variance` is σ², m²."""
+class NoiseLevel(NamedTuple):
+    """The state of the estimate; every array is (...).
 
-    def __init__(self, deviation: float) -> None:
-        """Start at an initial guess of σ, m."""
-        self.variance = deviation**2
-        self._floor = MIN_VARIANCE_RATIO * self.variance
-        self._weights, self._sum = GUESS_SAMPLES, GUESS_SAMPLES * self.variance
+    Attributes:
+        variance: σ², m².
+        weight_sum: Σ weight.
+        sample_sum: Σ weight · sample, m².
+        floor: the lowest σ², m².
+    """
 
-    def learn(self, square: float, multiple: float, other: float) -> None:
-        """Learn from an innovation.
+    variance: FloatArray
+    weight_sum: FloatArray
+    sample_sum: FloatArray
+    floor: FloatArray
+
+    @classmethod
+    def guess(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:
+        """Return the state that holds nothing but an initial guess of σ, m, with leading axes of the shape `lead`."""
+        variance = np.full(lead, deviation**2)
+        return cls(variance, np.full(lead, GUESS_SAMPLES), GUESS_SAMPLES * variance, MIN_VARIANCE_RATIO * variance)
+
+    @property
+    def deviation(self) -> FloatArray:
+        """σ, (...), m."""
+        return np.asarray(np.sqrt(self.variance))
+
+    def learn(self, square: FloatArray, multiple: float, other: FloatArray) -> NoiseLevel:
+        """Return the state after an innovation; one of exactly 0 is that of the same frame and holds no information.
 
         Args:
-            square: ‖ν‖²/m, m².
+            square: ‖ν‖²/m, (...), m².
             multiple: a, the multiple of σ² in its variance.
-            other: b, the rest of its variance, m².
+            other: b, (...), the rest of its variance, m².
         """
-        if square == 0.0:  # the same frame again, which holds no information
-            return
-        own = multiple * self.variance
-        weight = (own / (own + other)) ** 2
-        largest = MAX_SAMPLE_RATIO * max(1.0, WARM_UP_SAMPLES / self._weights) * self.variance
-        sample = min((square - other) / multiple, largest)
-        self._sum = FORGETTING * self._sum + weight * sample
-        self._weights = FORGETTING * self._weights + weight
-        self.variance = max(self._sum / self._weights, self._floor)
+        return branch(square != 0.0, _learned, self, square, multiple, other)
+
+
+def _learned(level: NoiseLevel, square: FloatArray, multiple: float, other: FloatArray) -> NoiseLevel:
+    variance, weight_sum, sample_sum, floor = level
+    own = multiple * variance
+    weight = (own / (own + other)) ** 2
+    cap = MAX_SAMPLE_RATIO * np.maximum(1.0, WARM_UP_SAMPLES / weight_sum) * variance
+    sample_sum = FORGETTING * sample_sum + weight * np.minimum((square - other) / multiple, cap)
+    weight_sum = FORGETTING * weight_sum + weight
+    return NoiseLevel(np.maximum(sample_sum / weight_sum, floor), weight_sum, sample_sum, floor)
