@@ -136,6 +136,7 @@ class ControllerEntry:
         config: returns the default settings, a frozen dataclass; a dataclass with a default for every field does.
         build: makes the controller from its settings and what it may know.
         needs_truth: whether it is given the true Jacobian and kinematics: a bound, not a competitor.
+        side_by_side: whether `build` returns a `ServoController`, whose parts take many runs at once.
     """
 
     name: str
@@ -143,3 +144,4 @@ class ControllerEntry:
     config: Callable[[], Any]
     build: Callable[[Any, RobotKnowledge], Controller]
     needs_truth: bool = False
+    side_by_side: bool = False

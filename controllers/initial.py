@@ -10,7 +10,7 @@ latency have died out; the features of a rest are averaged. With the rest-to-res
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar, Generic, Literal, NamedTuple, TypeVar, final
+from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -217,7 +217,7 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             raise ControllerDiverged(
                 f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
-        return transposed(np.linalg.solve(Q, Y))
+        return np.asarray(transposed(np.linalg.solve(Q, Y)))
 
 
 def _entry(rows: FloatArray, index: IntArray) -> FloatArray:
@@ -231,7 +231,7 @@ def _with_entry(rows: FloatArray, index: IntArray, row: FloatArray) -> FloatArra
     return np.where(chosen[..., None], row[..., None, :], rows)
 
 
-def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> InitialJacobian:
+def initial_jacobian(config: InitialConfig, knowledge: RobotKnowledge) -> InitialJacobian[Any]:
     """Return the provider that `config` asks for.
 
     Raises:

@@ -97,7 +97,7 @@ class Method:
             ValueError: an unknown law or estimator.
         """
         needs_truth = any(part.needs_truth for part in self._parts())
-        return ControllerEntry(self.name, self.summary, self.config, self.build, needs_truth)
+        return ControllerEntry(self.name, self.summary, self.config, self.build, needs_truth, side_by_side=True)
 
     def _parts(self) -> tuple[Part[Any], Part[Any]]:
         return _find("law", self.law, LAWS), _find("estimator", self.estimator, ESTIMATORS)

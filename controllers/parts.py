@@ -43,7 +43,7 @@ class Part(Generic[Kind]):
     trained: bool = False
 
 
-ESTIMATORS: dict[str, Part[Estimator]] = {
+ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "constant": Part(ConstantConfig, ConstantEstimator),
     "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
     "ukf": Part(UkfConfig, ukf_estimator),
@@ -56,7 +56,7 @@ ESTIMATORS: dict[str, Part[Estimator]] = {
     "cfdl": Part(CfdlConfig, CfdlEstimator),
 }
 
-LAWS: dict[str, Part[Law]] = {
+LAWS: dict[str, Part[Law[Any]]] = {
     "pid": Part(PidConfig, PidLaw),
     "mfac": Part(MfacConfig, MfacLaw),
     "mpc": Part(MpcConfig, MpcLaw),

@@ -128,6 +128,6 @@ def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:
     return np.asarray(A + np.eye(A.shape[-1]) * np.atleast_1d(value)[..., None, :])
 
 
-def transposed(A: FloatArray) -> FloatArray:
+def transposed(A: npt.NDArray[Any]) -> FloatArray:
     """Return Aᵀ, (..., n, m), for A (..., m, n)."""
     return np.swapaxes(A, -1, -2)

@@ -167,6 +167,7 @@ class PlantEntry:
         build: makes the plant from its settings and the setup.
         own_robot: it brings a robot and a start of its own: tasks taught on the UR5 and mismatches do not apply, and
             no nominal model is known.
+        side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
     """
 
     name: str
@@ -174,3 +175,4 @@ class PlantEntry:
     config: type[Any]
     build: Callable[[Any, PlantSetup], Plant]
     own_robot: bool = False
+    side_by_side: bool = False

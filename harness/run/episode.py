@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,13 +13,16 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import build
-from servobench.harness.run.log import StepLog
+from servobench.harness.run.experiment import Drawn, build
+from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import SETTLING_BAND, judge_run
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.side_by_side import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.threads import one_thread
+from servobench.harness.run.together import Together, build_together
+from servobench.plant.checks import FloatArray
 from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
 
@@ -65,39 +70,102 @@ def carry_out(
     resolved: ResolvedRun, *, steps: bool = True, picture: bool = False, keep: Path | None = None
 ) -> RunResult:
     """Carry out a run whose settings are resolved; arguments and errors as in `run_experiment`."""
-    request, experiment = resolved.request, build(resolved, keep=keep)
+    experiment = build(resolved, keep=keep)
     plant, scenario = experiment.plant, experiment.scenario
     log = StepLog(plant.spec, experiment.periods)
     status, reason = COMPLETED, ""
     try:
-        with one_thread(), np.errstate(divide="raise", over="raise", invalid="raise"):
-            run_loop(plant, experiment.controller, scenario.reference, experiment.loop, request.seed, log)
-    except RunFault as fault:
-        status, reason = fault.status, _one_line(fault)
-    except FloatingPointError as error:
-        status, reason = NUMERICAL_ERROR, _one_line(error)
+        with _careful():
+            desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview)
+            run_loop(plant, experiment.controller, desired, experiment.loop, resolved.request.seed, log)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
-        status, reason = CRASHED, describe_error(error)
+        status, reason = _ending(error)
     finally:
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
         plant.close()
-    metrics = {}
-    if len(logged):
-        metrics = judge_run(logged, scenario.kind, scenario.evaluate_from)
-    row: dict[str, Any] = {
+    metrics = judge_run(logged, scenario.kind, scenario.evaluate_from) if len(logged) else {}
+    row = _row(experiment.drawn, resolved.request, (status, reason), _numbers(metrics), logged)
+    table = logged.table(resolved.request.run_id, full_jacobian=experiment.run.full_jacobian) if steps else None
+    return RunResult(row, table, image)
+
+
+def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None) -> list[RunResult]:
+    """Carry out runs of one `side_by_side_key` that advance together; the rows are those of `carry_out`, without times.
+
+    Where they cannot be built together, because something is wrong with one of them, they are carried out one by one.
+
+    Args:
+        runs: at least one.
+        keep: results folder in which trained networks are kept beside the runs.
+    """
+    try:
+        many = build_together(runs, keep=keep)
+        ends = Ends(len(runs))
+        log = ManyLogs(many.bench.spec, many.loop.periods, ends)
+        try:
+            with _careful(), contextlib.suppress(AllEnded):
+                plant, controller = ManyBenches(many.bench, ends), ManyServos(many.servo, ends)
+                run_loop(plant, controller, many.desired, many.loop, [run.request.seed for run in runs], log)
+        finally:
+            many.bench.close()
+    except Exception:  # noqa: BLE001 - whatever it is, it is found again in the row of the run that it concerns
+        return [carry_out(run, steps=False, keep=keep) for run in runs]
+    return _judge_together(runs, many, ends, log.steps())
+
+
+def _judge_together(runs: Sequence[ResolvedRun], many: Together, ends: Ends, logged: Steps) -> list[RunResult]:
+    task = many.drawn[0].scenario
+    metrics = judge_run(logged, task.kind, task.evaluate_from) if len(ends.running) else {}
+    columns = {name: values.tolist() for name, values in metrics.items()}
+    results = []
+    for lane, (run, drawn) in enumerate(zip(runs, many.drawn, strict=True)):
+        if lane in ends.faults:
+            own = logged.run(lane, ends.rows[lane])
+            judged = judge_run(own, task.kind, task.evaluate_from) if len(own) else {}
+            row = _row(drawn, run.request, _ending(ends.faults[lane]), _numbers(judged), own)
+        else:
+            values = {name: column[lane] for name, column in columns.items()}
+            row = _row(drawn, run.request, (COMPLETED, ""), values, logged)
+        results.append(RunResult(row, None))
+    return results
+
+
+@contextlib.contextmanager
+def _careful() -> Iterator[None]:
+    """One thread, and an error where a number leaves its range."""
+    with one_thread(), np.errstate(divide="raise", over="raise", invalid="raise"):
+        yield
+
+
+def _ending(error: Exception) -> tuple[str, str]:
+    """Return status and reason of a run that an error ended."""
+    if isinstance(error, RunFault):
+        return error.status, _one_line(error)
+    if isinstance(error, FloatingPointError):
+        return NUMERICAL_ERROR, _one_line(error)
+    return CRASHED, describe_error(error)
+
+
+def _numbers(metrics: dict[str, FloatArray]) -> dict[str, float]:
+    return {name: float(value) for name, value in metrics.items()}
+
+
+def _row(
+    drawn: Drawn, request: RunRequest, ending: tuple[str, str], metrics: dict[str, float], logged: Steps
+) -> dict[str, Any]:
+    spec = logged.spec
+    return {
         **request.as_row(),
-        "task_kind": scenario.kind,
-        "feature_unit": plant.spec.feature_unit,
-        "settling_band": SETTLING_BAND * plant.spec.feature.scale,
-        "status": status,
+        "task_kind": drawn.scenario.kind,
+        "feature_unit": spec.feature_unit,
+        "settling_band": SETTLING_BAND * spec.feature.scale,
+        "status": ending[0],
         **metrics,
         "periods": len(logged),
-        "reason": reason,
-        "mismatch_values": json.dumps(experiment.sample.as_record() if experiment.sample else {}),
+        "reason": ending[1],
+        "mismatch_values": json.dumps(drawn.sample.as_record() if drawn.sample else {}),
     }
-    table = logged.table(request.run_id, full_jacobian=experiment.run.full_jacobian) if steps else None
-    return RunResult(row, table, image)
 
 
 def failed_row(request: RunRequest, status: str, reason: str) -> dict[str, Any]:

@@ -21,39 +21,58 @@ from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
+from servobench.plant.checks import FloatArray
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
-from servobench.plant.robot.hand_eye import FEATURE_NAMES, HandEyeModel, hand_eye_spec
+from servobench.plant.robot.hand_eye import FEATURE_NAMES, HandEyeModel, TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import PlantSpec
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is drawn for one run."""
+
+    scenario: Scenario
+    true: HandEyeModel | None = None  # the true robot; None for a plant that brings its own
+    sample: MismatchSample | None = None  # how it differs from the nominal one
+    moved: HandEyeModel | None = None  # the true robot after its camera was moved; None if it is not
+
+
+@dataclass(frozen=True, eq=False)
 class Experiment:
     """A run made ready: all configuration resolved, the true robot drawn, plant and controller built."""
 
     plant: Plant
     controller: Controller
-    scenario: Scenario
+    drawn: Drawn
     run: RunSettings
-    sample: MismatchSample | None
-    moved: HandEyeModel | None = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """Start, reference and length of the run."""
+        return self.drawn.scenario
 
     @property
     def loop(self) -> LoopSettings:
         """The settings of the loop."""
-        move = None
-        if self.moved is not None:
-            move = CameraMove(int(self.run.camera_moves_at * self.periods), self.moved.X_BC)
-        return LoopSettings(self.periods, self.run.preview, self.run.lost_after_periods, move)
+        moved = self.drawn.moved
+        return loop_settings(self.run, self.scenario.duration, None if moved is None else moved.X_BC)
 
     @property
     def periods(self) -> int:
         """Number of control periods."""
         return self.run.periods(self.scenario.duration)
+
+
+def loop_settings(run: RunSettings, duration: float, moved: FloatArray | None) -> LoopSettings:
+    """Return the settings of the loop of a run of `duration` [s], with the camera's pose (..., 4, 4) after a move."""
+    periods = run.periods(duration)
+    move = None if moved is None else CameraMove(int(run.camera_moves_at * periods), moved)
+    return LoopSettings(periods, run.preview, run.lost_after_periods, move)
 
 
 def build_experiment(
@@ -74,27 +93,58 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
     Raises:
         ConfigurationError: a name, setting, mismatch or seed that cannot be used.
     """
-    request, run = resolved.request, resolved.run
-    entry = find_plant(request.plant)
+    entry = find_plant(resolved.request.plant)
     if entry.own_robot:
         return _build_with_own_robot(resolved, entry, keep, progress)
-    nominal = nominal_ur5()
+    drawn = draw(resolved)
+    return Experiment(*assemble(resolved, drawn.true, drawn.scenario.start, keep, progress), drawn, resolved.run)
+
+
+def draw(resolved: ResolvedRun) -> Drawn:
+    """Draw the true robot and the task of a run.
+
+    Raises:
+        ConfigurationError: a mismatch or a task that cannot be used.
+    """
+    request, nominal = resolved.request, nominal_ur5()
     try:
         true, sample = sample_mismatch(request.mismatch, nominal, named_seed(request.seed, "mismatch"))
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     moved = sample.moved(true)
     setting = TaskSetting(true, true.arm.n, FEATURE_NAMES, named_seed(request.seed, "task"), moved)
-    scenario = _build_scenario(resolved, setting)
-    plant = _build_plant(resolved, entry, PlantSetup(true, scenario.start, run.period))
+    return Drawn(_build_scenario(resolved, setting), true, sample, moved)
+
+
+def assemble(
+    resolved: ResolvedRun,
+    true: HandEyeModel | None,
+    start: FloatArray | None,
+    keep: Path | None = None,
+    progress: Progress | None = None,
+) -> tuple[Plant, Controller]:
+    """Return plant and controller for a true robot and a start, or for those of runs side by side.
+
+    Args:
+        resolved: the run, or one of the runs.
+        true: the robot; of runs side by side its arrays have a leading axis.
+        start: (..., n) [rad].
+        keep: results folder in which trained networks are kept beside the runs.
+        progress: called with the share of a training of networks that is done.
+
+    Raises:
+        ConfigurationError: a setting that cannot be used.
+    """
+    request, run = resolved.request, resolved.run
+    plant = _build_plant(resolved, find_plant(request.plant), PlantSetup(true, start, run.period))
     try:
-        source = network_source(nominal.jacobian, plant.spec, keep, progress)
+        source = network_source(nominal_ur5().jacobian, plant.spec, keep, progress)
         knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
         controller = _build_controller(request.controller, resolved.controller, knowledge, lambda: _equations(true))
     except BaseException:
         plant.close()
         raise
-    return Experiment(plant, controller, scenario, run, sample, moved)
+    return plant, controller
 
 
 def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
@@ -165,16 +215,19 @@ def _build_with_own_robot(
     except BaseException:
         plant.close()
         raise
-    return Experiment(plant, controller, scenario, run, None)
+    return Experiment(plant, controller, Drawn(scenario), run)
 
 
-def _equations(model: HandEyeModel) -> TrueModel:
+def _equations(model: HandEyeModel | None) -> TrueModel:
+    if model is None:
+        raise ValueError("model must be given for a controller that needs the truth, got None")
+
     def symbolic(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
         from servobench.plant.robot.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
 
         return symbolic_feature(model)(joint_position)
 
-    return TrueModel(model.jacobian, symbolic)
+    return TrueModel(TrueJacobian(model), symbolic)
 
 
 def _build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:

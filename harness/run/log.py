@@ -1,12 +1,12 @@
-"""The log of one run: arrays with one row a control period, made into a table once the run is over.
+"""The log of a run: arrays with one row a control period, made into a table once the run is over.
 
-Row k holds instant t_k: reference, observation, command, truth and how long controller and plant took. The error is
-that of the true feature. Times are wall clock and the only columns that differ between two runs of the same seed.
+Runs side by side share one log, whose arrays have their lanes after the period: (k, ..., m). Row k holds instant t_k:
+reference, observation, command, truth and how long controller and plant took. The error is that of the true feature.
+Times are wall clock and the only columns that differ between two runs of the same seed.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -17,6 +17,8 @@ import pandas as pd
 
 from servobench.controllers.controller import Diagnostics
 from servobench.plant.checks import FloatArray
+from servobench.plant.faults import RunFault
+from servobench.plant.lanes import norm
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 JOINT_UNIT = "rad"
@@ -24,43 +26,47 @@ JOINT_UNIT = "rad"
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """A run as arrays of k rows; NaN where a number is not known."""
+    """A run, or runs side by side, as arrays of k rows; NaN where a number is not known."""
 
     spec: PlantSpec  # names and units for the columns
     time: FloatArray  # (k,) [s]
-    reference: FloatArray  # (k, m) [unit of the feature]
-    feature: FloatArray  # (k, m), what the controller saw [unit of the feature]
-    true_feature: FloatArray  # (k, m) [unit of the feature]
-    joint_position: FloatArray  # (k, n), as the encoders report it [rad]
-    command: FloatArray  # (k, n) [rad/s]
-    feature_valid: npt.NDArray[np.bool_]  # (k,), whether a measurement arrived
-    estimated_jacobian: FloatArray  # (k, m, n), the one that the controller used [unit of the feature per rad]
-    true_jacobian: FloatArray  # (k, m, n) [unit of the feature per rad]
+    reference: FloatArray  # (k, ..., m) [unit of the feature]
+    feature: FloatArray  # (k, ..., m), what the controller saw [unit of the feature]
+    true_feature: FloatArray  # (k, ..., m) [unit of the feature]
+    joint_position: FloatArray  # (k, ..., n), as the encoders report it [rad]
+    command: FloatArray  # (k, ..., n) [rad/s]
+    feature_valid: npt.NDArray[np.bool_]  # (k, ...), whether a measurement arrived
+    estimated_jacobian: FloatArray  # (k, ..., m, n), the one that the controller used [unit of the feature per rad]
+    true_jacobian: FloatArray  # (k, ..., m, n) [unit of the feature per rad]
     controller_time: FloatArray  # (k,) [µs]
     plant_time: FloatArray  # (k,) [µs]
-    diagnostics: dict[str, FloatArray]  # (k,) for each number that the controller gave at least once
+    diagnostics: dict[str, FloatArray]  # (k,) for each number that the controller gave at least once; of one run only
 
     def __len__(self) -> int:
         """Number of rows."""
         return len(self.time)
 
+    def run(self, lane: int, rows: int) -> Steps:
+        """Return the first rows of one of the runs side by side."""
+        named = ((item.name, getattr(self, item.name)) for item in fields(self)[1:-1])
+        arrays = {name: array[:rows] if array.ndim == 1 else array[:rows, lane] for name, array in named}
+        return Steps(self.spec, **arrays, diagnostics={})
+
     def error_norm(self) -> FloatArray:
-        """Return ‖reference − true feature‖, (k,) [unit of the feature]."""
-        return row_norms(self.reference - self.true_feature)
+        """Return ‖reference − true feature‖, (k, ...) [unit of the feature]."""
+        return norm(self.reference - self.true_feature)
 
     def jacobian_error(self) -> FloatArray:
-        """Return ‖Ĵ − J‖ / ‖J‖ (Frobenius), (k,)."""
+        """Return ‖Ĵ − J‖ / ‖J‖ (Frobenius), (k, ...)."""
         with np.errstate(all="ignore"):
-            difference = row_norms(self.estimated_jacobian - self.true_jacobian)
-            return np.asarray(difference / row_norms(self.true_jacobian))
+            difference = norm(_flat(self.estimated_jacobian - self.true_jacobian))
+            return np.asarray(difference / norm(_flat(self.true_jacobian)))
 
     def jacobian_condition(self) -> FloatArray:
-        """Return the largest over the smallest singular value of J, (k,); infinite where J has lost rank."""
-        condition = np.full(len(self), np.nan)
-        known = np.isfinite(self.true_jacobian).all(axis=(1, 2))
-        singular = np.linalg.svd(self.true_jacobian[known], compute_uv=False)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            condition[known] = np.where(singular[:, -1] > 0.0, singular[:, 0] / singular[:, -1], np.inf)
+        """Return the largest over the smallest singular value of J, (k, ...); infinite where J has lost rank."""
+        condition = np.full(self.true_jacobian.shape[:-2], np.nan)
+        known = np.isfinite(_flat(self.true_jacobian)).all(axis=-1)
+        condition[known] = conditions(self.true_jacobian[known])
         return condition
 
     def table(self, run_id: str, *, full_jacobian: bool = False) -> pd.DataFrame:
@@ -97,16 +103,17 @@ class Steps:
 
 
 class StepLog:
-    """Collects the rows of one run in arrays that are made beforehand."""
+    """Collects the rows of a run, or of runs side by side, in arrays that are made beforehand."""
 
-    def __init__(self, spec: PlantSpec, periods: int) -> None:
+    def __init__(self, spec: PlantSpec, periods: int, lanes: tuple[int, ...] = ()) -> None:
         """Prepare an empty log.
 
         Args:
             spec: sizes, names and units.
             periods: how many rows there is room for.
+            lanes: the leading axes of runs side by side.
         """
-        features, joints, jacobians = (periods, spec.m), (periods, spec.n), (periods, spec.m, spec.n)
+        features, joints, jacobians = ((periods, *lanes, *own) for own in ((spec.m,), (spec.n,), (spec.m, spec.n)))
         self._count = 0
         self._rows = Steps(
             spec=spec,
@@ -116,7 +123,7 @@ class StepLog:
             true_feature=np.empty(features),
             joint_position=np.empty(joints),
             command=np.empty(joints),
-            feature_valid=np.empty(periods, dtype=np.bool_),
+            feature_valid=np.empty((periods, *lanes), dtype=np.bool_),
             estimated_jacobian=np.full(jacobians, np.nan),
             true_jacobian=np.full(jacobians, np.nan),
             controller_time=np.empty(periods),
@@ -138,10 +145,10 @@ class StepLog:
 
         Args:
             observation: what the controller saw.
-            reference: (m,), the desired feature now [unit of the feature].
+            reference: (..., m), the desired feature now [unit of the feature].
             command: the controller's answer.
             truth: the true feature and Jacobian of this instant.
-            estimate: (m, n), the Jacobian that the controller used, or None [unit of the feature per rad].
+            estimate: (..., m, n), the Jacobian that the controller used, or None [unit of the feature per rad].
             diagnostics: the controller's own numbers; a name may come later than the first row.
             nanoseconds: how long the controller's and the plant's step took.
         """
@@ -164,6 +171,14 @@ class StepLog:
             rows.diagnostics[name][k] = value
         self._count += 1
 
+    def end(self, lanes: npt.NDArray[np.bool_], fault: RunFault) -> None:
+        """End the run for a fault that the loop found; runs side by side end those in the lanes.
+
+        Raises:
+            RunFault: `fault`, which ends the run that has this log to itself.
+        """
+        raise fault
+
     def steps(self) -> Steps:
         """Return the rows so far."""
         k, rows = self._count, self._rows
@@ -176,10 +191,15 @@ def column_unit(unit: str) -> str:
     return re.sub(r"\W+", "_", unit)
 
 
-def row_norms(rows: FloatArray) -> FloatArray:
-    """Return the norm of all entries of each row of (k, ...), with the bits of `numpy.linalg.norm` of the row alone."""
-    flat = rows.reshape(len(rows), math.prod(rows.shape[1:]))
-    return np.asarray(np.sqrt(np.matmul(flat[:, None, :], flat[:, :, None])[:, 0, 0]))
+def conditions(jacobian: FloatArray) -> FloatArray:
+    """Return the largest over the smallest singular value, (...), of J (..., m, n); infinite where J has lost rank."""
+    singular = np.linalg.svd(jacobian, compute_uv=False)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(singular[..., -1] > 0.0, singular[..., 0] / singular[..., -1], np.inf)
+
+
+def _flat(jacobian: FloatArray) -> FloatArray:
+    return jacobian.reshape(*jacobian.shape[:-2], jacobian.shape[-2] * jacobian.shape[-1])
 
 
 def _named(kind: str, names: tuple[str, ...], unit: str, values: FloatArray) -> Iterator[tuple[str, FloatArray]]:

@@ -1,4 +1,4 @@
-"""The loop: the only place that sees plant, controller and reference together.
+"""The loop: the only place that sees plant, controller and reference together; for one run or many side by side.
 
 reference(t) ------------.
                          v
@@ -10,16 +10,21 @@ reference(t) ------------.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
+from typing import Any, TypeAlias
+
+import numpy as np
 
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import StepLog
-from servobench.harness.run.references import Reference
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FeatureLost
 from servobench.plant.plant import Plant
 from servobench.plant.seeds import named_seed
+
+Seeds: TypeAlias = int | Sequence[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +32,7 @@ class CameraMove:
     """A change of the camera's pose during a run that the controller must notice by itself."""
 
     period: int  # the first period with the new pose
-    X_BC: FloatArray  # (4, 4), the new pose in the base frame
+    X_BC: FloatArray  # (..., 4, 4), the new pose in the base frame
 
 
 @dataclass(frozen=True)
@@ -41,21 +46,28 @@ class LoopSettings:
 
 
 def run_loop(
-    plant: Plant, controller: Controller, reference: Reference, settings: LoopSettings, seed: int, log: StepLog
+    plant: Plant, controller: Controller, desired: FloatArray, settings: LoopSettings, seed: Seeds, log: StepLog
 ) -> None:
-    """Step `plant` and `controller` against `reference` and write one row a period into `log`.
+    """Step `plant` and `controller` against a reference and write one row a period into `log`.
+
+    Args:
+        plant: of one run, or of runs side by side.
+        controller: the same.
+        desired: (..., periods + preview, m), the desired features from time 0 on.
+        settings: how long the run is and what ends it early.
+        seed: of the run, or one of each run.
+        log: receives the rows.
 
     Raises:
         RunFault: the run ended before its last period; the rows so far are in the log.
     """
     rows, move = 1 + settings.preview, settings.camera_move
-    desired = reference.sampled(plant.spec.period, settings.periods + settings.preview)
-    observation = plant.reset(named_seed(seed, "plant"))
-    controller.reset(observation, named_seed(seed, "controller"))
-    lost = 0
+    observation = plant.reset(_named(seed, "plant"))
+    controller.reset(observation, _named(seed, "controller"))
+    lost: Any = 0
     for k in range(settings.periods):
         began = perf_counter_ns()
-        command = controller.step(observation, desired[k : k + rows])
+        command = controller.step(observation, desired[..., k : k + rows, :])
         decided = perf_counter_ns()
         truth = plant.truth()
         if move is not None and k == move.period:
@@ -64,8 +76,13 @@ def run_loop(
         following = plant.step(command)
         spent = (decided - began, perf_counter_ns() - released)
         estimate, diagnostics = controller.estimated_jacobian(), controller.diagnostics()
-        log.add(observation, desired[k], command, truth, estimate, diagnostics, spent)
+        log.add(observation, desired[..., k, :], command, truth, estimate, diagnostics, spent)
         observation = following
-        lost = 0 if observation.feature_valid else lost + 1
-        if lost >= settings.lost_after_periods:
-            raise FeatureLost(f"no valid feature for {lost} periods, until {observation.time:g} s")
+        lost = (1 + lost) * (1 - observation.feature_valid)
+        if np.max(lost) >= settings.lost_after_periods:
+            text = f"no valid feature for {settings.lost_after_periods} periods, until {observation.time:g} s"
+            log.end(np.asarray(lost >= settings.lost_after_periods), FeatureLost(text))
+
+
+def _named(seed: Seeds, name: str) -> Any:  # noqa: ANN401 - as `seed`
+    return named_seed(seed, name) if isinstance(seed, int) else [named_seed(each, name) for each in seed]

@@ -16,11 +16,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from servobench.harness.run.log import Steps
 from servobench.harness.run.references import TaskKind
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import norm, transposed
 
 SETTLING_BAND = 0.005  # share of the feature's natural size: 5 mm on the UR5
 SETTLING_SHARE = 0.05  # band as a share of the initial error
@@ -28,82 +33,105 @@ DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
 
 
-def settling_time(error: FloatArray, band: float, period: float, dwell: float = DWELL) -> float:
+def settling_time(error: FloatArray, band: npt.ArrayLike, period: float, dwell: float = DWELL) -> FloatArray:
     """Return the first time after which `error` stays within `band`.
 
     Args:
-        error: (k,), one value a period [unit of the feature].
-        band: [unit of the feature].
+        error: (..., k), one value a period [unit of the feature].
+        band: one number or (...) [unit of the feature].
         period: [s].
         dwell: least time within the band at the end [s].
 
     Returns:
-        [s]; NaN if the error is outside at the end, or came in less than `dwell` before it.
+        (...) [s]; NaN if the error is outside at the end, or came in less than `dwell` before it.
     """
-    outside = np.flatnonzero(~(error <= band))
-    first = int(outside[-1]) + 1 if len(outside) else 0
-    return first * period if (len(error) - first) * period >= dwell - 1e-9 else np.nan
+    count = error.shape[-1]
+    outside = ~(error <= np.asarray(band)[..., None])
+    first = np.where(outside.any(axis=-1), count - outside[..., ::-1].argmax(axis=-1), 0)
+    return np.where((count - first) * period >= dwell - 1e-9, first * period, np.nan)
 
 
-def overshoot(feature: FloatArray, target: FloatArray) -> float:
+def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
     """Return how far the feature passes the target along the initial error, as a share of that.
 
     Args:
-        feature: (k, m) [unit of the feature].
-        target: (m,) [unit of the feature].
+        feature: (..., m, k) [unit of the feature].
+        target: (..., m) [unit of the feature].
 
     Returns:
-        At least 0; NaN if the run starts at the target.
+        (...), at least 0; NaN if the run starts at the target.
     """
-    way = target - feature[0]
-    length = float(way @ way)
-    return max(0.0, float(np.max((feature - feature[0]) @ way)) / length - 1.0) if length > 0.0 else np.nan
+    start = feature[..., 0]
+    way = target - start
+    length = np.vecdot(way, way)
+    passed = np.vecmat(way, feature - start[..., None]).max(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(length > 0.0, np.maximum(0.0, passed / length - 1.0), np.nan)
 
 
-def path_length(points: FloatArray) -> float:
-    """Return the length of the path through `points`, (k, m) [their unit]."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+def path_length(points: FloatArray) -> FloatArray:
+    """Return the length, (...), of the path through `points`, (..., m, k) [their unit]."""
+    return norm(np.ascontiguousarray(transposed(np.diff(points, axis=-1)))).sum(axis=-1)
 
 
-def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, float]:
-    """Return the metrics of one run.
+def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, FloatArray]:
+    """Return the metrics of a run, or of runs side by side.
 
     Args:
-        steps: its rows, at least one.
+        steps: the rows, at least one.
         kind: of the task; "point_to_point" has a fixed target.
         evaluate_from: where the evaluated part begins [s].
 
     Returns:
-        Metric name -> value; NaN where a metric does not apply.
+        Metric name -> (...); NaN where a metric does not apply, as the times of runs side by side.
     """
-    spec, error, fixed = steps.spec, steps.error_norm(), kind == "point_to_point"
+    spec, fixed = steps.spec, kind == "point_to_point"
+    error, jacobian_error, condition = map(
+        _columns, (steps.error_norm(), steps.jacobian_error(), steps.jacobian_condition())
+    )
     # Column after column: the order of a sum decides its last bits, and stored tables are compared bit for bit.
-    feature, reference, command = map(np.asfortranarray, (steps.true_feature, steps.reference, steps.command))
-    evaluated = error[steps.time >= evaluate_from - 1e-9]
-    final = error[-max(1, round(FINAL_SPAN / spec.period)) :]
-    way = float(np.linalg.norm(reference[0] - feature[0])) if fixed else path_length(reference)
-    saturated = np.any(np.abs(command) >= spec.joint_velocity_limit * (1 - 1e-9), axis=1)
-    jacobian_error, condition = (values[~np.isnan(values)] for values in (
-        steps.jacobian_error(), steps.jacobian_condition()))  # fmt: skip
+    feature, reference, command = map(_columns, (steps.true_feature, steps.reference, steps.command))
+    evaluated = error[..., steps.time >= evaluate_from - 1e-9]
+    final = error[..., -max(1, round(FINAL_SPAN / spec.period)) :]
+    way = norm(reference[..., 0] - feature[..., 0]) if fixed else path_length(reference)
+    effort = np.abs(command)
+    at_limit = effort >= spec.joint_velocity_limit[:, None] * (1 - 1e-9)
+    lanes = error.shape[:-1]
+    unknown = np.full(lanes, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        path_length_ratio = np.where(way > 0.0, path_length(feature) / way, np.nan)
     return {
         "settling_time_s": settling_time(error, SETTLING_BAND * spec.feature.scale, spec.period),
-        "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[0], spec.period),
-        "overshoot": overshoot(feature, reference[0]) if fixed else np.nan,
-        "steady_state_error": float(np.mean(final)),
+        "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[..., 0], spec.period),
+        "overshoot": overshoot(feature, reference[..., 0]) if fixed else unknown,
+        "steady_state_error": final.mean(axis=-1),
         "rms_error": _rms(error),
-        "max_error": float(np.max(error)),
-        "rms_error_evaluated": _rms(evaluated) if len(evaluated) else np.nan,
-        "path_length_ratio": path_length(feature) / way if way > 0.0 else np.nan,
-        "control_effort_rad": float(np.abs(command).sum() * spec.period),
-        "saturation_fraction": float(np.mean(saturated)),
-        "feature_invalid_fraction": float(np.mean(~steps.feature_valid)),
-        "jacobian_error_mean": float(np.mean(jacobian_error)) if len(jacobian_error) else np.nan,
-        "jacobian_condition_max": float(np.max(condition)) if len(condition) else np.nan,
-        "controller_time_median_us": float(np.median(steps.controller_time)),
-        "controller_time_p99_us": float(np.quantile(steps.controller_time, 0.99)),
-        "plant_time_median_us": float(np.median(steps.plant_time)),
+        "max_error": error.max(axis=-1),
+        "rms_error_evaluated": _rms(evaluated) if evaluated.shape[-1] else unknown,
+        "path_length_ratio": path_length_ratio,
+        "control_effort_rad": effort.reshape(*effort.shape[:-2], -1).sum(axis=-1) * spec.period,
+        "saturation_fraction": at_limit.any(axis=-2).mean(axis=-1),
+        "feature_invalid_fraction": np.mean(_columns(~steps.feature_valid), axis=-1),
+        "jacobian_error_mean": _of_known(np.mean, jacobian_error),
+        "jacobian_condition_max": _of_known(np.max, condition),
+        "controller_time_median_us": np.full(lanes, np.median(steps.controller_time)),
+        "controller_time_p99_us": np.full(lanes, np.quantile(steps.controller_time, 0.99)),
+        "plant_time_median_us": np.full(lanes, np.median(steps.plant_time)),
     }
 
 
-def _rms(error: FloatArray) -> float:
-    return float(np.sqrt(np.mean(error**2)))
+def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return values (k, ...) or (k, ..., m) with the period as the last, contiguous axis."""
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+
+
+def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatArray:
+    """Return the mean or maximum over periods, (...), of those values (..., k) that are not NaN; NaN without any."""
+    if not np.isnan(values).any():
+        return np.asarray(summary(values, axis=-1))
+    rows = [row[~np.isnan(row)] for row in values.reshape(-1, values.shape[-1])]
+    return np.array([summary(row) if len(row) else np.nan for row in rows]).reshape(values.shape[:-1])
+
+
+def _rms(error: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean(error**2, axis=-1)))

@@ -65,6 +65,17 @@ class HandEyeModel:
         return np.asarray(np.asarray(p_C, dtype=np.float64) @ self.X_BC[:3, :3].T + self.X_BC[:3, 3])
 
 
+@dataclass(frozen=True, eq=False)
+class TrueJacobian:
+    """The Jacobian of a model as a function of the joint positions, which keeps its lanes."""
+
+    model: HandEyeModel
+
+    def __call__(self, joint_position: FloatArray) -> FloatArray:
+        """Return J, (..., m, n), at (..., n) [rad]."""
+        return self.model.jacobian(joint_position)
+
+
 def hand_eye_spec(model: HandEyeModel, period: float, max_joint_speed: float, joint_range: float) -> PlantSpec:
     """Return the spec of a plant built on `model`.
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kit.straight_move import CONDITION, SPEC, VELOCITY, straight_move
-from servobench.harness.run.log import StepLog, column_unit, row_norms
+from servobench.harness.run.log import StepLog, column_unit
 
 COLUMNS = [
     *("run_id", "step", "time_s", "reference_x_m", "reference_y_m", "feature_x_m", "feature_y_m"),
@@ -55,8 +55,3 @@ def test_a_singular_jacobian_has_an_infinite_condition():
 @pytest.mark.parametrize(("unit", "suffix"), [("m", "m"), ("rad/s", "rad_s"), ("px", "px"), ("m/s^2", "m_s_2")])
 def test_units_become_suffixes_of_columns(unit, suffix):
     assert column_unit(unit) == suffix
-
-
-def test_norms_of_many_rows_have_the_bits_of_one():
-    rows = np.random.default_rng(0).normal(size=(500, 3, 6))
-    np.testing.assert_array_equal(row_norms(rows), [np.linalg.norm(row) for row in rows])

@@ -33,15 +33,15 @@ def test_settling_and_overshoot_agree_with_python_control():
     info = control.step_info(response, times, SettlingTimeThreshold=0.05, yfinal=1.0)
     assert settling_time(np.abs(1.0 - response), 0.05, 0.01) == pytest.approx(info["SettlingTime"], abs=0.011)
     track = np.outer(response, [0.3, 0.0, -0.4])
-    assert overshoot(track, np.array([0.3, 0.0, -0.4])) == pytest.approx(info["Overshoot"] / 100, abs=1e-9)
+    assert overshoot(track.T, np.array([0.3, 0.0, -0.4])) == pytest.approx(info["Overshoot"] / 100, abs=1e-9)
 
 
 def test_no_overshoot_when_the_feature_stops_short():
-    assert overshoot(np.array([[0.0, 0.0], [0.5, 0.2]]), np.array([1.0, 0.0])) == 0.0
+    assert overshoot(np.array([[0.0, 0.5], [0.0, 0.2]]), np.array([1.0, 0.0])) == 0.0
 
 
 def test_the_path_length_of_a_square_is_its_circumference():
-    assert path_length(np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]], dtype=float)) == 4.0
+    assert path_length(np.array([[0, 1, 1, 0, 0], [0, 0, 1, 1, 0]], dtype=float)) == 4.0
 
 
 def test_a_run_is_judged_by_hand_computed_figures():

@@ -1,0 +1,236 @@
+"""Runs that advance together: a plant, a controller and a log of many lanes for the same loop that carries out one run.
+
+A run that ends early leaves the plant and the controller; the loop goes on with the others and sees its last values in
+its place. What raises in a step of the controller concerns some lanes only, but does not say which: the step, which is
+pure, is repeated with ever fewer lanes until the run is found.
+"""
+
+from __future__ import annotations
+
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.controllers.controller import Controller, Diagnostics
+from servobench.controllers.servo import Servo, ServoState
+from servobench.harness.run.log import StepLog, Steps
+from servobench.plant.bench import Bench
+from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import take
+from servobench.plant.plant import Plant
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth, trusted_observation
+
+LaneIndex = npt.NDArray[np.intp]
+
+
+class AllEnded(Exception):
+    """No run is under way any more."""
+
+
+@final
+class Ends:
+    """Which runs are still under way, and how the others ended.
+
+    Attributes:
+        running: indices of the runs that are under way, ascending.
+        faults: what ended a run, by its index.
+        rows: rows of the log that such a run has.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Start `count` runs."""
+        self.count, self.running = count, np.arange(count)
+        self.faults: dict[int, Exception] = {}
+        self.rows: dict[int, int] = {}
+
+    def end(self, lane: int, fault: Exception, rows: int) -> None:
+        """End one run; the first fault counts.
+
+        Raises:
+            AllEnded: it was the last one.
+        """
+        if lane not in self.faults:
+            self.faults[lane], self.rows[lane] = fault, rows
+            self.running = self.running[self.running != lane]
+        if not len(self.running):
+            raise AllEnded
+
+    def spread(self, values: npt.NDArray[Any], before: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return values of the runs under way in their places among all runs; the others keep those from before."""
+        if len(self.running) == self.count:
+            return values
+        spread = before.copy()
+        spread[self.running] = values
+        return spread
+
+
+class _Member:
+    """A plant or controller of the runs that were under way when it was last asked."""
+
+    def __init__(self, ends: Ends) -> None:
+        self.ends = ends
+        self._mine = ends.running
+
+    def left(self) -> LaneIndex | None:
+        """Return which of its own lanes are still under way, or None if all are."""
+        if len(self._mine) == len(self.ends.running):
+            return None
+        stay = np.flatnonzero(np.isin(self._mine, self.ends.running))
+        self._mine = self.ends.running
+        return stay
+
+
+@final
+class ManyBenches(Plant):
+    """A bench of many lanes, as the loop sees it."""
+
+    def __init__(self, bench: Bench, ends: Ends) -> None:
+        """Take the bench, which has a lane for each run."""
+        self.spec: PlantSpec = bench.spec
+        self._bench, self._ends, self._member, self._k = bench, ends, _Member(ends), 0
+
+    def reset(self, seed: Any) -> Observation:  # noqa: ANN401 - a seed of each run
+        """See `Plant.reset`."""
+        self._seen = self._bench.reset(seed)
+        self._truth = self._bench.truth()
+        return self._seen
+
+    def step(self, command: Command) -> Observation:
+        """See `Plant.step`; a run whose plant fails ends."""
+        self._leave()
+        seen = self._bench.step(Command(take(command.joint_velocity, self._running())))
+        faults = self._bench.faults
+        if faults:
+            lanes = self._ends.running
+            for lane, fault in faults.items():
+                self._ends.end(int(lanes[lane]), fault, self._k)
+            stay = self._member.left()
+            self._bench.keep(stay)
+            seen = take(seen, stay)
+        self._k += 1
+        self._seen = self._spread(seen)
+        return self._seen
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        self._leave()
+        truth, last = self._bench.truth(), self._truth
+        jacobian = truth.jacobian
+        if jacobian is not None and last.jacobian is not None:
+            jacobian = self._ends.spread(jacobian, last.jacobian)
+        self._truth = Truth(self._ends.spread(truth.feature, last.feature), jacobian)
+        return self._truth
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """See `Plant.move_camera`."""
+        self._leave()
+        self._bench.move_camera(X_BC[self._running()])
+
+    def close(self) -> None:
+        """See `Plant.close`."""
+        self._bench.close()
+
+    def _running(self) -> Any:  # noqa: ANN401 - an index
+        return slice(None) if len(self._ends.running) == self._ends.count else self._ends.running
+
+    def _leave(self) -> None:
+        stay = self._member.left()
+        if stay is not None:
+            self._bench.keep(stay)
+
+    def _spread(self, seen: Observation) -> Observation:
+        names = ("joint_position", "feature", "feature_valid", "valid")
+        arrays = [self._ends.spread(getattr(seen, name), getattr(self._seen, name)) for name in names]
+        return trusted_observation(seen.time, *arrays)
+
+
+@final
+class ManyServos(Controller):
+    """A composed controller of many lanes, as the loop sees it."""
+
+    def __init__(self, servo: Servo, ends: Ends) -> None:
+        """Take the servo, which has a lane for each run where its parts know the true robot."""
+        self._servo, self._ends, self._member, self._k = servo, ends, _Member(ends), 0
+
+    def reset(self, observation: Observation, seed: Any) -> None:  # noqa: ANN401 - a seed of each run
+        """See `Controller.reset`; no part of a servo draws random numbers."""
+        self._state = self._servo.start(observation)
+        self._u = np.zeros_like(observation.joint_position)
+        self._jacobian = self._state.jacobian
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """See `Controller.step`; a run whose controller fails ends."""
+        stay = self._member.left()
+        if stay is not None:
+            self._state = take(self._state, stay)
+        given = observation, reference
+        if len(self._ends.running) < self._ends.count:
+            given = take(given, self._ends.running)
+        try:
+            self._state, u = self._servo.step(self._state, *given)
+        except Exception:  # noqa: BLE001 - whatever a part raises ends the runs that it concerns
+            self._end_failing(*given)
+            self._state, u = self._servo.step(self._state, *take(given, self._stay))
+        self._k += 1
+        self._u = self._ends.spread(u, self._u)
+        self._jacobian = self._ends.spread(self._state.jacobian, self._jacobian)
+        return Command(self._u)
+
+    def _end_failing(self, *given: Any) -> None:  # noqa: ANN401 - what a step is given
+        lanes = self._ends.running
+        for lane, fault in failing_lanes(self._servo, self._state, given, np.arange(len(lanes))):
+            self._ends.end(int(lanes[lane]), fault, self._k)
+        self._stay = self._member.left()
+        self._state = take(self._state, self._stay)
+
+    def estimated_jacobian(self) -> FloatArray:
+        """See `Controller.estimated_jacobian`."""
+        return self._jacobian
+
+    def diagnostics(self) -> Diagnostics:
+        """Return nothing: runs side by side keep no steps."""
+        return {}
+
+
+def failing_lanes(
+    servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: LaneIndex
+) -> list[tuple[int, Exception]]:
+    """Return the lanes in which a step fails, and what each raises as a single run, by halving."""
+    try:
+        servo.step(take(state, lanes), *take(given, lanes))
+    except Exception as error:  # noqa: BLE001 - whatever a part raises
+        if len(lanes) == 1:
+            return [(int(lanes[0]), _as_single_run(servo, state, given, int(lanes[0]), error))]
+        half = len(lanes) // 2
+        return [*failing_lanes(servo, state, given, lanes[:half]), *failing_lanes(servo, state, given, lanes[half:])]
+    return []
+
+
+def _as_single_run(servo: Servo, state: ServoState, given: tuple[Any, ...], lane: int, error: Exception) -> Exception:
+    try:
+        servo.step(take(state, lane), *take(given, lane))
+    except Exception as own:  # noqa: BLE001 - the same error with the words of a single run
+        return own
+    return error
+
+
+@final
+class ManyLogs(StepLog):
+    """The log of runs side by side, without times and diagnostics."""
+
+    def __init__(self, spec: PlantSpec, periods: int, ends: Ends) -> None:
+        """Prepare an empty log with a lane for each run."""
+        super().__init__(spec, periods, (ends.count,))
+        self._ends = ends
+
+    def end(self, lanes: npt.NDArray[np.bool_], fault: Exception) -> None:
+        """End the runs in the lanes."""
+        for lane in np.flatnonzero(lanes):
+            self._ends.end(int(lane), fault, self._count)
+
+    def steps(self) -> Steps:
+        """Return the rows so far, without times."""
+        for time in (self._rows.controller_time, self._rows.plant_time):
+            time.fill(np.nan)
+        return super().steps()
