@@ -17,6 +17,7 @@ import numpy as np
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskKind, line, read_waypoints
 from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_generator
@@ -25,6 +26,7 @@ from servobench.plant.settings import Count, NonNegative, Number, Positive, sett
 Vector: TypeAlias = tuple[float, ...]
 
 SHOULDER = (0.0, 0.0, 0.09)  # [m] base frame
+MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
 REACH = (0.35, 0.75)  # [m] from the shoulder to the ball: away from the arm's own column and from the stretched arm
 
 
@@ -160,7 +162,7 @@ class TaskSetting:
                              f"{', '.join(name for name in TASKS if TASKS[name].any_robot)}")  # fmt: skip
         return self.model
 
-    def start(self, joint_position: Vector) -> FloatArray | None:
+    def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
         """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
         return None if self.model is None else as_vector("start", joint_position, self.n)
 
@@ -186,7 +188,7 @@ def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
     return _move(config.start, FixedPoint(target), config.duration, setting)
 
 
-def _move(start: Vector, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
+def _move(start: Vector | FloatArray, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
     return Scenario(setting.start(start), reference, duration, 0.75 * duration, "point_to_point")
 
 
@@ -196,12 +198,13 @@ def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
     if not (lower < upper).all():
         raise ValueError("lower must be below upper for every joint")
     generator = named_generator(setting.seed, "start_and_target")
-    for _ in range(1000):
-        pair = generator.uniform(lower, upper, (2, n))
-        balls = nominal.arm.ball_position(pair)
-        apart = np.linalg.norm(balls[1] - balls[0]) >= config.shortest
-        if apart and (balls[:, 2] >= config.lowest).all() and _stays_in_reach(pair[1], config.lowest, setting):
-            return _build_point(PointTask(tuple(pair[0]), tuple(pair[1]), config.duration), setting)
+    for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
+        pairs = generator.uniform(lower, upper, (DRAWN_AT_ONCE, 2, n))
+        balls = nominal.arm.ball_position(pairs)
+        apart = norm(balls[:, 1] - balls[:, 0]) >= config.shortest
+        for start, target in pairs[apart & (balls[:, :, 2] >= config.lowest).all(axis=-1)]:
+            if _stays_in_reach(target, config.lowest, setting):
+                return _move(start, FixedPoint(setting.taught_on().feature(target)), config.duration, setting)
     raise ValueError("no start and target in the box are far enough apart and above the table")
 
 
