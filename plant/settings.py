@@ -128,7 +128,7 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
     changes: dict[str, Any] = {}
     for key, value in values.items():
         if key not in known:
-            raise ValueError(f"{name} has no setting {key!r}: {suggest(key, known) if known else 'it has none'}")
+            raise ValueError(f"{name} has no setting {key!r}: {_suggest_setting(key, default)}")
         present = getattr(default, key)
         if is_dataclass(present):
             if not isinstance(value, Mapping):
@@ -149,6 +149,16 @@ def suggest(word: str, known: Iterable[str]) -> str:
     hint = f"did you mean {nearest[0]!r}? " if nearest else ""
     more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
     return f"{hint}valid: {', '.join(names[:MAX_LISTED])}{more}"
+
+
+def _suggest_setting(key: str, section: object) -> str:
+    """Return what to say after an unknown key: where in a nested section it stands, or the nearest one."""
+    known = [item.name for item in fields(cast(Any, section))]
+    for name in known:
+        part = getattr(section, name)
+        if is_dataclass(part) and key in (item.name for item in fields(part)):
+            return f"did you mean {f'{name}.{key}'!r}?"
+    return suggest(key, known) if known else "it has none"
 
 
 def _convert(name: str, adapter: TypeAdapter[Any], value: object) -> Any:  # noqa: ANN401 - the adapter decides

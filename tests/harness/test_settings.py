@@ -76,6 +76,7 @@ def test_flatten_names_every_leaf():
     ("assignment", "message"),
     [
         ("outer.cuont=1", r"outer has no setting 'cuont': did you mean 'count'\? valid: count, inner, name, on, point"),
+        ("outer.gain=1", r"outer has no setting 'gain': did you mean 'inner.gain'\?"),
         ("outer.inner.gian=1", r"outer.inner has no setting 'gian': did you mean 'gain'"),
         ("outer.inner.gain=-1", r"outer.inner.gain must be above 0, got -1"),
         ("outer.inner.gain=nan", r"outer.inner.gain must be finite, got nan"),
