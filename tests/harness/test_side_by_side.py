@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from servobench.controllers.laws.mfac import MfacLaw
+from servobench.controllers.methods import METHODS
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.episode import carry_out, carry_out_together
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve
+from servobench.harness.run.together import side_by_side_key
+from servobench.plant.faults import FilterDiverged
+
+ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency_periods": 1}}, "random": {"duration": 2.5}}
+PROBED = {"mfac+rls": {"initial": {"source": "probe", "settle_periods": 3, "average_periods": 1}}}
+
+
+def lossy(probability, periods):
+    sensing = {"kinematic": {"sensing": {"drop_probability": probability}}}
+    return {**sensing, "run": {"lost_after_periods": periods}, "random": {"duration": 2.5}}
+
+
+SEEDS = (40001, 40002, 40003, 40004, 40005)
+
+
+def runs(controller, settings, plant="kinematic", mismatch="severe", task="random"):
+    return [resolve(RunRequest(plant, controller, task, mismatch, seed), Settings(settings)) for seed in SEEDS]
+
+
+def rows(results):
+    return [{name: value for name, value in each.row.items() if "_time_" not in name or "settling" in name}
+            for each in results]  # fmt: skip
+
+
+def one_by_one(resolved):
+    return rows(carry_out(run, steps=False) for run in resolved)
+
+
+def same(one, other):
+    np.testing.assert_equal(one, other)
+
+
+@pytest.mark.parametrize("controller", [name for name in METHODS if METHODS[name].side_by_side])
+def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
+    together = runs(controller, ROUGH, mismatch="severe+camera_move=60deg")
+    assert side_by_side_key(together[0]) is not None
+    alone = one_by_one(together)
+    same(rows(carry_out_together(together)), alone)
+    same(rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]])
+
+
+def test_probing_runs_go_side_by_side():
+    together = runs("mfac+rls", {*ROUGH, **PROBED})
+    same(rows(carry_out_together(together)), one_by_one(together))
+
+
+def test_runs_that_lose_the_feature_leave_the_others_alone():
+    together = runs("ukf_mfac", lossy(0.6, 9))
+    alone = one_by_one(together)
+    assert {row["status"] for row in alone} == {"completed", "feature_lost"}
+    same(rows(carry_out_together(together)), alone)
+
+
+@pytest.mark.parametrize("kind", [FilterDiverged, FloatingPointError, np.linalg.LinAlgError, KeyError])
+def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkeypatch):
+    command = MfacLaw.command
+
+    def fragile(self, state, estimate, observation, reference):
+        bad = (observation.time > 1.0) & (observation.feature[..., 0] > 0.05)
+        if np.any(bad):
+            raise kind(f"the feature is at {observation.feature[..., 0].tolist()}")
+        return command(self, state, estimate, observation, reference)
+
+    together = runs("ukf_mfac", ROUGH)
+    monkeypatch.setattr(MfacLaw, "command", fragile)
+    alone = one_by_one(together)
+    assert {"completed"} < {row["status"] for row in alone}
+    same(rows(carry_out_together(together)), alone)
+
+
+def test_a_block_of_which_every_run_ends_early_has_all_its_rows():
+    together = runs("ukf_mfac", lossy(0.99, 3))
+    alone = one_by_one(together)
+    assert {row["status"] for row in alone} == {"feature_lost"}
+    same(rows(carry_out_together(together)), alone)
+
+
+def test_times_of_runs_side_by_side_are_unknown():
+    row = carry_out_together(runs("ukf_mfac", ROUGH))[0].row
+    assert np.isnan([row["controller_time_median_us"], row["controller_time_p99_us"], row["plant_time_median_us"]]).all()
+
+
+def test_plug_ins_and_rendered_plants_go_alone():
+    assert side_by_side_key(runs("nmpc_calibrated", {})[0]) is None
+    assert side_by_side_key(runs("ukf_mfac", {}, plant="bullet")[0]) is None
