@@ -1,59 +1,93 @@
 """The pair stage under an unknown delay: which joint motion belongs to the feature motion that was just seen.
 
-For each candidate delay d = 0 … D the joint motion that ended d periods ago, over as many periods as the feature motion
-took, and the feature motion that a model predicts for it.
+For each candidate delay d = 0 … D−1 the joint motion that ended d periods ago, over as many periods as the feature
+motion took, and the feature motion that a model predicts for it.
 """
 
 from __future__ import annotations
 
-from typing import final
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch
+from servobench.plant.signals import BoolArray
 
 MAX_GAP = 16  # [periods] that a motion over lost frames may span; after a longer gap the past is forgotten
 
 
-@final
-class MotionHistory:
-    """Joint positions and sums of predicted feature steps of the last periods, rows [q, Σ x], the newest last."""
+class MotionHistory(NamedTuple):
+    """Joint positions and sums of predicted feature steps of the last periods; a state with a pure `append`.
 
-    def __init__(self, candidates: int, joints: int, features: int) -> None:
-        """Keep the past for as many candidate delays."""
-        self._candidates, self._n, self._m = candidates, joints, features
-        self._rows: FloatArray | None = None
+    Attributes:
+        rows: [q, Σ x], (..., D + `MAX_GAP` + 1, n + m), the newest last.
+        empty: (...), whether there is no past: before the next motion the arm counts as having been at rest.
+    """
 
-    def forget(self) -> None:
-        """Forget the past; before the next motion the arm counts as having been at rest."""
-        self._rows = None
+    rows: FloatArray
+    empty: BoolArray
 
-    def append(self, joint_position: FloatArray, joint_step: FloatArray, predicted: FloatArray, periods: int) -> None:
-        """Add one observed motion; over lost frames the joints count as having moved evenly.
+    @classmethod
+    def start(cls, lead: tuple[int, ...], candidates: int, joints: int, features: int) -> MotionHistory:
+        """Return an empty one for as many candidate delays, with leading axes of the shape `lead`."""
+        return cls(np.zeros((*lead, candidates + MAX_GAP + 1, joints + features)), np.full(lead, True))
+
+    def forget(self) -> MotionHistory:
+        """Return one without a past."""
+        return self._replace(empty=np.full(np.shape(self.empty), True))
+
+    def append(
+        self, joint_position: FloatArray, joint_step: FloatArray, predicted: FloatArray, periods: npt.NDArray[np.int_]
+    ) -> MotionHistory:
+        """Return one with one more observed motion; over lost frames the joints count as having moved evenly.
 
         Args:
-            joint_position: where it began, (n,), rad.
-            joint_step: Δq, (n,), rad.
-            predicted: the feature step that the model predicts, (m,), m.
-            periods: that it took, at most `MAX_GAP`.
+            joint_position: where it began, (..., n), rad.
+            joint_step: Δq, (..., n), rad.
+            predicted: the feature step that the model predicts, (..., m), m.
+            periods: that it took, (...), from 1 to `MAX_GAP`.
         """
-        if self._rows is None:
-            self._rows = np.zeros((self._candidates + MAX_GAP + 1, self._n + self._m))
-            self._rows[:, : self._n] = joint_position
-        begin = np.concatenate([joint_position, self._rows[-1, self._n :]])
-        step = np.concatenate([joint_step, predicted])
-        share = np.arange(1, periods + 1)[:, None] / periods if periods > 1 else 1.0
-        self._rows = np.concatenate([self._rows[periods:], np.atleast_2d(begin + step * share)])
+        rows = branch(self.empty, _at_rest, self.rows, joint_position)
+        begin = np.concatenate([joint_position, rows[..., -1, joint_position.shape[-1] :]], axis=-1)
+        step = np.concatenate([joint_step, predicted], axis=-1)
+        long = periods > 1
+        appended = branch(np.logical_not(long), _append_period, rows, begin, step)
+        return MotionHistory(branch(long, _append_gap, appended, begin, step, periods), np.full(np.shape(long), False))
 
-    def motions(self, periods: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return, for each candidate delay, the motion over `periods` that ended so many periods ago.
+    def motions(self, periods: npt.NDArray[np.int_], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return, for each candidate delay, the motion over `periods`, (...), that ended so many periods ago.
 
         Returns:
-            Joint positions where it began, (D, n), rad; joint steps, (D, n), rad; predicted feature steps, (D, m), m.
+            Joint positions where it began, (..., D, n), rad; joint steps, (..., D, n), rad; predicted feature steps,
+            (..., D, m), m.
         """
-        if self._rows is None:
-            raise ValueError("motions must be asked for after append")
-        last, count, n = self._candidates + MAX_GAP, self._candidates, self._n
-        begin = self._rows[last - periods : last - periods - count : -1]
-        passed = self._rows[last : last - count : -1] - begin
-        return begin[:, :n], passed[:, :n], passed[:, n:]
+        last = self.rows.shape[-2] - 1
+        count = last - MAX_GAP
+        begin = _rows_at(self.rows, last - np.arange(count) - np.asarray(periods)[..., None])
+        passed = self.rows[..., last : last - count : -1, :] - begin
+        return begin[..., :joints], passed[..., :joints], passed[..., joints:]
+
+
+def _rows_at(rows: FloatArray, index: npt.NDArray[np.int_]) -> FloatArray:
+    """Return the rows (..., k, n + m) that an index (..., k) names."""
+    return np.take_along_axis(rows, index[..., None], axis=-2)
+
+
+def _at_rest(rows: FloatArray, joint_position: FloatArray) -> FloatArray:
+    n = joint_position.shape[-1]
+    still = np.broadcast_to(joint_position[..., None, :], (*rows.shape[:-1], n))
+    return np.concatenate([still, np.zeros((*rows.shape[:-1], rows.shape[-1] - n))], axis=-1)
+
+
+def _append_period(rows: FloatArray, begin: FloatArray, step: FloatArray) -> FloatArray:
+    return np.concatenate([rows[..., 1:, :], (begin + step)[..., None, :]], axis=-2)
+
+
+def _append_gap(rows: FloatArray, begin: FloatArray, step: FloatArray, periods: npt.NDArray[np.int_]) -> FloatArray:
+    count, gap = rows.shape[-2], np.asarray(periods)[..., None]
+    index = np.arange(count) + gap
+    new = index - count + 1
+    between = begin[..., None, :] + step[..., None, :] * (new / gap)[..., None]
+    return np.where((new > 0)[..., None], between, _rows_at(rows, np.minimum(index, count - 1)))

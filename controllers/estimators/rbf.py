@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Collection
-from typing import Annotated, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import LatestFeatures, jacobian_output
+from servobench.controllers.networks.rbf import JacobianNetwork, LatestFeatures
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import norm
 from servobench.plant.settings import Count, NonNegative, Positive, settings
 
 
@@ -29,38 +29,66 @@ class RbfConfig:
     """[rad²] ε, joint motion (squared, summed over the window) below which learning fades."""
 
 
-def window_gradient(weights: FloatArray, moved: FloatArray, feature_steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return −½ ∂Q/∂W of the window's squared prediction error (eqs. 31, 32) and the errors themselves.
-
-    With μ_t = [Δq_{1,t} θ_1(q_t) … Δq_{n,t} θ_n(q_t)] and W = [W_1 … W_n] is Ĵ_t Δq_t = W μ_t, all columns at once.
-
-    Args:
-        weights: W, (m, n L), m/rad.
-        moved: μ_t, (T, n L), rad.
-        feature_steps: Δy_t, (T, m), m.
-
-    Returns:
-        G = Σ_t (Δy_t − W μ_t) μ_tᵀ, (m, n L), and Δy_t − W μ_t, (T, m).
-    """
-    error = feature_steps - moved @ weights.T
-    return error.T @ moved, error
-
-
-def window_step(squares: Collection[tuple[float, float]], k2: float, epsilon: float) -> float:
-    """Return α₂ = k₂ / (ε ‖θ‖² + Σ_t ‖μ_t‖²) (eq. 36 with ε); 0 where nothing has moved.
+def window_step(
+    sizes: FloatArray, joint_steps: FloatArray, count: npt.NDArray[np.int_], k2: float, epsilon: npt.ArrayLike
+) -> FloatArray:
+    """Return α₂ = k₂ / (ε ‖θ‖² + Σ_t Σ_i Δq²_{i,t} ‖θ_i(q_t)‖²) (eq. 36 with ε), (...); 0 where nothing has moved.
 
     Args:
-        squares: for each motion of the window the mean of ‖θ_i(q_t)‖² over the columns, and
-            ‖μ_t‖² = Σ_i Δq²_{i,t} ‖θ_i(q_t)‖², rad²; ‖θ‖² is the mean of the first over the window.
+        sizes: ‖θ_i(q_t)‖², (..., T, n); 0 for motions that are still missing. ‖θ‖² is their mean.
+        joint_steps: Δq_t, (..., T, n), rad.
+        count: motions in the window, (...).
         k2: k₂.
-        epsilon: ε, rad².
+        epsilon: ε, (...), rad².
     """
-    total = epsilon * sum(theta for theta, _ in squares) / len(squares) + sum(moved for _, moved in squares)
-    return k2 / total if total > 0.0 else 0.0
+    flat = (*sizes.shape[:-2], -1)
+    size = sizes.reshape(flat)
+    total = np.vecdot((joint_steps * joint_steps).reshape(flat), size)
+    total = total + epsilon * np.add.reduce(size, axis=-1) / (count * sizes.shape[-1])
+    return np.asarray(k2 / np.where(total > 0.0, total, np.inf))
+
+
+def started_rows(network: JacobianNetwork, jacobian: FloatArray) -> FloatArray:
+    """Return the offline weights by rows of the Jacobian for every lane, (..., m, n, L), m/rad.
+
+    Args:
+        network: the offline network.
+        jacobian: Ĵ₀, (..., m, n); only its shape is looked at. The network is itself the initial Jacobian, for all
+            joint positions; one matrix without its joint position holds less.
+
+    Raises:
+        ValueError: `jacobian` is of another size than the network.
+    """
+    *lead, m, n = jacobian.shape
+    if (m, n) != (network.m, network.n):
+        raise ValueError(f"jacobian must have shape {(network.m, network.n)}, got {(m, n)}")
+    return np.broadcast_to(network.rows, (*lead, *network.rows.shape))
+
+
+class RbfState(NamedTuple):
+    """The state of the update; the window holds the T − 1 motions before the next one, the newest last.
+
+    Attributes:
+        rows: W by rows of the Jacobian, (..., m, n, L), m/rad.
+        theta: θ of the window, (..., T−1, U, L); 0 where a motion is still missing, as in the next two.
+        joint_steps: Δq of the window, (..., T−1, n), rad.
+        feature_steps: Δy of the window, (..., T−1, m), m.
+        filled: how many motions there are, (...).
+        errors: Δy_t − Ĵ_t Δq_t of the last update, (..., T, m), m.
+        step: α₂ of the last update, (...).
+    """
+
+    rows: FloatArray
+    theta: FloatArray
+    joint_steps: FloatArray
+    feature_steps: FloatArray
+    filled: npt.NDArray[np.int_]
+    errors: FloatArray
+    step: FloatArray
 
 
 @final
-class RbfEstimator(Estimator):
+class RbfEstimator(Estimator[RbfState]):
     """Jacobian network with the paper's windowed gradient update.
 
         Ĵ_i(q) = W_i θ_i(q)                                                     (eqs. 29, 30)
@@ -76,75 +104,52 @@ class RbfEstimator(Estimator):
     """
 
     def __init__(self, config: RbfConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
-        """Start from the offline Jacobian network."""
+        """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
         self._network = networks.jacobian
         self._features = LatestFeatures(self._network)
-        self._count = 0
-        self._restore()
 
-    @property
-    def weights(self) -> FloatArray:
-        """W as it is now, (n, m, L), m/rad; a copy."""
-        return np.array(self._columns())
+    def start(self, jacobian: FloatArray) -> RbfState:
+        """Start from the offline network; see `started_rows`."""
+        rows, window = started_rows(self._network, jacobian), self._config.window
+        lead, (layers, units) = jacobian.shape[:-2], self._network.layers
+        return RbfState(
+            rows=rows,
+            theta=np.zeros((*lead, window - 1, layers, units)),
+            joint_steps=np.zeros((*lead, window - 1, self._network.n)),
+            feature_steps=np.zeros((*lead, window - 1, self._network.m)),
+            filled=np.zeros(lead, dtype=np.int_),
+            errors=np.zeros((*lead, window, self._network.m)),
+            step=np.zeros(lead),
+        )
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Forget everything and restore the offline network.
-
-        Args:
-            jacobian: Ĵ₀, (m, n); only its size is looked at. The network is itself the initial Jacobian, for all joint
-                positions; one matrix without its joint position holds less.
-
-        Raises:
-            ValueError: `jacobian` is of another size than the network.
-        """
-        if jacobian.shape != (self._network.m, self._network.n):
-            raise ValueError(f"jacobian must have shape {(self._network.m, self._network.n)}, got {jacobian.shape}")
-        self._restore()
-
-    def update(self, motion: Motion) -> None:
+    def update(self, state: RbfState, motion: Motion) -> RbfState:
         """Learn from the window that `motion` completes."""
-        theta = self._features.at(motion.joint_position)
-        row = self._count % self._config.window
-        moved = self._moved[row]
-        np.multiply(motion.joint_step[:, None], theta, out=moved.reshape(theta.shape))
-        self._feature_steps[row] = motion.feature_step
-        self._squares.append((float(np.vdot(theta, theta)) / len(theta), float(np.vdot(moved, moved))))
-        self._count += 1
-        filled = slice(min(self._count, self._config.window))
-        gradient, self._error = window_gradient(self._weights, self._moved[filled], self._feature_steps[filled])
-        self._step = window_step(self._squares, self._config.k2, self._epsilon)
-        gradient *= self._step
-        self._weights += gradient
+        return self.learn(state, motion, self._config.epsilon)
 
-    def scale_epsilon(self, factor: float) -> None:
-        """Use `factor` times the configured ε, for a feature whose variance is so many times the assumed one."""
-        self._epsilon = factor * self._config.epsilon
+    def learn(self, state: RbfState, motion: Motion, epsilon: npt.ArrayLike) -> RbfState:
+        """Do the same with another ε, (...), rad²."""
+        config, network = self._config, self._network
+        theta = np.concatenate([state.theta, self._features.at(motion.joint_position)[..., None, :, :]], axis=-3)
+        joint_steps = np.concatenate([state.joint_steps, motion.joint_step[..., None, :]], axis=-2)
+        feature_steps = np.concatenate([state.feature_steps, motion.feature_step[..., None, :]], axis=-2)
+        errors = feature_steps - np.matvec(network.output(state.rows, theta), joint_steps)
+        filled = np.minimum(state.filled + 1, config.window)
+        sizes = np.vecdot(theta, theta).take(network.layer_of, axis=-1)
+        step = window_step(sizes, joint_steps, filled, config.k2, epsilon)
+        rows = network.gradient(step[..., None, None] * errors, joint_steps, theta)
+        np.add(rows, state.rows, out=rows)
+        past = theta[..., 1:, :, :], joint_steps[..., 1:, :], feature_steps[..., 1:, :]
+        return RbfState(rows, *past, filled, errors, step)
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return Ĵ at `joint_position` (n,), rad."""
-        return jacobian_output(self._columns(), self._features.at(joint_position))
+    def jacobian(self, state: RbfState, joint_position: FloatArray) -> FloatArray:
+        """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
+        return self._features.jacobian(state.rows, joint_position)
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: RbfState) -> Diagnostics:
         """Return the step size α₂, the root of Q, the window's prediction error (m), and the norm of all weights."""
         return {
-            "estimator_step_size": self._step,
-            "window_error": float(np.linalg.norm(self._error)),
-            "estimator_weight_norm": float(np.linalg.norm(self._weights)),
+            "estimator_step_size": state.step,
+            "window_error": norm(state.errors.reshape(*state.step.shape, -1)),
+            "estimator_weight_norm": norm(state.rows.reshape(*state.step.shape, -1)),
         }
-
-    def _columns(self) -> FloatArray:
-        """Return W_i as a view, (n, m, L), of the weights, (m, n L)."""
-        network = self._network
-        return self._weights.reshape(network.m, network.n, -1).swapaxes(0, 1)
-
-    def _restore(self) -> None:
-        network, window = self._network, self._config.window
-        self._weights = network.weights.swapaxes(0, 1).reshape(network.m, -1).copy()
-        self._moved: FloatArray = np.empty((window, self._weights.shape[1]))  # μ_t; the oldest row is overwritten
-        self._feature_steps: FloatArray = np.empty((window, network.m))
-        self._squares: deque[tuple[float, float]] = deque(maxlen=window)
-        self._count = 0
-        self._epsilon = self._config.epsilon
-        self._error = np.zeros((1, network.m))
-        self._step = 0.0

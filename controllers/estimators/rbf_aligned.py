@@ -8,10 +8,10 @@ a map learns from two motions and a network cannot learn. Not in the paper.
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Le, Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
@@ -19,10 +19,11 @@ from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.map_bank import map_update, near_rotation
 from servobench.controllers.estimators.pairing import MAX_GAP, MotionHistory
-from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfState
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch, norm
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
 
 MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
@@ -74,8 +75,38 @@ class RbfAlignedConfig:
     """[1] sum of innovations (CUSUM) beyond which it seems so."""
 
 
+class RbfAlignedState(NamedTuple):
+    """The state of network, map and delay.
+
+    Attributes:
+        network: of the network.
+        bank: each candidate's map M above its covariance P, (..., D, 2m, m).
+        scores: ℓ_d, (..., D).
+        noise: σ².
+        delay: d, (...) [periods].
+        map: M̄, (..., m, m).
+        rotation: R, (..., m, m).
+        history: of motions.
+        moves: how often the camera seems to have been moved, (...).
+        nis: of the last motion per feature, (...).
+        cusum: C, (...).
+    """
+
+    network: RbfState
+    bank: FloatArray
+    scores: FloatArray
+    noise: NoiseLevel
+    delay: npt.NDArray[np.int_]
+    map: FloatArray
+    rotation: FloatArray
+    history: MotionHistory
+    moves: npt.NDArray[np.int_]
+    nis: FloatArray
+    cusum: FloatArray
+
+
 @final
-class RbfAlignedEstimator(Estimator):
+class RbfAlignedEstimator(Estimator[RbfAlignedState]):
     """Jacobian network, map and delay.
 
         P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← map_update(x_d, Δy)   for each delay d   (`map_bank`)
@@ -92,130 +123,159 @@ class RbfAlignedEstimator(Estimator):
     """
 
     def __init__(self, config: RbfAlignedConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
-        """Start from the offline Jacobian network."""
+        """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config, network = config, networks.jacobian
         self._network = RbfEstimator(RbfConfig(config.window, config.k2, config.epsilon), knowledge, networks)
         self._period = knowledge.spec.period
-        self._eye = np.eye(network.m)
         self._n, self._m = network.n, network.m
+        self._eye = np.eye(network.m)
+        self._P0 = (config.initial_deviation**2 if config.align else 0.0) * self._eye
         self._candidates = 1 + (config.longest_delay if config.find_delay else 0)
-        self._forget()
 
-    def _forget(self) -> None:
-        eye, config = self._eye, self._config
-        self._P0 = (config.initial_deviation**2 if config.align else 0.0) * eye
-        self._bank: FloatArray = np.repeat(np.concatenate([eye, self._P0])[None], self._candidates, axis=0)  # M above P
-        self._scores = np.zeros(self._candidates)
-        self._noise = NoiseLevel(config.feature_noise)
-        self._delay = 0
-        self._map, self._rotation = eye, eye
-        self._history = MotionHistory(self._candidates, self._n, self._m)
-        self._moves = 0
-        self._key, self._latest = b"", np.zeros((self._m, self._n))
-        self._nis = self._cusum = 0.0
+    def start(self, jacobian: FloatArray) -> RbfAlignedState:
+        """Start from the offline network, as drawn by its camera; see `RbfEstimator.start`."""
+        lead, none = jacobian.shape[:-2], np.zeros(jacobian.shape[:-2], dtype=np.int_)
+        bank, eye = np.concatenate([self._eye, self._P0]), np.broadcast_to(self._eye, (*lead, self._m, self._m))
+        return RbfAlignedState(
+            network=self._network.start(jacobian),
+            bank=np.broadcast_to(bank, (*lead, self._candidates, *bank.shape)),
+            scores=np.zeros((*lead, self._candidates)),
+            noise=NoiseLevel.guess(self._config.feature_noise, lead),
+            delay=none,
+            map=eye,
+            rotation=eye,
+            history=MotionHistory.start(lead, self._candidates, self._n, self._m),
+            moves=none,
+            nis=np.zeros(lead),
+            cusum=np.zeros(lead),
+        )
 
-    @property
-    def map(self) -> FloatArray:
-        """M̄ as it is now, (m, m); a copy."""
-        return self._map.copy()
+    def covariance(self, state: RbfAlignedState) -> FloatArray:
+        """Return P of the present delay, (..., m, m)."""
+        return _of_delay(state.bank, state.delay)[..., self._m :, :]
 
-    @property
-    def covariance(self) -> FloatArray:
-        """P of the present delay, (m, m); a copy."""
-        return self._bank[self._delay, self._m :].copy()
+    def estimate(self, state: RbfAlignedState, joint_position: FloatArray) -> Estimate:
+        """Return Ĵ at `joint_position` (..., n), rad, with d and σ."""
+        return Estimate(self.jacobian(state, joint_position), state.delay, state.noise.deviation)
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Forget everything and restore the offline network; see `RbfEstimator.reset`."""
-        self._network.reset(jacobian)
-        self._forget()
+    def jacobian(self, state: RbfAlignedState, joint_position: FloatArray) -> FloatArray:
+        """Return M̄ Ĵ_net at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
+        return np.asarray(state.map @ self._network.jacobian(state.network, joint_position))
 
-    def estimate(self, joint_position: FloatArray) -> Estimate:
-        """Return Ĵ at `joint_position` (n,), rad, with d and σ."""
-        return Estimate(self.jacobian(joint_position), self._delay, math.sqrt(self._noise.variance))
-
-    def update(self, motion: Motion) -> None:
+    def update(self, state: RbfAlignedState, motion: Motion) -> RbfAlignedState:
         """Learn map, delay and network from one motion."""
-        config, periods = self._config, max(1, round(motion.duration / self._period))
-        if periods > MAX_GAP:
-            self._history.forget()
-            return
-        q, dq = motion.joint_position, motion.joint_step
-        self._history.append(q, dq, self._network_jacobian(q).dot(dq), periods)
-        begins, steps, x = self._history.motions(periods)
-        square = np.add.reduce(x * x, axis=1)
-        if config.detect_moves and self._jumped(square, motion.feature_step):
-            self._expect_any_map()
-            if config.find_noise:
-                self._noise.learn(float(motion.feature_step @ motion.feature_step) / self._m, 2.0, 0.0)
-            return
-        if config.align or config.find_delay:
-            self._learn_map(x, square, motion.feature_step)
-        if config.learn and self._deviation() < config.confidence:
-            begin, step = begins[self._delay], steps[self._delay]
-            seen = self._rotation.T @ motion.feature_step
-            self._key = b""
-            self._network.scale_epsilon(self._noise.variance / config.feature_noise**2)
-            self._network.update(Motion(begin, step, seen, motion.error, motion.duration))
+        periods = np.maximum(1, np.rint(motion.duration / self._period).astype(np.int_))
+        short = periods <= MAX_GAP
+        history = branch(np.logical_not(short), MotionHistory.forget, state.history)
+        return branch(short, self._learn, state._replace(history=history), motion, periods)
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return M̄ Ĵ_net at `joint_position` (n,), rad."""
-        return np.asarray(self._map.dot(self._network_jacobian(joint_position)))
-
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: RbfAlignedState) -> Diagnostics:
         """Return those of the network, and delay, rotation (rad), deviation and NIS of the map, moves, noise level."""
-        cosine = min(1.0, max(-1.0, 1.0 - 0.25 * float(np.sum((self._rotation - self._eye) ** 2))))
+        turned = (state.rotation - self._eye).reshape(*np.shape(state.delay), -1)
         return {
-            **self._network.diagnostics(),
-            "delay": float(self._delay),
-            "map_rotation": math.acos(cosine),
-            "map_deviation": self._deviation(),
-            "map_surprise": self._nis,
-            "camera_moves": float(self._moves),
-            "noise_level": math.sqrt(self._noise.variance),
+            **self._network.diagnostics(state.network),
+            "delay": state.delay,
+            "map_rotation": np.arccos(np.clip(1.0 - 0.25 * np.vecdot(turned, turned), -1.0, 1.0)),
+            "map_deviation": self._deviation(state),
+            "map_surprise": state.nis,
+            "camera_moves": state.moves,
+            "noise_level": state.noise.deviation,
         }
 
-    def _network_jacobian(self, q: FloatArray) -> FloatArray:
-        """Return Ĵ_net, (m, n), at q; cached because it is needed several times at one place between two updates."""
-        key = q.tobytes()
-        if key != self._key:
-            self._key, self._latest = key, self._network.jacobian(q)
-        return self._latest
+    def _deviation(self, state: RbfAlignedState) -> FloatArray:
+        return np.asarray(np.sqrt(self.covariance(state).trace(axis1=-2, axis2=-1) / self._m))
 
-    def _jumped(self, square: FloatArray, feature_step: FloatArray) -> bool:
-        reach = math.sqrt(max(square.tolist()))
-        seen = math.sqrt(float(feature_step @ feature_step))
-        return seen > MIN_JUMP_RATIO * reach + MIN_JUMP_DEVIATIONS * math.sqrt(self._noise.variance)
+    def _learn(self, state: RbfAlignedState, motion: Motion, periods: npt.NDArray[np.int_]) -> RbfAlignedState:
+        q, dq, dy = motion.joint_position, motion.joint_step, motion.feature_step
+        predicted = np.matvec(self._network.jacobian(state.network, q), dq)
+        history = state.history.append(q, dq, predicted, periods)
+        begins, steps, x = history.motions(periods, self._n)
+        state, lengths = state._replace(history=history), norm(x)
+        if not self._config.detect_moves:
+            return self._follow(state, motion, begins, steps, x, lengths)
+        reach = MIN_JUMP_RATIO * lengths.max(axis=-1) + MIN_JUMP_DEVIATIONS * state.noise.deviation
+        jumped = norm(dy) > reach
+        state = branch(jumped, self._jump, state, dy)
+        return branch(np.logical_not(jumped), self._follow, state, motion, begins, steps, x, lengths)
 
-    def _expect_any_map(self) -> None:
-        self._bank[:, self._m :] = self._P0
-        self._cusum, self._moves = 0.0, self._moves + 1
+    def _jump(self, state: RbfAlignedState, feature_step: FloatArray) -> RbfAlignedState:
+        noise = state.noise
+        if self._config.find_noise:
+            noise = noise.learn(np.vecdot(feature_step, feature_step) / self._m, 2.0, np.zeros_like(state.cusum))
+        bank = self._any_map(state.bank)
+        return state._replace(bank=bank, cusum=np.zeros_like(state.cusum), moves=state.moves + 1, noise=noise)
 
-    def _deviation(self) -> float:
-        return math.sqrt(float(self._bank[self._delay, self._m :].trace()) / self._m)
+    def _any_map(self, bank: FloatArray) -> FloatArray:
+        """Return the bank with P₀ for all P."""
+        unknown = np.broadcast_to(self._P0, (*bank.shape[:-2], self._m, self._m))
+        return np.concatenate([bank[..., : self._m, :], unknown], axis=-2)
 
-    def _learn_map(self, x: FloatArray, square: FloatArray, feature_step: FloatArray) -> None:
+    def _follow(
+        self,
+        state: RbfAlignedState,
+        motion: Motion,
+        begins: FloatArray,
+        steps: FloatArray,
+        x: FloatArray,
+        lengths: FloatArray,
+    ) -> RbfAlignedState:
+        config = self._config
+        if config.align or config.find_delay:
+            state = self._learn_map(state, x, lengths, motion.feature_step)
+        if not config.learn:
+            return state
+        known = self._deviation(state) < config.confidence
+        begin, step = _of_delay(begins, state.delay), _of_delay(steps, state.delay)
+        seen = np.vecmat(motion.feature_step, state.rotation)
+        own = Motion(begin, step, seen, motion.error, motion.duration)
+        epsilon = state.noise.variance / config.feature_noise**2 * config.epsilon
+        return state._replace(network=branch(known, self._network.learn, state.network, own, epsilon))
+
+    def _learn_map(
+        self, state: RbfAlignedState, x: FloatArray, lengths: FloatArray, feature_step: FloatArray
+    ) -> RbfAlignedState:
         """Update map, covariance and score of every delay, and choose among them."""
-        config, m = self._config, self._m
-        variance = 2.0 * self._noise.variance + config.model_error**2 * square
-        if config.align:
-            P = self._bank[:, m:]
-            P += (config.walk**2 * np.sqrt(square))[:, None, None] * self._eye
-            excess = P.trace(axis1=1, axis2=2) / (m * config.initial_deviation**2)
-            if max(excess.tolist()) > 1.0:
-                P /= np.maximum(excess, 1.0)[:, None, None]
-        bank, nis, s = map_update(self._bank, x, feature_step, variance)
-        self._nis, expected = float(nis[self._delay]) / m, float(s[self._delay])
+        config, m, noise = self._config, self._m, state.noise
+        variance = 2.0 * noise.variance[..., None] + config.model_error**2 * (lengths * lengths)
+        before = self._walked(state.bank, lengths) if config.align else state.bank
+        bank, nis, s = map_update(before, x, feature_step, variance)
+        surprise, expected = _of_delay(nis, state.delay) / m, _of_delay(s, state.delay)
         if config.find_noise:
-            self._noise.learn(self._nis * expected, 2.0, expected - 2.0 * self._noise.variance)
-        self._cusum = max(0.0, self._cusum + min(self._nis, CUSUM_CAP) - CUSUM_DRIFT)
-        if config.detect_moves and self._cusum > config.gate:
-            self._expect_any_map()
-            bank, _, _ = map_update(self._bank, x, feature_step, variance)
-        self._bank = bank
-        self._scores = config.forgetting * self._scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
-        best = int(self._scores.argmin())
-        if self._scores[best] < self._scores[self._delay] - config.margin:
-            self._delay = best
-        if config.align:
-            now = bank[self._delay]
-            self._map, self._rotation = near_rotation(now[:m], now[m:], config.rotation_deviation)
+            noise = noise.learn(surprise * expected, 2.0, expected - 2.0 * noise.variance)
+        cusum, moves = np.maximum(0.0, state.cusum + np.minimum(surprise, CUSUM_CAP) - CUSUM_DRIFT), state.moves
+        if config.detect_moves:
+            moved = cusum > config.gate
+            bank = branch(moved, self._learn_any_map, bank, before, x, feature_step, variance)
+            cusum, moves = np.where(moved, 0.0, cusum), moves + moved
+        scores = config.forgetting * state.scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
+        best = scores.argmin(axis=-1)
+        better = _of_delay(scores, best) < _of_delay(scores, state.delay) - config.margin
+        delay = np.where(better, best, state.delay)
+        state = state._replace(
+            bank=bank, scores=scores, noise=noise, delay=delay, moves=moves, nis=surprise, cusum=cusum
+        )
+        if not config.align:
+            return state
+        now = _of_delay(bank, delay)
+        nearest, rotation = near_rotation(now[..., :m, :], now[..., m:, :], config.rotation_deviation)
+        return state._replace(map=nearest, rotation=rotation)
+
+    def _walked(self, bank: FloatArray, lengths: FloatArray) -> FloatArray:
+        """Return the bank with P ← P + w² ‖x_d‖ I, no larger than P₀."""
+        config, m = self._config, self._m
+        P = bank[..., m:, :] + (config.walk**2 * lengths)[..., None, None] * self._eye
+        excess = P.trace(axis1=-2, axis2=-1) / (m * config.initial_deviation**2)
+        return np.concatenate([bank[..., :m, :], P / np.maximum(excess, 1.0)[..., None, None]], axis=-2)
+
+    def _learn_any_map(
+        self, bank: FloatArray, before: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
+    ) -> FloatArray:
+        return map_update(self._any_map(before), x, feature_step, variance)[0]
+
+
+def _of_delay(each: FloatArray, delay: npt.NDArray[np.int_]) -> FloatArray:
+    """Return the entry of a delay, (...), of what there is for each candidate, (..., D, *)."""
+    if np.ndim(delay) == 0:
+        return np.asarray(each[delay])
+    index = np.reshape(delay, delay.shape + (1,) * (each.ndim - delay.ndim))
+    return np.take_along_axis(each, index, axis=delay.ndim).squeeze(axis=delay.ndim)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.estimators.rbf import started_rows
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import LatestFeatures, jacobian_output
+from servobench.controllers.networks.rbf import LatestFeatures
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import norm
 from servobench.plant.settings import Positive, settings
 
 
@@ -24,8 +26,15 @@ class RbfLyapunovConfig:
     """[1/m] n₃, weight of the prediction error."""
 
 
+class RbfLyapunovState(NamedTuple):
+    """W by rows of the Jacobian, (..., m, n, L), m/rad; and s of the last motion, (..., m), m/s."""
+
+    rows: FloatArray
+    rate_error: FloatArray
+
+
 @final
-class RbfLyapunovEstimator(Estimator):
+class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
     """Jacobian network whose update makes V = ½ n₂ eᵀe + ½ Σ‖W̃_i‖² decrease under u = K_p Ĵ⁺ e.
 
         Ĵ_i(q) = W_i θ_i(q)                                            (eqs. 40, 41)
@@ -43,49 +52,30 @@ class RbfLyapunovEstimator(Estimator):
     """
 
     def __init__(self, config: RbfLyapunovConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
-        """Start from the offline Jacobian network."""
+        """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
         self._network = networks.jacobian
         self._features = LatestFeatures(self._network)
-        self._weights: FloatArray = self._network.weights
-        self._restore()
 
-    @property
-    def weights(self) -> FloatArray:
-        """W as it is now, (n, m, L), m/rad; a copy."""
-        return np.array(self._weights)
+    def start(self, jacobian: FloatArray) -> RbfLyapunovState:
+        """Start from the offline network; see `started_rows`."""
+        return RbfLyapunovState(started_rows(self._network, jacobian), np.zeros(jacobian.shape[:-1]))
 
-    def reset(self, jacobian: FloatArray) -> None:
-        """Forget everything and restore the offline network.
-
-        Args:
-            jacobian: Ĵ₀, (m, n); only its size is looked at, see `RbfEstimator.reset`.
-
-        Raises:
-            ValueError: `jacobian` is of another size than the network.
-        """
-        if jacobian.shape != (self._network.m, self._network.n):
-            raise ValueError(f"jacobian must have shape {(self._network.m, self._network.n)}, got {jacobian.shape}")
-        self._restore()
-
-    def update(self, motion: Motion) -> None:
+    def update(self, state: RbfLyapunovState, motion: Motion) -> RbfLyapunovState:
         """Learn from one motion."""
-        theta, dq = self._features.at(motion.joint_position), motion.joint_step
-        s = self._rate_error = (motion.feature_step - jacobian_output(self._weights, theta) @ dq) / motion.duration
+        q, dq, theta = motion.joint_position, motion.joint_step[..., None, :], self._features.at(motion.joint_position)
+        unexplained = motion.feature_step - np.matvec(self._features.jacobian(state.rows, q), motion.joint_step)
+        s = unexplained / np.asarray(motion.duration)[..., None]
         pull = self._config.n3 * s - self._config.n2 * motion.error
-        self._weights = self._weights + pull[:, None] * (dq[:, None] * theta)[:, None, :]
+        rows = self._network.gradient(pull[..., None, :], dq, theta[..., None, :, :])
+        np.add(rows, state.rows, out=rows)
+        return RbfLyapunovState(rows, s)
 
-    def jacobian(self, joint_position: FloatArray) -> FloatArray:
-        """Return Ĵ at `joint_position` (n,), rad."""
-        return jacobian_output(self._weights, self._features.at(joint_position))
+    def jacobian(self, state: RbfLyapunovState, joint_position: FloatArray) -> FloatArray:
+        """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
+        return self._features.jacobian(state.rows, joint_position)
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: RbfLyapunovState) -> Diagnostics:
         """Return ‖s‖, the prediction error of the feature's velocity (m/s), and the norm of all weights."""
-        return {
-            "rate_error": float(np.linalg.norm(self._rate_error)),
-            "estimator_weight_norm": float(np.linalg.norm(self._weights)),
-        }
-
-    def _restore(self) -> None:
-        self._weights = self._network.weights.copy()
-        self._rate_error = np.zeros(self._network.m)
+        flat = state.rows.reshape(*state.rows.shape[:-3], -1)
+        return {"rate_error": norm(state.rate_error), "estimator_weight_norm": norm(flat)}

@@ -19,8 +19,10 @@ from functools import cached_property
 from typing import Literal, final, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import transposed
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
@@ -42,12 +44,6 @@ def jacobian_features(q: FloatArray, centres: FloatArray, widths: FloatArray) ->
     offset = q[..., None, None, :] - centres
     exponent = np.einsum("...k,...k->...", offset, offset) / widths**2
     return np.asarray(np.exp(-np.minimum(exponent, MAX_EXPONENT)))
-
-
-def jacobian_output(weights: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return Ĵ, (..., m, n), m/rad, from weights W (n, m, L) and features θ (..., n, L) (eqs. 30, 41)."""
-    columns = np.matmul(weights, theta[..., None])[..., 0]
-    return np.asarray(np.swapaxes(columns, -1, -2))
 
 
 def hidden_features(xi: FloatArray, centres: FloatArray, widths: FloatArray, kernel: Kernel) -> FloatArray:
@@ -72,16 +68,16 @@ def controller_output(weights: FloatArray, xi: FloatArray, h: FloatArray) -> Flo
     """Return q_cmd = ψ ξ with ψ_j = W_j h (eqs. 12, 17).
 
     Args:
-        weights: W, (n, p, N_h), rad per unit of ξ.
+        weights: W, (..., n, p, N_h), rad per unit of ξ.
         xi: ξ, (..., p).
         h: (..., N_h).
 
     Returns:
         (..., n), rad.
     """
-    n, p, hidden = weights.shape
-    psi = (h @ weights.reshape(n * p, hidden).T).reshape(*h.shape[:-1], n, p)
-    return np.asarray(np.matmul(psi, xi[..., None])[..., 0])
+    *lead, n, p, hidden = weights.shape
+    psi = np.matvec(weights.reshape(*lead, n * p, hidden), h)
+    return np.asarray(np.matvec(psi.reshape(*psi.shape[:-1], n, p), xi))
 
 
 def information_vector(errors: FloatArray, positions: FloatArray) -> FloatArray:
@@ -132,42 +128,112 @@ class JacobianNetwork:
         """Number of features."""
         return int(self.weights.shape[1])
 
+    @property
+    def layers(self) -> tuple[int, int]:
+        """How many different hidden layers there are, U, and how many units each has, L."""
+        return self._members.shape[0], self.weights.shape[-1]
+
+    @cached_property
+    def layer_of(self) -> npt.NDArray[np.int_]:
+        """Which of the U different hidden layers a column has, (n,): columns of equal centres and widths share one."""
+        layers: dict[bytes, int] = {}
+        columns = zip(self.centres, self.widths, strict=True)
+        return np.array([layers.setdefault(c.tobytes() + width.tobytes(), len(layers)) for c, width in columns])
+
+    @cached_property
+    def rows(self) -> FloatArray:
+        """W by rows of the Jacobian, (m, n, L), m/rad: the layout of weights that learn online; read-only."""
+        rows = np.ascontiguousarray(self.weights.swapaxes(0, 1))
+        rows.flags.writeable = False
+        return rows
+
     def features(self, q: FloatArray) -> FloatArray:
-        """Return θ, (..., n, L), at joint positions (..., n), rad: the numbers of `jacobian_features`, sooner."""
+        """Return the different ones of the layers of `jacobian_features`, (..., U, L), at q, (..., n), rad."""
         centres, ones, decay = self._prepared
-        offset = q[..., None, None, :] - centres
+        offset = q[..., None, :, None] - centres
         offset *= offset
-        theta: FloatArray = offset.dot(ones) * decay
+        theta: FloatArray = np.vecmat(ones, offset) * decay
         np.maximum(theta, MIN_EXPONENT, out=theta)
         return np.exp(theta, out=theta)
 
-    def jacobian(self, q: FloatArray) -> FloatArray:
-        """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad."""
-        return jacobian_output(self.weights, self.features(q))
+    def output(self, rows: FloatArray, theta: FloatArray) -> FloatArray:
+        """Return Ĵ_i = W_i θ_i (eqs. 30, 41) at T joint positions, (..., T, m, n), m/rad.
+
+        Args:
+            rows: W by rows of the Jacobian, (..., m, n, L), m/rad.
+            theta: from `features`, (..., T, U, L).
+        """
+        lead, (count, layers, units) = theta.shape[:-3], theta.shape[-3:]
+        every = theta.reshape(*lead, count * layers, units) @ transposed(rows.reshape(*rows.shape[:-3], -1, units))
+        return every.reshape(*lead, count, -1).take(self._places, axis=-1)  # each layer was multiplied by each column
+
+    def gradient(self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray) -> FloatArray:
+        """Return Σ_t e_t Δq_{i,t} θ_i(q_t)ᵀ (eq. 32) by rows of the Jacobian, (..., m, n, L): −½ ∂/∂W Σ_t ‖e_t‖².
+
+        Args:
+            errors: e_t = Δy_t − Ĵ(q_t) Δq_t, (..., T, m), m.
+            joint_steps: Δq_t, (..., T, n), rad.
+            theta: θ(q_t) from `features`, (..., T, U, L).
+        """
+        *lead, count, layers, units = theta.shape
+        of_layers = joint_steps[..., None, :] * self._members
+        factors = errors[..., None, :, None] * of_layers[..., None, :]
+        flat = theta.reshape(*lead, count * layers, units)
+        gradient = transposed(factors.reshape(*lead, count * layers, -1)) @ flat
+        return np.asarray(gradient.reshape(*lead, self.m, self.n, units))
+
+    def jacobian(self, q: FloatArray, rows: FloatArray | None = None) -> FloatArray:
+        """Return Ĵ, (..., m, n), m/rad, at joint positions (..., n), rad, with the trained weights or with others."""
+        return self.output(self.rows if rows is None else rows, self.features(q)[..., None, :, :])[..., 0, :, :]
 
     @cached_property
     def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Centres, (1, L, n) where all columns share them as after training, ones (n,), and −1/δ², (n, L)."""
-        shared = bool((self.centres == self.centres[0]).all())
-        return self.centres[: 1 if shared else None], np.ones(self.n), -1.0 / self.widths**2
+        """Centres of the layers, (U, n, L), or (1, n, L) where all share them; ones, (n,); and −1/δ², (U, L)."""
+        _, first = np.unique(self.layer_of, return_index=True)
+        centres = self.centres[first].swapaxes(-1, -2)
+        shared = bool((centres == centres[0]).all())
+        return np.ascontiguousarray(centres[: 1 if shared else None]), np.ones(self.n), -1.0 / self.widths[first] ** 2
+
+    @cached_property
+    def _members(self) -> FloatArray:
+        """1 where a column has a layer, else 0, (U, n)."""
+        return np.asarray(self.layer_of == np.unique(self.layer_of)[:, None], dtype=np.float64)
+
+    @cached_property
+    def _places(self) -> npt.NDArray[np.int_]:
+        """Where the entries of Ĵ are among the products of all U layers with all columns, (m, n)."""
+        return self.layer_of * self.m * self.n + np.arange(self.m * self.n).reshape(self.m, self.n)
 
 
 @final
 class LatestFeatures:
-    """θ at the joint position that was asked for last: an estimator is asked several times for the same one."""
+    """θ and Ĵ at the joint positions that were asked for last.
+
+    An estimator asks for the same ones in `estimate` and in the next `update`. This saves time only: it is a memo of
+    pure functions, and rows of weights never change.
+    """
 
     def __init__(self, network: JacobianNetwork) -> None:
         """Take the network; nothing is known yet."""
         self._network = network
-        self._key = b""
-        self._theta: FloatArray | None = None
+        self._position, self._shape = b"", (-1,)
+        self._theta, self._rows, self._jacobian = (np.empty(0),) * 3
 
     def at(self, q: FloatArray) -> FloatArray:
-        """Return θ, (n, L), at q, (n,), rad."""
-        key = q.tobytes()
-        if self._theta is None or key != self._key:
-            self._key, self._theta = key, self._network.features(q)
+        """Return θ, (..., U, L), at q, (..., n), rad."""
+        position = q.tobytes()
+        if position != self._position or q.shape != self._shape:
+            self._theta = self._network.features(q)
+            self._position, self._shape, self._rows = position, q.shape, np.empty(0)
         return self._theta
+
+    def jacobian(self, rows: FloatArray, q: FloatArray) -> FloatArray:
+        """Return Ĵ, (..., m, n), m/rad, at q, (..., n), rad, with weights by rows, (..., m, n, L)."""
+        theta = self.at(q)
+        if rows is not self._rows:
+            self._jacobian = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :]
+            self._rows = rows
+        return self._jacobian
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,10 +283,10 @@ class ControllerNetwork:
 
     def features(self, xi: FloatArray) -> FloatArray:
         """Return h, (..., N_h), at ξ (..., p): the numbers of `hidden_features`, sooner."""
-        ones, decay = self._prepared
-        offset = xi[..., None, :] - self.centres
+        centres, ones, decay = self._prepared
+        offset = xi[..., :, None] - centres
         offset *= offset
-        h: FloatArray = offset.dot(ones)
+        h: FloatArray = np.vecmat(ones, offset)
         if self.kernel == "exponential":
             np.sqrt(h, out=h)
         h *= decay
@@ -232,9 +298,9 @@ class ControllerNetwork:
         return controller_output(self.weights, xi, self.features(xi))
 
     @cached_property
-    def _prepared(self) -> tuple[FloatArray, FloatArray]:
-        """Ones, (p,), and −1/γ², (N_h,)."""
-        return np.ones(self.centres.shape[1]), -1.0 / self.widths**2
+    def _prepared(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Centres, (p, N_h), ones, (p,), and −1/γ², (N_h,)."""
+        return np.ascontiguousarray(self.centres.T), np.ones(self.centres.shape[1]), -1.0 / self.widths**2
 
 
 def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, ...]) -> None:

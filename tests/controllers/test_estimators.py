@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kit.toy import motion, plant_spec
+from kit.toy import Learning, motion, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator, projection_update
 from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
@@ -13,6 +13,7 @@ from servobench.controllers.estimators.fixed import ConstantEstimator, TrueConfi
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     KalmanEstimator,
+    covariance_of,
     kalman_update,
     measurement_matrix,
     split_update,
@@ -44,20 +45,20 @@ def random_motions(n, m, count, seed=3):
 def test_a_constant_jacobian_is_found_when_all_joints_move(estimator):
     rng = np.random.default_rng(0)
     J = rng.normal(size=(3, 6))
-    estimator.reset(np.zeros((3, 6)))
+    run = Learning(estimator, np.zeros((3, 6)))
     for _ in range(400):
         dq = rng.normal(scale=0.05, size=6)
-        estimator.update(motion(dq, J @ dq))
-    np.testing.assert_allclose(estimator.jacobian(dq), J, atol=0.01 if hasattr(estimator, "covariance") else 1e-3)
+        run.update(motion(dq, J @ dq))
+    np.testing.assert_allclose(run.jacobian(), J, atol=0.01 if isinstance(estimator, KalmanEstimator) else 1e-3)
 
 
 @pytest.mark.parametrize("estimator", LEARNING)
 def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
-    estimator.reset(np.ones((3, 6)))
-    before = estimator.diagnostics()
-    estimator.update(motion(np.full(6, 1e-4), np.full(3, 0.002)))
-    np.testing.assert_array_equal(estimator.jacobian(np.zeros(6)), np.ones((3, 6)))
-    assert estimator.diagnostics() == before
+    run = Learning(estimator, np.ones((3, 6)))
+    before = run.diagnostics()
+    run.update(motion(np.full(6, 1e-4), np.full(3, 0.002)))
+    np.testing.assert_array_equal(run.jacobian(), np.ones((3, 6)))
+    assert run.diagnostics() == before
     assert before["estimator_updated"] == 0.0
 
 
@@ -74,11 +75,11 @@ def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
     ],
 )
 def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq, expected):
-    estimator.reset(np.array(jacobian))
-    estimator.update(motion(dq, [0.4]))
-    np.testing.assert_allclose(estimator.jacobian(np.zeros(2)), expected, atol=1e-15)
-    if hasattr(estimator, "covariance"):  # P → 1/8 and 1/4
-        np.testing.assert_allclose(estimator.covariance(), np.diag([0.125, 0.25]), atol=1e-15)
+    run = Learning(estimator, np.array(jacobian))
+    run.update(motion(dq, [0.4]))
+    np.testing.assert_allclose(run.jacobian(), expected, atol=1e-15)
+    if isinstance(estimator, KalmanEstimator):  # P → 1/8 and 1/4
+        np.testing.assert_allclose(covariance_of(run.state), np.diag([0.125, 0.25]), atol=1e-15)
 
 
 def test_the_first_step_of_least_squares_equals_the_one_computed_by_hand():
@@ -113,15 +114,14 @@ def test_the_split_forms_equal_the_full_ones(n, m):
         ukf_estimator(UkfConfig(form="sigma_points")),
         ukf_estimator(UkfConfig(form="split")),
     ]
-    for estimator in estimators:
-        estimator.reset(np.full((m, n), 0.1))
+    runs = [Learning(estimator, np.full((m, n), 0.1)) for estimator in estimators]
     for dq, dy in random_motions(n, m, 300):
-        for estimator in estimators:
-            estimator.update(motion(dq, dy))
-    for estimator in estimators[1:]:
-        np.testing.assert_allclose(estimator.jacobian(dq), estimators[0].jacobian(dq), atol=1e-10)
-        np.testing.assert_allclose(estimator.covariance(), estimators[0].covariance(), atol=1e-12)
-        assert estimator.diagnostics() == pytest.approx(estimators[0].diagnostics())
+        for run in runs:
+            run.update(motion(dq, dy))
+    for run in runs[1:]:
+        np.testing.assert_allclose(run.jacobian(), runs[0].jacobian(), atol=1e-10)
+        np.testing.assert_allclose(covariance_of(run.state), covariance_of(runs[0].state), atol=1e-12)
+        assert run.diagnostics() == pytest.approx(runs[0].diagnostics())
 
 
 def test_joseph_form_keeps_the_covariance_positive_definite_under_nearly_exact_measurements():
@@ -161,11 +161,9 @@ def test_the_compact_form_without_regularisation_is_broydens_update(seed, n, m):
     J, dq, dy = rng.normal(size=(m, n)), rng.normal(scale=0.1, size=n), rng.normal(scale=0.1, size=m)
     broyden = BroydenEstimator(BroydenConfig(step_factor=1.0, min_joint_step=1e-9))
     compact = CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-300, min_joint_step=0.0, reset=False))
-    for estimator in (broyden, compact):
-        estimator.reset(J)
-        estimator.update(motion(dq, dy))
-    np.testing.assert_allclose(compact.jacobian(dq), broyden.jacobian(dq), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(broyden.jacobian(dq) @ dq, dy, atol=1e-11)
+    found, expected = (each.update(each.start(J), motion(dq, dy)).J for each in (compact, broyden))
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(expected @ dq, dy, atol=1e-11)
 
 
 def test_broydens_update_is_the_smallest_change_that_explains_the_motion():
@@ -193,34 +191,33 @@ def test_recursive_least_squares_equals_weighted_batch_least_squares(forgetting)
 
 
 def test_forgetting_does_not_wind_up_while_one_joint_rests():
-    estimator, config = RlsEstimator(RlsConfig()), RlsConfig()
-    estimator.reset(np.zeros((1, 3)))
+    run, config = Learning(RlsEstimator(RlsConfig()), np.zeros((1, 3))), RlsConfig()
     rng = np.random.default_rng(1)
     for _ in range(2000):
         dq = np.array([*rng.normal(scale=0.05, size=2), 0.0])
-        estimator.update(motion(dq, [0.3 * dq[0]]))
-        assert estimator.diagnostics()["covariance_mean"] <= config.covariance_limit * (1 + 1e-12)
-    np.testing.assert_allclose(estimator.jacobian(dq), [[0.3, 0.0, 0.0]], atol=1e-3)
+        run.update(motion(dq, [0.3 * dq[0]]))
+        assert run.diagnostics()["covariance_mean"] <= config.covariance_limit * (1 + 1e-12)
+    np.testing.assert_allclose(run.jacobian(), [[0.3, 0.0, 0.0]], atol=1e-3)
 
 
 def test_the_compact_form_returns_to_its_start_when_its_sign_is_lost():
     for reset, expected in ((True, 0.5), (False, -0.5)):
         estimator = CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset=reset))
-        estimator.reset(np.array([[0.5]]))
-        estimator.update(motion([0.1], [-0.05]))
-        np.testing.assert_allclose(estimator.jacobian(np.zeros(1)), [[expected]], atol=1e-9)
-        assert estimator.diagnostics()["jacobian_resets"] == float(reset)
+        run = Learning(estimator, np.array([[0.5]]))
+        run.update(motion([0.1], [-0.05]))
+        np.testing.assert_allclose(run.jacobian(), [[expected]], atol=1e-9)
+        assert run.diagnostics()["jacobian_resets"] == float(reset)
 
 
 def test_the_constant_estimator_keeps_the_first_jacobian():
-    estimator, J = ConstantEstimator(), np.arange(6.0).reshape(2, 3)
-    estimator.reset(J)
-    estimator.update(motion(np.ones(3), np.ones(2)))
-    np.testing.assert_array_equal(estimator.jacobian(np.ones(3)), J)
+    J = np.arange(6.0).reshape(2, 3)
+    run = Learning(ConstantEstimator(), J)
+    run.update(motion(np.ones(3), np.ones(2)))
+    np.testing.assert_array_equal(run.jacobian(np.ones(3)), J)
 
 
 def test_the_true_estimator_answers_with_the_truth_where_the_arm_is():
     knowledge = RobotKnowledge(plant_spec(2, 1), 0, true_jacobian=lambda q: q[None, :] ** 2)
     estimator = TrueEstimator(TrueConfig(), knowledge)
-    estimator.reset(np.zeros((1, 2)))
-    np.testing.assert_array_equal(estimator.jacobian(np.array([2.0, 3.0])), [[4.0, 9.0]])
+    run = Learning(estimator, np.zeros((1, 2)))
+    np.testing.assert_array_equal(run.jacobian(np.array([2.0, 3.0])), [[4.0, 9.0]])

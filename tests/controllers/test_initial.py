@@ -31,13 +31,15 @@ def probe(plant, seed=0, **settings):
     """Run a provider on a plant until it is done."""
     provider = initial_jacobian(InitialConfig(source="probe", **settings), RobotKnowledge(plant.spec, 0))
     observation = plant.reset(seed)
-    provider.reset(observation)
-    periods = 0
-    while (u := provider.step(observation)) is not None:
+    state, periods = provider.start(observation), 0
+    while True:
+        state, u, done = provider.step(state, observation)
+        if done:
+            assert not u.any()
+            return provider.jacobian(state), periods
         assert (np.abs(u) <= plant.spec.joint_velocity_limit).all()
         observation = plant.step(Command(u))
         periods += 1
-    return provider.jacobian(), periods
 
 
 def test_probing_finds_the_true_jacobian_through_lag_delay_and_latency():
@@ -67,18 +69,19 @@ def test_lost_frames_prolong_probing_and_do_no_harm():
 
 def test_a_probing_move_turns_away_from_a_joint_limit():
     provider = initial_jacobian(InitialConfig("probe", average_periods=1), RobotKnowledge(spec(), 0))
-    provider.reset(at := Observation(0.0, np.array([0.99, 0.0]), np.zeros(1)))
-    np.testing.assert_allclose(provider.step(at), [-0.3, 0.0])
+    at = Observation(0.0, np.array([0.99, 0.0]), np.zeros(1))
+    _, u, _ = provider.step(provider.start(at), at)
+    np.testing.assert_allclose(u, [-0.3, 0.0])
 
 
 def test_a_joint_that_does_not_move_is_a_named_fault():
     provider = initial_jacobian(InitialConfig("probe"), RobotKnowledge(spec(), 0))
-    observation = Observation(0.0, np.zeros(2), np.zeros(1))
-    provider.reset(observation)
-    while provider.step(observation) is not None:
-        pass
+    observation, done = Observation(0.0, np.zeros(2), np.zeros(1)), False
+    state = provider.start(observation)
+    while not done:
+        state, _, done = provider.step(state, observation)
     with pytest.raises(ControllerDiverged, match="moved the joints too little"):
-        provider.jacobian()
+        provider.jacobian(state)
 
 
 def test_a_controller_says_that_it_probes_and_servoes_afterwards():
@@ -100,22 +103,22 @@ def test_a_controller_says_that_it_probes_and_servoes_afterwards():
 def test_the_nominal_model_is_evaluated_at_the_start():
     knowledge = RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: 2.0 * q[None, :])
     provider = initial_jacobian(InitialConfig(), knowledge)
-    provider.reset(at := Observation(0.0, np.array([0.1, 0.3]), np.zeros(1)))
-    assert provider.step(at) is None
-    np.testing.assert_array_equal(provider.jacobian(), [[0.2, 0.6]])
+    assert provider.immediate
+    state = provider.start(Observation(0.0, np.array([0.1, 0.3]), np.zeros(1)))
+    np.testing.assert_array_equal(provider.jacobian(state), [[0.2, 0.6]])
 
 
 def test_a_nominal_model_of_another_robot_is_refused():
     provider = initial_jacobian(InitialConfig(), RobotKnowledge(spec(), 0, nominal_jacobian=lambda q: np.zeros((3, 6))))
     with pytest.raises(ValueError, match=r"nominal_jacobian must return shape \(1, 2\), got \(3, 6\)"):
-        provider.reset(Observation(0.0, np.zeros(2), np.zeros(1)))
+        provider.start(Observation(0.0, np.zeros(2), np.zeros(1)))
 
 
 def test_a_given_jacobian_is_taken_as_it_is():
     provider = initial_jacobian(InitialConfig("given", given=((1.0, 2.0),)), RobotKnowledge(spec(), 0))
-    provider.reset(at := Observation(0.0, np.zeros(2), np.zeros(1)))
-    assert provider.step(at) is None
-    np.testing.assert_array_equal(provider.jacobian(), [[1.0, 2.0]])
+    assert provider.immediate
+    state = provider.start(Observation(0.0, np.zeros(2), np.zeros(1)))
+    np.testing.assert_array_equal(provider.jacobian(state), [[1.0, 2.0]])
 
 
 def test_the_nominal_source_without_a_model_tells_the_remedy():

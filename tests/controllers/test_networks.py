@@ -47,8 +47,23 @@ def test_the_quick_features_of_the_jacobian_network_are_those_of_the_plain_formu
         network = JacobianNetwork(centres, network.widths, network.weights)
     for q in (np.random.default_rng(4).normal(scale=3.0, size=(*shape, 3)), np.full((*shape, 3), 1e3)):
         plain = jacobian_features(q, network.centres, network.widths)
-        np.testing.assert_allclose(network.features(q), plain, rtol=1e-12)
+        assert network.layers == (3, 20)
+        np.testing.assert_allclose(network.features(q)[..., network.layer_of, :], plain, rtol=1e-12)
     np.testing.assert_array_equal(network.features(network.centres[1, 2])[1, 2], 1.0)
+
+
+def test_columns_of_equal_centres_and_widths_share_a_layer():
+    base = jacobian_network(n=3, units=5)
+    columns = [0, 1, 0]
+    network = JacobianNetwork(base.centres[columns], base.widths[columns], base.weights)
+    q = np.random.default_rng(2).normal(size=(4, 3))
+    theta = jacobian_features(q, network.centres, network.widths)
+    assert network.layers == (2, 5)
+    np.testing.assert_allclose(network.features(q), theta[:, :2], rtol=1e-12)
+    np.testing.assert_allclose(network.jacobian(q), np.einsum("nml,snl->smn", network.weights, theta), atol=1e-13)
+    errors, steps = np.random.default_rng(3).normal(size=(2, 4, 3))
+    gradient = np.einsum("sm,sn,snl->mnl", errors[:, :2], steps, theta)
+    np.testing.assert_allclose(network.gradient(errors[:, :2], steps, network.features(q)), gradient, atol=1e-12)
 
 
 @pytest.mark.parametrize("kernel", ["exponential", "gaussian"])
@@ -70,6 +85,9 @@ def test_the_latest_features_are_those_of_the_position_asked_for():
     latest.at(q)
     q[0] += 1.0
     np.testing.assert_array_equal(latest.at(q), network.features(q))
+    for rows in (network.rows, 2.0 * network.rows):
+        for q in (first, first, second, np.stack([first, second])):
+            np.testing.assert_array_equal(latest.jacobian(rows, q), network.jacobian(q, rows))
 
 
 def test_many_joint_positions_at_once_give_what_each_gives_alone():

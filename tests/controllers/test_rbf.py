@@ -4,41 +4,30 @@ import casadi
 import numpy as np
 import pytest
 
-from kit.toy import KNOWLEDGE, motion, only_jacobian
+from kit.toy import KNOWLEDGE, Learning, motion, only_jacobian
 from kit.toy import jacobian_network as network
-from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, window_gradient, window_step
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, window_step
 from servobench.controllers.networks.rbf import JacobianNetwork, jacobian_features
 
 
 def started(config, net):
-    return RbfEstimator(config, KNOWLEDGE, only_jacobian(net))
-
-
-def as_matrix(weights):
-    """Return [W_1 … W_n], (m, n L), of weights (n, m, L)."""
-    return np.concatenate(weights, axis=1)
-
-
-def moved_by(theta, dq):
-    """Return μ_t, (T, n L)."""
-    return np.array([np.concatenate([dq[t, i] * theta[t, i] for i in range(len(dq[t]))]) for t in range(len(dq))])
-
-
-def squares(theta, dq):
-    """Return the mean of ‖θ_i(q_t)‖² over the columns and ‖μ_t‖² of each motion."""
-    sizes = (theta**2).sum(axis=2)
-    return list(zip(sizes.mean(axis=1), (dq**2 * sizes).sum(axis=1), strict=True))
+    return Learning(RbfEstimator(config, KNOWLEDGE, only_jacobian(net)), np.zeros((net.m, net.n)))
 
 
 def window(net, count, seed=1):
     rng = np.random.default_rng(seed)
     q, dq, dy = rng.normal(size=(count, net.n)), rng.normal(size=(count, net.n)), rng.normal(size=(count, net.m))
-    return jacobian_features(q, net.centres, net.widths), dq, dy
+    return jacobian_features(q, net.centres, net.widths), net.features(q), dq, dy
+
+
+def step_of(theta, dq, k2, epsilon):
+    """Return α₂ of a full window."""
+    return window_step((theta**2).sum(axis=2), dq, len(dq), k2, epsilon)
 
 
 def test_the_gradient_is_that_of_automatic_differentiation():
     net = network()
-    theta, dq, dy = window(net, 5)
+    theta, layers, dq, dy = window(net, 5)
     n, m, units = net.weights.shape
     W = casadi.SX.sym("W", n * m * units)
     Q = 0
@@ -49,13 +38,14 @@ def test_the_gradient_is_that_of_automatic_differentiation():
         )
         Q += casadi.sumsqr(casadi.DM(dy[t]) - predicted)
     expected = casadi.Function("g", [W], [casadi.gradient(Q, W)])(net.weights.ravel())
-    gradient, _ = window_gradient(as_matrix(net.weights), moved_by(theta, dq), dy)
-    np.testing.assert_allclose(-2.0 * gradient, as_matrix(np.asarray(expected).reshape(n, m, units)), atol=1e-12)
+    errors = dy - np.matvec(net.output(net.rows, layers), dq)
+    gradient = net.gradient(errors, dq, layers)
+    np.testing.assert_allclose(-2.0 * gradient.swapaxes(0, 1), np.asarray(expected).reshape(n, m, units), atol=1e-12)
 
 
 def test_matrices_and_plain_loops_give_the_same_update():
     net, config = network(), RbfConfig(window=3, k2=0.7, epsilon=0.01)
-    theta, dq, dy = window(net, 3)
+    theta, layers, dq, dy = window(net, 3)
     gradient, size, norms = np.zeros(net.weights.shape), 0.0, []
     for t in range(3):
         J = np.column_stack([net.weights[i] @ theta[t, i] for i in range(net.n)])
@@ -64,10 +54,9 @@ def test_matrices_and_plain_loops_give_the_same_update():
             norms.append(theta[t, i] @ theta[t, i])
             for unit in range(4):
                 gradient[i, :, unit] += (dy[t] - J @ dq[t]) * dq[t, i] * theta[t, i, unit]
-    moved = moved_by(theta, dq)
-    matrix, _ = window_gradient(as_matrix(net.weights), moved, dy)
-    np.testing.assert_allclose(matrix, as_matrix(gradient), atol=1e-12)
-    step = window_step(squares(theta, dq), config.k2, config.epsilon)
+    errors = dy - np.matvec(net.output(net.rows, layers), dq)
+    np.testing.assert_allclose(net.gradient(errors, dq, layers).swapaxes(0, 1), gradient, atol=1e-12)
+    step = step_of(theta, dq, config.k2, config.epsilon)
     assert step == pytest.approx(0.7 / (0.01 * np.mean(norms) + size), rel=1e-12)
 
 
@@ -76,7 +65,7 @@ def test_the_first_update_equals_the_one_computed_by_hand():
     estimator = started(RbfConfig(window=4, k2=0.5, epsilon=0.01), net)
     # θ(0) = 1, Ĵ = 2, error 0.5 − 2 · 0.1 = 0.3, α₂ = 0.5 / (0.01 + 0.01) = 25, W = 2 + 25 · 0.3 · 0.1
     estimator.update(motion([0.1], [0.5]))
-    np.testing.assert_allclose(estimator.weights, [[[2.75]]], atol=1e-14)
+    np.testing.assert_allclose(estimator.state.rows, [[[2.75]]], atol=1e-14)
     np.testing.assert_allclose(estimator.jacobian(np.zeros(1)), [[2.75]], atol=1e-14)
     assert estimator.diagnostics()["estimator_step_size"] == pytest.approx(25.0)
     assert estimator.diagnostics()["window_error"] == pytest.approx(0.3)
@@ -87,25 +76,24 @@ def test_the_weights_never_move_away_from_those_of_a_representable_jacobian(k2):
     true, rng = network(seed=5), np.random.default_rng(6)
     start = JacobianNetwork(true.centres, true.widths, true.weights + rng.normal(size=true.weights.shape))
     estimator = started(RbfConfig(window=1, k2=k2, epsilon=0.0), start)
-    V = np.sum((estimator.weights - true.weights) ** 2)
+    V = np.sum((estimator.state.rows - true.rows) ** 2)
     first = V
     for _ in range(200):
         q, dq = rng.normal(size=3), rng.normal(size=3)
         estimator.update(motion(dq, true.jacobian(q) @ dq, q=q))
-        V, before = np.sum((estimator.weights - true.weights) ** 2), V
+        V, before = np.sum((estimator.state.rows - true.rows) ** 2), V
         assert before * (1 + 1e-12) >= V
     assert first * 0.9 > V
 
 
 def test_beyond_a_step_size_of_two_the_weights_do_move_away():
     true, rng = network(seed=5), np.random.default_rng(6)
-    weights = true.weights + rng.normal(size=true.weights.shape)
-    q, dq = rng.normal(size=3), rng.normal(size=3)
-    theta = jacobian_features(q, true.centres, true.widths)[None]
-    row, W, W_true = moved_by(theta, dq[None]), as_matrix(weights), as_matrix(true.weights)
-    gradient, _ = window_gradient(W, row, (true.jacobian(q) @ dq)[None])
-    after = W + window_step(squares(theta, dq[None]), 2.1, 0.0) * gradient
-    assert np.sum((after - W_true) ** 2) > np.sum((W - W_true) ** 2)
+    rows = true.rows + rng.normal(size=true.rows.shape)
+    q, dq = rng.normal(size=(1, 3)), rng.normal(size=(1, 3))
+    theta = jacobian_features(q, true.centres, true.widths)
+    errors = np.matvec(true.jacobian(q) - true.jacobian(q, rows), dq)
+    after = rows + step_of(theta, dq, 2.1, 0.0) * true.gradient(errors, dq, true.features(q))
+    assert np.sum((after - true.rows) ** 2) > np.sum((rows - true.rows) ** 2)
 
 
 def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
@@ -115,14 +103,14 @@ def test_epsilon_keeps_noise_at_rest_from_rewriting_the_network():
         rng = np.random.default_rng(8)
         for _ in range(30):
             estimator.update(motion(1e-5 * rng.normal(size=3), 1e-3 * rng.normal(size=2)))
-        moved.append(np.linalg.norm(estimator.weights - network().weights))
+        moved.append(np.linalg.norm(estimator.state.rows - network().rows))
     assert moved[1] < 1e-3 * moved[0]
 
 
 def test_an_arm_at_rest_teaches_nothing_even_without_epsilon():
     estimator = started(RbfConfig(epsilon=0.0), network())
     estimator.update(motion(np.zeros(3), [1e-3, 0.0]))
-    np.testing.assert_array_equal(estimator.weights, network().weights)
+    np.testing.assert_array_equal(estimator.state.rows, network().rows)
 
 
 def test_only_the_last_motions_of_the_window_count():
@@ -131,16 +119,15 @@ def test_only_the_last_motions_of_the_window_count():
     estimator = started(RbfConfig(window=2), net)
     for each in motions[:-1]:
         estimator.update(each)
-    weights = estimator.weights
+    rows = estimator.state.rows
     estimator.update(motions[-1])
-    theta = np.array([jacobian_features(each.joint_position, net.centres, net.widths) for each in motions[-2:]])
-    dq, dy = (np.array([getattr(each, name) for each in motions[-2:]]) for name in ("joint_step", "feature_step"))
-    moved = moved_by(theta, dq)
-    gradient, _ = window_gradient(as_matrix(weights), moved, dy)
-    expected = as_matrix(weights) + window_step(squares(theta, dq), 0.5, 1e-3) * gradient
-    np.testing.assert_allclose(as_matrix(estimator.weights), expected, atol=1e-13)
+    names = "joint_position", "joint_step", "feature_step"
+    q, dq, dy = (np.array([getattr(each, name) for each in motions[-2:]]) for name in names)
+    gradient = net.gradient(dy - np.matvec(net.jacobian(q, rows), dq), dq, net.features(q))
+    expected = rows + step_of(jacobian_features(q, net.centres, net.widths), dq, 0.5, 1e-3) * gradient
+    np.testing.assert_allclose(estimator.state.rows, expected, atol=1e-13)
 
 
 def test_an_initial_jacobian_of_another_size_is_refused():
     with pytest.raises(ValueError, match=r"jacobian must have shape \(2, 3\), got \(3, 6\)"):
-        started(RbfConfig(), network()).reset(np.zeros((3, 6)))
+        started(RbfConfig(), network()).estimator.start(np.zeros((3, 6)))

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from kit.toy import KNOWLEDGE, motion, only_jacobian
+from kit.toy import KNOWLEDGE, Learning, motion, only_jacobian
 from kit.toy import jacobian_network as network
 from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.networks.rbf import JacobianNetwork
 
 
 def started(config, net):
-    return RbfLyapunovEstimator(config, KNOWLEDGE, only_jacobian(net))
+    return Learning(RbfLyapunovEstimator(config, KNOWLEDGE, only_jacobian(net)), np.zeros((net.m, net.n)))
 
 
 def test_the_first_update_equals_the_one_computed_by_hand():
@@ -29,7 +29,7 @@ def lyapunov_run(true, estimator, config, gain=4.0, dt=1e-3, steps=1500, sign=1.
         J_hat, J = estimator.jacobian(q), true.jacobian(q)
         u = gain * np.linalg.pinv(J_hat) @ e
         s = J @ u - J_hat @ u
-        V.append(0.5 * config.n2 * e @ e + 0.5 * np.sum((true.weights - estimator.weights) ** 2))
+        V.append(0.5 * config.n2 * e @ e + 0.5 * np.sum((true.rows - estimator.state.rows) ** 2))
         rate.append(-gain * config.n2 * e @ e - config.n3 * s @ s)
         estimator.update(motion(u * dt, J @ u * dt, sign * e, q, dt))
         q, e = q + u * dt, e - J @ u * dt
@@ -60,9 +60,9 @@ def test_a_constant_error_and_an_exact_jacobian_at_the_target_teach_nothing():
     net, dq = network(), np.array([0.01, -0.02, 0.03])
     estimator = started(RbfLyapunovConfig(), net)
     estimator.update(motion(dq, net.jacobian(np.zeros(3)) @ dq))
-    np.testing.assert_allclose(estimator.weights, net.weights, atol=1e-15)
+    np.testing.assert_allclose(estimator.state.rows, net.rows, atol=1e-15)
 
 
 def test_an_initial_jacobian_of_another_size_is_refused():
     with pytest.raises(ValueError, match=r"jacobian must have shape \(2, 3\)"):
-        started(RbfLyapunovConfig(), network()).reset(np.zeros((1, 3)))
+        started(RbfLyapunovConfig(), network()).estimator.start(np.zeros((1, 3)))

@@ -31,6 +31,22 @@ def motion(dq, dy, e=None, q=None, duration=PERIOD):
     return Motion(np.zeros(dq.size) if q is None else q, dq, dy, np.zeros(dy.size) if e is None else e, duration)
 
 
+class Learning:
+    """An estimator with the state of one run, or of several side by side."""
+
+    def __init__(self, estimator, jacobian):
+        self.estimator, self.state = estimator, estimator.start(jacobian)
+
+    def update(self, motion):
+        self.state = self.estimator.update(self.state, motion)
+
+    def jacobian(self, q=None):
+        return self.estimator.jacobian(self.state, q)
+
+    def diagnostics(self):
+        return self.estimator.diagnostics(self.state)
+
+
 def jacobian_network(n=3, m=2, units=4, seed=0):
     """Return a random Jacobian network."""
     rng = np.random.default_rng(seed)
