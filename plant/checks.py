@@ -16,27 +16,29 @@ def is_finite(array: FloatArray) -> bool:
     return math.isfinite(flat.dot(flat)) or bool(np.isfinite(array).all())
 
 
-def as_vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
-    """Return `value` as a read-only float64 vector.
+def as_array(name: str, value: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return a read-only float64 copy of `value`.
 
     Args:
         name: name of the argument, for the error message.
-        value: anything array-like of shape (size,).
-        size: wanted number of entries.
-
-    Returns:
-        A read-only copy, shape (size,).
+        value: anything array-like.
+        shape: wanted shape.
 
     Raises:
         ValueError: wrong shape, or an entry that is not finite.
     """
-    vector = np.array(value, dtype=np.float64)
-    if vector.shape != (size,):
-        raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
-    if not is_finite(vector):
-        raise ValueError(f"{name} must be finite, got {vector.tolist()}")
-    vector.flags.writeable = False
-    return vector
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if not is_finite(array):
+        raise ValueError(f"{name} must be finite, got {array.tolist()}")
+    array.flags.writeable = False
+    return array
+
+
+def as_vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
+    """Return a read-only float64 copy of `value`, (size,); errors as in `as_array`."""
+    return as_array(name, value, (size,))
 
 
 def check_number(

@@ -13,14 +13,18 @@ import math
 import warnings
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.bench import Bench, SensingConfig, World
-from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import PlantDiverged
+from servobench.plant.lanes import take, where
 from servobench.plant.plant import PlantEntry, PlantSetup
-from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.seeds import Seeds
 from servobench.plant.settings import NonNegative, Periods, Positive, nested, settings
 from servobench.plant.signals import Truth
 
@@ -63,6 +67,20 @@ def discretise_lag(lag: float, period: float) -> tuple[FloatArray, FloatArray]:
     return np.asarray(discrete.A), np.asarray(discrete.B)[:, 0]
 
 
+class KinematicState(NamedTuple):
+    """The state of the world, whose arrays never change.
+
+    Attributes:
+        model: arm and camera as they are now.
+        q: (..., n), rad.
+        v: (..., n), rad/s.
+    """
+
+    model: HandEyeModel
+    q: FloatArray
+    v: FloatArray
+
+
 class KinematicWorld(World):
     """A serial arm under a fixed camera, in closed form: [q, v]₊ = A [q, v] + B u, y = h(q)."""
 
@@ -72,18 +90,17 @@ class KinematicWorld(World):
         Raises:
             ValueError: a start of the wrong size, or a period that is not positive.
         """
-        self._model, start = setup.robot()
-        self._X_BC = self._model.X_BC
-        self.spec = hand_eye_spec(self._model, setup.period, config.max_joint_speed, config.joint_range)
-        self._start = as_vector("start", start, self.spec.n)
+        model, start = setup.robot()
+        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
+        self.lead, self._first = model.lead, KinematicState(model, start, np.zeros(start.shape))
+        self._model, self._q, self._v = self._first
+        self._truth: Truth | None = None
         A, B = discretise_lag(config.lag, setup.period)
         self._coefficients = float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1])
-        self._truth: Truth | None = None
 
-    def reset(self, seed: int) -> FloatArray:
+    def reset(self, seed: Seeds) -> FloatArray:
         """Go back to the start at rest; nothing here is random."""
-        self.move_camera(self._X_BC)
-        self._q, self._v = self._start, np.zeros(self.spec.n)
+        self.restore(self._first)
         return self._q
 
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
@@ -91,11 +108,10 @@ class KinematicWorld(World):
         from_v, kept, to_q, to_v = self._coefficients
         q = self._q + from_v * self._v + to_q * joint_velocity
         v = kept * self._v + to_v * joint_velocity
-        if not math.isfinite(sum(q.tolist())):
-            raise PlantDiverged(f"joint positions are not finite: {q.tolist()}")
+        if not is_finite(q):
+            q, v = self._rest(q, v)
         self._q = np.minimum(np.maximum(q, self.spec.joint_lower), self.spec.joint_upper)
         self._v = np.where(self._q == q, v, 0.0)
-        self._q.setflags(write=False)
         self._truth = None
         return self._q
 
@@ -112,6 +128,29 @@ class KinematicWorld(World):
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
         self._model, self._truth = replace(self._model, X_BC=X_BC), None
+
+    def save(self) -> KinematicState:
+        """See `Plant.save`."""
+        return KinematicState(self._model, self._q, self._v)
+
+    def restore(self, state: KinematicState) -> None:
+        """See `Plant.restore`."""
+        self._model, self._q, self._v = state
+        self._truth, self.faults = None, {}
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """See `Plant.keep`."""
+        self.check_lanes()
+        self.lead, self._first = (len(lanes),), take(self._first, lanes)
+        self.restore(take(self.save(), lanes))
+
+    def _rest(self, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Let the lanes rest whose new joint positions, (..., n) rad, are not finite."""
+        bad = ~np.isfinite(q).all(axis=-1)
+        for lane in np.flatnonzero(bad).tolist():
+            reached = q.reshape(-1, self.spec.n)[lane]
+            self.fail(lane, PlantDiverged(f"joint positions are not finite: {reached.tolist()}"))
+        return where(bad, self._q, q), where(bad, np.zeros_like(v), v)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -131,4 +170,5 @@ ENTRY = PlantEntry(
     summary="numpy arm with joint lag, command delay and feature noise: exact and fast",
     config=KinematicConfig,
     build=build_kinematic,
+    side_by_side=True,
 )

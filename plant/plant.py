@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.checks import FloatArray, as_array
+from servobench.plant.faults import RunFault
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
@@ -37,10 +39,12 @@ class TrueModel:
 
 
 class Abilities(ABC):
-    """What a plant and a world can do beside moving; what neither is bound to know has a default."""
+    """The abilities of plants and worlds beside moving; those that are optional have a default."""
 
     spec: PlantSpec
     """Sizes, names, limits and period; set on construction."""
+    faults: Mapping[int, RunFault] = MappingProxyType({})
+    """Of runs side by side: the lanes that failed, which `keep` has to drop. A single run raises instead."""
 
     @abstractmethod
     def truth(self) -> Truth:
@@ -85,12 +89,23 @@ class Abilities(ABC):
         """Put the camera elsewhere from the next measurement on, until `reset`: a camera displaced during the run.
 
         Args:
-            X_BC: (4, 4), the camera's new pose in the base frame.
+            X_BC: (4, 4), the camera's new pose in the base frame; (..., 4, 4) for runs side by side.
 
         Raises:
             ValueError: a plant without a camera that could be moved.
         """
         raise ValueError("the plant has no camera that could be moved")
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """Drop all other runs for good, of runs side by side.
+
+        Args:
+            lanes: (k,), indices of the lanes that stay, in their new order.
+
+        Raises:
+            ValueError: a plant that carries out one run only.
+        """
+        raise ValueError("the plant carries out one run only, so none can be dropped")
 
     @abstractmethod
     def close(self) -> None:
@@ -135,8 +150,9 @@ class PlantSetup:
     """The arguments with which the harness builds a plant.
 
     Attributes:
-        model: the true arm and camera, mismatch included; None for a plant that brings a robot of its own.
-        start: (n,), rad, reported joint positions at time 0; None for a plant that brings its own start.
+        model: the true arm and camera, mismatch included; None for a plant that brings a robot of its own. For runs
+            side by side its arrays have a leading axis.
+        start: (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
         period: control period, s.
     """
 
@@ -145,14 +161,14 @@ class PlantSetup:
     period: float
 
     def robot(self) -> tuple[HandEyeModel, FloatArray]:
-        """Return model and start, for a plant that needs them.
+        """Return model and start, (..., n), for a plant that needs them.
 
         Raises:
-            ValueError: there are none.
+            ValueError: there are none, or a start of the wrong shape.
         """
         if self.model is None or self.start is None:
             raise ValueError("model and start must be given for this plant, got None")
-        return self.model, self.start
+        return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,28 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
+from typing import Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.checks import FloatArray
+
+Seeds: TypeAlias = int | Sequence[int]
+"""The seed of a single run, or one for each of the runs side by side."""
+
+BLOCK = 64  # draws of a stream that are made at once
+
+
+def check_seed(seed: int) -> None:
+    """Check a seed.
+
+    Raises:
+        ValueError: it is negative.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must be a non-negative integer, got {seed}")
 
 
 def named_sequence(seed: int, name: str) -> np.random.SeedSequence:
@@ -13,8 +33,7 @@ def named_sequence(seed: int, name: str) -> np.random.SeedSequence:
     Raises:
         ValueError: a negative seed.
     """
-    if seed < 0:
-        raise ValueError(f"seed must be a non-negative integer, got {seed}")
+    check_seed(seed)
     return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),))
 
 
@@ -26,3 +45,56 @@ def named_generator(seed: int, name: str) -> np.random.Generator:
 def named_seed(seed: int, name: str) -> int:
     """Return a 32-bit seed for the part called `name` below the run's `seed`."""
     return int(named_sequence(seed, name).generate_state(1)[0])
+
+
+class Stream:
+    """Random numbers of a part, drawn ahead: each run has the numbers of its own named generator, one after the other.
+
+    It can be copied and pickled.
+    """
+
+    def __init__(
+        self,
+        seeds: Seeds,
+        name: str,
+        draw: Literal["standard_normal", "random"],
+        shape: tuple[int, ...] = (),
+        factor: float = 1.0,
+    ) -> None:
+        """Begin all streams.
+
+        Args:
+            seeds: one, or one for each of the runs side by side, which gives every draw a leading axis.
+            name: of the part.
+            draw: method of the generators.
+            shape: of a draw of one run.
+            factor: on all numbers.
+
+        Raises:
+            ValueError: a negative seed.
+        """
+        self._single = isinstance(seeds, int | np.integer)
+        self._seeds = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
+        for seed in self._seeds:
+            check_seed(seed)
+        self._generators: list[np.random.Generator] = []  # made with the first block: many streams are never used
+        self._name, self._draw, self._shape, self._factor = name, draw, (BLOCK, *shape), factor
+        self._block: FloatArray = np.empty(0)
+        self._used = BLOCK
+
+    def next(self) -> FloatArray:
+        """Return the next draw of each run, (..., *shape)."""
+        if self._used == BLOCK:
+            self._generators = self._generators or [named_generator(seed, self._name) for seed in self._seeds]
+            drawn = [getattr(generator, self._draw)(self._shape) for generator in self._generators]
+            self._block = self._factor * (drawn[0] if self._single else np.stack(drawn, axis=1))
+            self._used = 0
+        self._used += 1
+        row: FloatArray = self._block[self._used - 1]
+        return row
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """Drop the streams of all other lanes."""
+        self._seeds = [self._seeds[lane] for lane in lanes]
+        if self._generators:
+            self._generators, self._block = [self._generators[lane] for lane in lanes], self._block[:, lanes]

@@ -209,8 +209,8 @@ class Truth:
     """The true state of a plant, for evaluation only.
 
     Attributes:
-        feature: (m,), the feature without noise, latency or gaps.
-        jacobian: (m, n), ∂feature/∂joint_position, or None if the plant does not know it.
+        feature: (..., m), the feature without noise, latency or gaps.
+        jacobian: (..., m, n), ∂feature/∂joint_position, or None if the plant does not know it.
     """
 
     feature: FloatArray

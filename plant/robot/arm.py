@@ -8,6 +8,8 @@ translation (a_i, 0, d_i) and the roll α_i, and the calibration file that every
     θ = g ⊙ q + o          q reported joint position, g gear ratio (1 = as reported), o joint offset
     p = p_flange + R_flange t          t ball centre in the flange frame
     ∂p/∂q_i = g_i z_i × (p − p_i)
+
+The arms of many runs side by side are one arm, whose arrays have leading axes.
 """
 
 from __future__ import annotations
@@ -20,12 +22,13 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.checks import FloatArray, as_array, as_vector
 
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
-
 TURN_SIGNS = np.array([1.0, -1.0])  # of the sine in the two columns that a turn about z mixes
+SWAPPED_COLUMNS = np.array([1, 0, 2, 3])  # of a pose: each column's partner in a turn about z
+YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a vector: the partners in a cross product
 
 
 def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
@@ -41,28 +44,30 @@ def rotation_from_rpy(rpy: npt.ArrayLike) -> FloatArray:
 
 
 def rpy_from_rotation(R: FloatArray) -> FloatArray:
-    """Return roll, pitch, yaw, (3,) rad, of a rotation matrix (3, 3); sound at a pitch of ±90° too.
+    """Return roll, pitch, yaw, (..., 3) rad, of rotation matrices (..., 3, 3); also valid at a pitch of ±90°.
 
-    The yaw is taken out before pitch and roll are read, so that no angle is read from two vanishing numbers.
+    The yaw is removed before pitch and roll are computed, so that no angle depends on two vanishing numbers.
     """
-    yaw = np.arctan2(R[1, 0], R[0, 0])
+    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
-    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
-    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
-    return np.array([roll, pitch, yaw])
+    pitch = np.arctan2(-R[..., 2, 0], c * R[..., 0, 0] + s * R[..., 1, 0])
+    roll = np.arctan2(s * R[..., 0, 2] - c * R[..., 1, 2], c * R[..., 1, 1] - s * R[..., 0, 1])
+    return np.stack([roll, pitch, yaw], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
 class SerialArm:
     """A serial arm with n revolute joints and a ball on its flange.
 
+    All arrays have the same leading axes.
+
     Attributes:
         joint_names: n names.
-        translation: (n+1, 3), m; row i leads from frame i to joint i+1, the last row to the flange.
-        rpy: (n+1, 3), rad; the rotations that go with them.
-        joint_offset: (n,), rad.
-        gear_ratio: (n,), true joint motion over reported joint motion.
-        tool: (3,), m, ball centre in the flange frame.
+        translation: (..., n+1, 3), m; row i leads from frame i to joint i+1, the last row to the flange.
+        rpy: (..., n+1, 3), rad; the rotations that belong to them.
+        joint_offset: (..., n), rad.
+        gear_ratio: (..., n), true joint motion over reported joint motion.
+        tool: (..., 3), m, ball centre in the flange frame.
     """
 
     joint_names: tuple[str, ...]
@@ -74,14 +79,10 @@ class SerialArm:
 
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
-        n = len(self.joint_names)
-        for name, wanted in (("translation", (n + 1, 3)), ("rpy", (n + 1, 3))):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape != wanted:
-                raise ValueError(f"{name} must have shape {wanted}, got {value.shape}")
-            object.__setattr__(self, name, as_vector(name, value.ravel(), value.size).reshape(wanted))
-        for name, size in (("joint_offset", n), ("gear_ratio", n), ("tool", 3)):
-            object.__setattr__(self, name, as_vector(name, getattr(self, name), size))
+        n, lead = self.n, np.shape(self.translation)[:-2]
+        shapes = {"translation": (n + 1, 3), "rpy": (n + 1, 3), "joint_offset": (n,), "gear_ratio": (n,), "tool": (3,)}
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, as_array(name, getattr(self, name), lead + shape))
 
     @property
     def n(self) -> int:
@@ -90,11 +91,12 @@ class SerialArm:
 
     @cached_property
     def _fixed(self) -> FloatArray:
-        """Fixed transforms as homogeneous matrices, (n+1, 4, 4)."""
-        fixed = np.zeros((self.n + 1, 4, 4))
-        fixed[:, :3, :3] = rotation_from_rpy(self.rpy)
-        fixed[:, :3, 3] = self.translation
-        fixed[:, 3, 3] = 1.0
+        """Fixed transforms as homogeneous matrices, (n+1, ..., 4, 4)."""
+        translation = np.moveaxis(self.translation, -2, 0)
+        fixed = np.zeros((*translation.shape[:-1], 4, 4))
+        fixed[..., :3, :3] = np.moveaxis(rotation_from_rpy(self.rpy), -3, 0)
+        fixed[..., :3, 3] = translation
+        fixed[..., 3, 3] = 1.0
         return fixed
 
     def joint_angle(self, joint_position: npt.ArrayLike) -> FloatArray:
@@ -114,16 +116,16 @@ class SerialArm:
             (..., n+1, 4, 4), m: entry i is the frame after joint i+1, the last one is the flange.
         """
         theta = self.joint_angle(joint_position)
-        # The joint axis goes first, so that the loop meets one joint after the other; one pose needs no such move.
         angle = (theta if theta.ndim == 1 else np.moveaxis(theta, -1, 0))[..., None, None]
-        cos, sin = np.cos(angle), np.sin(angle) * TURN_SIGNS
+        # A turn about z makes x c + y s and y c - x s of columns 0 and 1, and leaves the others as they are.
+        own, swapped = np.empty((*angle.shape[:-2], 4, 4)), np.zeros((*angle.shape[:-2], 4, 4))
+        own[..., :2], own[..., 2:] = np.cos(angle), 1.0
+        swapped[..., :2] = np.sin(angle) * TURN_SIGNS
         poses = np.empty((self.n + 1, *theta.shape[:-1], 4, 4))
         pose: FloatArray = self._fixed[0]
-        for turned, c, s, fixed in zip(poses, cos, sin, self._fixed[1:], strict=False):
-            # Columns 0 and 1 of a frame turned about z are x c + y s and y c - x s; the others stay.
-            np.multiply(pose[..., :2], c, out=turned[..., :2])
-            turned[..., :2] += pose[..., 1::-1] * s
-            turned[..., 2:] = pose[..., 2:]
+        for turned, c, s, fixed in zip(poses, own, swapped, self._fixed[1:], strict=False):
+            np.multiply(pose, c, out=turned)
+            np.add(turned, pose.take(SWAPPED_COLUMNS, axis=-1) * s, out=turned)
             pose = turned @ fixed
         poses[self.n] = pose
         return poses if theta.ndim == 1 else np.moveaxis(poses, 0, -3)
@@ -143,15 +145,14 @@ class SerialArm:
         axis = frames[..., : self.n, :3, 2]
         lever = ball[..., None, :] - frames[..., : self.n, :3, 3]
         # numpy.cross would cost as much as the forward kinematics.
-        columns = np.empty_like(lever)
-        for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-            columns[..., i] = axis[..., j] * lever[..., k] - axis[..., k] * lever[..., j]
-        columns *= self.gear_ratio[:, None]
+        columns = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
+        columns -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
+        columns *= self.gear_ratio[..., None]
         return ball, np.swapaxes(columns, -1, -2)
 
     def _ball(self, frames: FloatArray) -> FloatArray:
         flange = frames[..., -1, :, :]
-        return flange[..., :3, :3] @ self.tool + flange[..., :3, 3]
+        return np.asarray(np.matvec(flange[..., :3, :3], self.tool) + flange[..., :3, 3])
 
 
 def arm_from_dh(

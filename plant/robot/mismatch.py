@@ -246,23 +246,26 @@ def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple
     Raises:
         ValueError: the calibration file is missing or malformed.
     """
-    n, size = model.arm.n, mismatch.size
+    arm, n, size = model.arm, model.arm.n, mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
         return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, shape)
 
+    def factors(name: str, *shape: int) -> FloatArray:
+        """A magnitude of 0 gives factors of 1 whatever is drawn, which saves a generator."""
+        return 1.0 + size(name) * draw(name, *shape) if size(name) > 0.0 else np.ones(shape)
+
     angle, move = size("camera_rotation"), size("camera_move")
     sample = MismatchSample(
-        link_scale=1.0 + size("links") * draw("links", n + 1, 3),
+        link_scale=factors("links", n + 1, 3),
         joint_offset=size("joint_offsets") * draw("joint_offsets", n),
-        gear_ratio=1.0 + size("gear_ratio") * draw("gear_ratio", n),
+        gear_ratio=factors("gear_ratio", n),
         tool_offset=size("tool") * draw("tool", 3),
         camera_axis=_draw_camera_axis(angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")),
         camera_angle=angle if mismatch.camera_exact else float(angle * draw("camera_angle", 1)[0]),
         move_axis=_draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
         move_angle=move,
     )
-    arm = model.arm
     if mismatch.profile == "factory":
         file = mismatch.calibration
         arm = ur5_arm_from_calibration(None if file is None else Path(file).expanduser())
@@ -285,7 +288,7 @@ def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Genera
     cos_gamma = 1.0 - generator.uniform() * (1.0 - math.sqrt(1.0 - largest**2))
     sin_gamma = math.sqrt(1.0 - cos_gamma**2)
     turn = generator.uniform(0.0, 2 * math.pi)
-    sign = generator.choice([-1.0, 1.0])
+    sign = (-1.0, 1.0)[generator.integers(2)]
     return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
 
 

@@ -173,7 +173,7 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
             lambda: SerialArm(("i",), np.zeros((2, 3)), np.full((2, 3), np.nan), np.zeros(1), np.ones(1), np.zeros(3)),
             "rpy must be finite",
         ),
-        (lambda: HandEyeModel(ur5_arm(), np.eye(3)), r"X_BC must be a finite \(4, 4\) matrix"),
+        (lambda: HandEyeModel(ur5_arm(), np.eye(3)), r"X_BC must have shape \(4, 4\), got \(3, 3\)"),
         (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, -1.0, 1.0])), "X_BC must hold a rotation matrix"),
         (lambda: HandEyeModel(ur5_arm(), np.diag([1.0, 1.0, 1.1, 1.0])), "X_BC must hold a rotation matrix"),
         (lambda: hand_eye_spec(nominal_ur5(), 0.05, -1.0, 6.0), "joint_velocity_limit must be positive"),

@@ -1,0 +1,115 @@
+"""Runs side by side: a lane of a plant has the same bits alone, with other neighbours and after others were dropped."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from kit.plants import configure, mismatched
+from servobench.harness.config.registry import find_plant
+from servobench.plant import lanes
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.hand_eye import TrueJacobian
+from servobench.plant.robot.ur5 import HOME
+from servobench.plant.signals import Command
+
+SEEDS = (11, 4, 7)
+MODELS = [mismatched("severe+gear_ratio=5%", seed) for seed in SEEDS]
+STARTS = np.array(HOME) + np.random.default_rng(0).uniform(-0.3, 0.3, (3, 6))
+PERIODS, MOVE = 70, 40  # further than one block of random numbers
+COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (PERIODS, 3, 6))
+MOVED = np.array([mismatched("camera_rotation=40deg", seed).X_BC for seed in SEEDS])
+WORST = {"command_delay_periods": 3, "latency_periods": 2, "drop_probability": 0.2}
+
+
+@pytest.fixture(params=["kinematic"])
+def build(request):
+    """Return a function that builds a plant for one lane or for an array of lanes, under bad sensing."""
+    entry, opened = find_plant(request.param), []
+    assert entry.side_by_side
+
+    def made(chosen):
+        model = MODELS[chosen] if np.ndim(chosen) == 0 else lanes.stack([MODELS[lane] for lane in chosen])
+        opened.append(entry.build(configure(entry.config, **WORST), PlantSetup(model, STARTS[chosen], 0.05)))
+        opened[-1].reset(SEEDS[chosen] if np.ndim(chosen) == 0 else [SEEDS[lane] for lane in chosen])
+        return opened[-1]
+
+    yield made
+    for plant in opened:
+        plant.close()
+
+
+def walk(plant, chosen, periods=range(PERIODS)):
+    """Return what a plant shows at each period, as arrays (periods, ...)."""
+    rows = []
+    for k in periods:
+        if k == MOVE:
+            plant.move_camera(MOVED[chosen])
+        seen, truth = plant.step(Command(COMMANDS[k, chosen])), plant.truth()
+        assert not any(each.flags.writeable for each in (seen.joint_position, seen.feature, seen.valid))
+        rows.append((seen.joint_position, seen.feature, seen.feature_valid, seen.valid, truth.feature, truth.jacobian))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def assert_same(walked, lane, alone):
+    for together, one in zip(walked, alone, strict=True):
+        np.testing.assert_array_equal(together[:, lane], one)
+
+
+def test_an_arm_has_the_same_bits_alone_and_among_others():
+    order = np.array([2, 0, 1])
+    stacked = lanes.stack(MODELS)
+    q = STARTS + np.random.default_rng(3).uniform(-2.0, 2.0, (20, 3, 6))
+
+    def everything(model, q):
+        points = model.feature(q)
+        return (model.arm.frames(q), points, model.jacobian(q), TrueJacobian(model)(q), model.to_base(points))
+
+    together, permuted = everything(stacked, q), everything(lanes.take(stacked, order), q[:, order])
+    for lane in range(3):
+        alone = everything(lanes.take(stacked, lane), q[:, lane])
+        for many, other, one in zip(together, permuted, alone, strict=True):
+            np.testing.assert_array_equal(many[:, lane], one)
+            np.testing.assert_array_equal(other[:, order.tolist().index(lane)], one)
+
+
+def test_a_lane_has_the_same_bits_alone_in_another_order_and_after_others_were_dropped(build):
+    alone = [walk(build(lane), lane) for lane in range(3)]
+    assert 0.1 < 1.0 - np.mean(alone[0][2]) < 0.3
+    order = np.array([2, 0, 1])
+    for chosen in (np.arange(3), order):
+        walked = walk(build(chosen), chosen)
+        for place, lane in enumerate(chosen):
+            assert_same(walked, place, alone[lane])
+    plant, late = build(np.arange(3)), range(20, PERIODS)
+    walk(plant, np.arange(3), range(20))
+    plant.keep(np.array([2, 0]))
+    walked = walk(plant, np.array([2, 0]), late)
+    for place, lane in enumerate((2, 0)):
+        assert_same(walked, place, [column[20:] for column in alone[lane]])
+    with pytest.raises(ValueError, match=r"seed must have shape \(2,\), got \(3,\)"):
+        plant.reset(SEEDS)
+    first = plant.reset([SEEDS[2], SEEDS[0]])
+    np.testing.assert_array_equal(first.feature[1], build(0).reset(SEEDS[0]).feature)
+
+
+@pytest.mark.parametrize("chosen", [1, np.arange(3)])
+def test_a_state_of_any_period_has_many_futures(build, chosen):
+    plant = build(chosen)
+    walk(plant, chosen, range(30))
+    state = plant.save()
+    first = walk(plant, chosen, range(30, PERIODS))
+    other = build(chosen)
+    for each, saved in ((plant, state), (plant, pickle.loads(pickle.dumps(state))), (other, state), (plant, state)):
+        each.restore(saved)
+        for again, before in zip(walk(each, chosen, range(30, PERIODS)), first, strict=True):
+            np.testing.assert_array_equal(again, before)
+    with pytest.raises(ValueError, match="state must be of runs of shape"):
+        build(np.array([0, 2])).restore(state)
+
+
+def test_a_single_run_has_no_lanes_to_drop(build):
+    with pytest.raises(ValueError, match="one run only"):
+        build(0).keep(np.array([0]))
