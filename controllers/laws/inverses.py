@@ -3,55 +3,51 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dposv
 
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch, transposed
 
 MAX_DAMPED_RATIO = 1e9  # [1] of ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
-MAX_CONDITION = 1e3  # [1] of ‖J‖ ‖J⁺‖; the normal equations square it and then lose six digits
 MIN_SINGULAR_RATIO = 1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors
 
 
 def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
-    """Return Jᵀ (JJᵀ + δ²I)⁻¹, (n, m), rad/m, for J (m, n); the pseudo-inverse where δ = 0.
+    """Return Jᵀ (JJᵀ + δ²I)⁻¹, (..., n, m), rad/m, for J (..., m, n); the pseudo-inverse where δ = 0.
 
-    It is computed from a Cholesky factor, or from singular values where rounding errors would exceed δ.
+    It solves the normal equations, or takes singular values where rounding errors would exceed δ.
 
     Args:
-        J: (m, n), m/rad.
+        J: (..., m, n), m/rad.
         damping: δ, m/rad; directions in which J is weaker than this get little joint motion.
     """
     if damping == 0.0:
         return np.asarray(np.linalg.pinv(J))
-    square = J.dot(J.T)
-    if not square.trace() < MAX_DAMPED_RATIO * damping**2:
-        return damped_inverse_by_svd(J, damping)
-    square.flat[:: len(J) + 1] += damping**2
-    return np.asarray(dposv(square, J)[1]).T
+    square = J @ transposed(J)
+    ordinary = square.trace(axis1=-2, axis2=-1) < MAX_DAMPED_RATIO * damping**2
+    inverse = branch(ordinary, _solve_normal_equations, J, square, damping)
+    return transposed(branch(np.logical_not(ordinary), _decompose, inverse, J, damping))
 
 
 def damped_inverse_by_svd(J: FloatArray, damping: float) -> FloatArray:
     """Return the same from singular values, which is accurate for any J and takes longer."""
+    return transposed(_decompose(J, J, damping))
+
+
+def _solve_normal_equations(J: FloatArray, square: FloatArray, damping: float) -> FloatArray:
+    """Return (JJᵀ + δ²I)⁻¹ J, (..., m, n), for square = JJᵀ."""
+    damped = square + damping**2 * np.eye(J.shape[-2])
+    return np.asarray(np.linalg.solve(damped, J), dtype=np.float64)
+
+
+def _decompose(_: FloatArray, J: FloatArray, damping: float) -> FloatArray:
+    """Return (JJᵀ + δ²I)⁻¹ J, (..., m, n), from singular values."""
     U, sigma, Vt = np.linalg.svd(J, full_matrices=False)
-    return np.asarray((Vt.T * (sigma / (sigma**2 + damping**2))) @ U.T)
+    return np.asarray((U * (sigma / (sigma**2 + damping**2))[..., None, :]) @ Vt)
 
 
 def project_to_row_space(weights: FloatArray, jacobian: FloatArray) -> FloatArray:
-    """Return Ĵ⁺Ĵ W: the part of the weights (n, p, N_h) whose output moves the feature under `jacobian` (m, n)."""
-    return np.asarray((_row_space_projector(jacobian) @ weights.reshape(len(weights), -1)).reshape(weights.shape))
-
-
-def _row_space_projector(jacobian: FloatArray) -> FloatArray:
-    """Return Ĵ⁺Ĵ, (n, n), from the normal equations where they are accurate, else from singular values."""
-    m, n = jacobian.shape
-    if m <= n:
-        try:
-            inverse = np.linalg.solve(jacobian @ jacobian.T, jacobian)  # (Ĵ⁺)ᵀ
-        except np.linalg.LinAlgError:
-            pass  # the rank is below m; singular values find it
-        else:
-            if np.vdot(jacobian, jacobian) * np.vdot(inverse, inverse) < MAX_CONDITION**2:
-                return jacobian.T @ inverse
+    """Return Ĵ⁺Ĵ W: the part of weights (..., n, p, N_h) whose output moves the feature under Ĵ (..., m, n)."""
     _, singular, rows = np.linalg.svd(jacobian, full_matrices=False)
-    basis = rows[singular > MIN_SINGULAR_RATIO * singular[0]]
-    return np.asarray(basis.T @ basis)
+    basis = rows * (singular > MIN_SINGULAR_RATIO * singular[..., :1])[..., None]
+    flat = weights.reshape(*weights.shape[:-2], -1)
+    return np.asarray(transposed(basis) @ (basis @ flat)).reshape(weights.shape)

@@ -7,10 +7,15 @@ feature's step, until one after the other has none left, always along the wanted
 
 from __future__ import annotations
 
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 
 from servobench.controllers.laws.inverses import damped_inverse
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch
+from servobench.plant.signals import BoolArray
 
 MIN_ROOM = 1e-9  # [1] of its limit; a joint with less room is left out
 REMAINDER_TOLERANCE = 1e-6  # [1] of the step that may be left undone
@@ -35,6 +40,28 @@ def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     return np.asarray(joint_velocity / np.maximum(excess, 1.0))
 
 
+class _Shared(NamedTuple):
+    """A joint step that is being redistributed.
+
+    Attributes:
+        joint_step: (..., n), rad, within the limits.
+        left: (...), share of the wanted step that is still to be made.
+        free: (..., n), joints that may still take over.
+        jacobian: Ĵ, (..., m, n), m/rad.
+        wanted: the wanted step of the feature, (..., m), m.
+        down: (..., n), rad, how far a joint may go down in total.
+        up: the same upwards.
+    """
+
+    joint_step: FloatArray
+    left: FloatArray
+    free: BoolArray
+    jacobian: FloatArray
+    wanted: FloatArray
+    down: FloatArray
+    up: FloatArray
+
+
 def redistribute(
     joint_step: FloatArray,
     jacobian: FloatArray,
@@ -45,34 +72,48 @@ def redistribute(
     """Return a joint step within the limits that moves the feature by f Ĵ dq, 0 < f ≤ 1, with a large f.
 
     Args:
-        joint_step: dq, (n,), rad, as wanted.
-        jacobian: Ĵ, (m, n), m/rad.
+        joint_step: dq, (..., n), rad, as wanted.
+        jacobian: Ĵ, (..., m, n), m/rad.
         limit: (n,), rad, positive.
         damping: m/rad, positive; the remaining joints make little motion in directions in which they are weaker, and
             the feature's direction is kept except for what they leave out.
-        further: how far a joint that takes over may go down and up in total, two arrays (n,), rad, at least 0; None:
-            as far as its limit.
+        further: how far a joint that takes over may go down and up in total, two arrays (..., n), rad, at least 0;
+            None: as far as its limit.
 
     Returns:
-        (n,), rad; `joint_step` itself where it keeps the limits.
+        (..., n), rad; `joint_step` itself where it keeps the limits.
     """
-    excess = largest_excess(joint_step, limit)
-    if excess <= 1.0:
-        return joint_step
-    down, up = (limit, limit) if further is None else (np.minimum(limit, reach) for reach in further)
-    m, least_room = len(jacobian), MIN_ROOM * limit
-    dq, left = joint_step / excess, 1.0 - 1.0 / excess
-    wanted = jacobian @ joint_step
-    free = np.abs(dq) < limit - least_room
-    while left > REMAINDER_TOLERANCE and np.count_nonzero(free) >= m:
-        J = np.where(free, jacobian, 0.0)
-        more = left * (damped_inverse(J, damping) @ wanted)
-        room = np.where(more > 0.0, up - dq, down + dq)
-        stuck = free & (room <= least_room)
-        if stuck.any():
-            free &= ~stuck
-            continue
-        share = 1.0 / max(1.0, float(np.maximum.reduce(np.abs(more[free]) / room[free])))
-        dq = dq + share * more
-        left *= 1.0 - share
-    return np.asarray(np.clip(dq, -limit, limit))
+    if further is None:
+        further = np.broadcast_to(limit, joint_step.shape), np.broadcast_to(limit, joint_step.shape)
+    take_over = partial(_take_over, limit=limit, damping=damping)
+
+    def shared(joint_step: FloatArray, jacobian: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
+        excess = largest_excess(joint_step, limit)
+        dq = joint_step / excess[..., None]
+        free = np.abs(dq) < limit - MIN_ROOM * limit
+        wanted = np.matvec(jacobian, joint_step)
+        down, up = np.minimum(limit, down), np.minimum(limit, up)
+        state = _Shared(dq, 1.0 - 1.0 / excess, free, jacobian, wanted, down, up)
+        while (unfinished := _is_unfinished(state)).any():
+            state = branch(unfinished, take_over, state)
+        return np.clip(state.joint_step, -limit, limit)
+
+    return branch(largest_excess(joint_step, limit) > 1.0, shared, joint_step, jacobian, *further)
+
+
+def _is_unfinished(state: _Shared) -> BoolArray:
+    enough = np.add.reduce(state.free, axis=-1) >= state.jacobian.shape[-2]
+    return np.asarray((state.left > REMAINDER_TOLERANCE) & enough)
+
+
+def _take_over(state: _Shared, limit: FloatArray, damping: float) -> _Shared:
+    """Let the free joints go on until one of them has no room left; where one has none now, only leave it out."""
+    dq, free = state.joint_step, state.free
+    J = np.where(free[..., None, :], state.jacobian, 0.0)
+    more = state.left[..., None] * np.matvec(damped_inverse(J, damping), state.wanted)
+    room = np.where(more > 0.0, state.up - dq, state.down + dq)
+    stuck = free & (room <= MIN_ROOM * limit)
+    free = free & ~stuck
+    use = np.divide(np.abs(more), room, where=free, out=np.zeros_like(more))
+    share = (1.0 - np.logical_or.reduce(stuck, axis=-1)) / np.maximum.reduce(use, axis=-1, initial=1.0)
+    return state._replace(joint_step=dq + share[..., None] * more, left=state.left * (1.0 - share), free=free)

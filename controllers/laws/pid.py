@@ -2,7 +2,7 @@
 
     v(k) = K_p e(k) + K_i I(k) + K_d d(k) [+ ẏ_ref(k)],      u(k) = Ĵᵀ (ĴĴᵀ + δ²I)⁻¹ v(k)
 
-with e = y_ref − y (m,), its integral I and its filtered derivative d:
+with e = y_ref − y (..., m), its integral I and its filtered derivative d:
 
     I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt),   ẏ_ref(k) = (y_ref(k+1) − y_ref(k)) / dt
 
@@ -11,7 +11,7 @@ K_i = K_d = 0 and δ = 0 is eq. 43 (and eq. 9), whose minus sign belongs to the 
 
 from __future__ import annotations
 
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -19,10 +19,11 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.inverses import damped_inverse
 from servobench.controllers.laws.law import Law
-from servobench.controllers.laws.limit import scale_to_limit
+from servobench.controllers.laws.limit import largest_excess
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch, norm
 from servobench.plant.settings import NonNegative, Positive, settings
-from servobench.plant.signals import Observation
+from servobench.plant.signals import BoolArray, Observation
 
 
 @settings
@@ -43,8 +44,26 @@ class PidConfig:
     """Add the reference's own velocity; needs a preview of at least 1."""
 
 
+class PidState(NamedTuple):
+    """The state of the law.
+
+    Attributes:
+        integral: I, (..., m), m s.
+        derivative: d, (..., m), m/s.
+        last_error: e of the last valid feature, (..., m), m.
+        started: (...), whether there was a valid feature.
+        saturated: (...), whether the last command was limited.
+    """
+
+    integral: FloatArray
+    derivative: FloatArray
+    last_error: FloatArray
+    started: BoolArray
+    saturated: BoolArray
+
+
 @final
-class PidLaw(Law):
+class PidLaw(Law[PidState]):
     """u = Ĵ⁺ (K_p e + K_i I + K_d d [+ ẏ_ref]), limited as a whole so that the direction stays.
 
     Anti-windup by conditional integration: while the command is limited, the integral grows no further (it may shrink).
@@ -62,42 +81,42 @@ class PidLaw(Law):
         self._config = config
         self._limit = knowledge.spec.joint_velocity_limit
         self._dt = knowledge.spec.period
-        self._m = knowledge.spec.m
-        self._forget()
 
-    def _forget(self) -> None:
-        self._integral = np.zeros(self._m)
-        self._derivative = np.zeros(self._m)
-        self._last_error: FloatArray | None = None
-        self._saturated = False
+    def start(self, observation: Observation) -> PidState:
+        """Return zero integral and derivative."""
+        zero, no = np.zeros(observation.feature.shape), np.full(observation.feature.shape[:-1], False)
+        return PidState(integral=zero, derivative=zero, last_error=zero, started=no, saturated=no)
 
-    def reset(self, observation: Observation) -> None:
-        """Forget integral and derivative."""
-        self._forget()
-
-    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return u, (n,), rad/s; see `Law.command`."""
-        config = self._config
-        e = reference[0] - observation.feature
-        if observation.feature_valid:
-            self._differentiate(e)
-        integral = self._integral + self._dt * e if observation.feature_valid else self._integral
-        v = config.proportional_gain * e + config.integral_gain * integral + config.derivative_gain * self._derivative
+    def command(
+        self, state: PidState, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[PidState, FloatArray]:
+        """Return the new state and u, (..., n), rad/s; see `Law.command`."""
+        config, before = self._config, state.integral
+        e = reference[..., 0, :] - observation.feature
+        state = branch(observation.feature_valid, self._learn, state, e)
+        v = config.proportional_gain * e + config.integral_gain * state.integral
+        v = v + config.derivative_gain * state.derivative
         if config.feedforward:
-            v = v + (reference[1] - reference[0]) / self._dt
-        wanted = damped_inverse(estimate.jacobian, config.damping) @ v
-        u = scale_to_limit(wanted, self._limit)
-        self._saturated = bool((np.abs(wanted) > self._limit).any())
-        if not self._saturated or integral @ integral < self._integral @ self._integral:
-            self._integral = integral
-        return u
+            v = v + (reference[..., 1, :] - reference[..., 0, :]) / self._dt
+        wanted = np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
+        excess = largest_excess(wanted, self._limit)
+        state = state._replace(saturated=excess > 1.0)
+        winds_up = state.saturated & (np.vecdot(state.integral, state.integral) >= np.vecdot(before, before))
+        return branch(winds_up, _hold_integral, state, before), wanted / np.maximum(excess, 1.0)[..., None]
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: PidState) -> Diagnostics:
         """Return the norm of the integral, m s, and whether the command was limited."""
-        return {"integral_norm": float(np.linalg.norm(self._integral)), "saturated": float(self._saturated)}
+        return {"integral_norm": norm(state.integral), "saturated": state.saturated}
 
-    def _differentiate(self, e: FloatArray) -> None:
-        if self._last_error is not None:
-            tau = self._config.derivative_filter
-            self._derivative = (tau * self._derivative + e - self._last_error) / (tau + self._dt)
-        self._last_error = e
+    def _learn(self, state: PidState, e: FloatArray) -> PidState:
+        """Integrate and differentiate the error of a valid feature."""
+        state = branch(state.started, self._differentiate, state, e)
+        return state._replace(integral=state.integral + self._dt * e, last_error=e, started=np.full(e.shape[:-1], True))
+
+    def _differentiate(self, state: PidState, e: FloatArray) -> PidState:
+        tau = self._config.derivative_filter
+        return state._replace(derivative=(tau * state.derivative + e - state.last_error) / (tau + self._dt))
+
+
+def _hold_integral(state: PidState, integral: FloatArray) -> PidState:
+    return state._replace(integral=integral)

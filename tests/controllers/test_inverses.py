@@ -49,6 +49,15 @@ def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
     np.testing.assert_allclose(damped_inverse(J, damping), wanted, rtol=1e-7, atol=1e-7 * np.abs(wanted).max())
 
 
+def test_each_lane_is_inverted_by_the_formula_that_is_accurate_for_it():
+    """An ordinary Jacobian beside a huge singular one, of which the normal equations have no solution."""
+    ordinary, huge = np.random.default_rng(4).normal(size=(2, 2)), 1e9 * np.ones((2, 2))
+    both = damped_inverse(np.array([ordinary, huge, ordinary]), 0.02)
+    for lane, single in enumerate((ordinary, huge, ordinary)):
+        np.testing.assert_array_equal(both[lane], damped_inverse(single, 0.02))
+    np.testing.assert_allclose(both[1], damped_inverse_by_svd(huge, 0.02))
+
+
 def test_the_damped_inverse_exists_where_the_jacobian_is_huge_and_singular():
     J = 1e9 * np.ones((2, 2))
     assert np.isfinite(damped_inverse(J, 0.02)).all()

@@ -5,14 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kit.toy import plant_spec, seen
+from kit.toy import Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw, mfac_step
 
 
 def fresh(n, m, limit=1e6, preview=1, **settings):
-    return MfacLaw(MfacConfig(**settings), RobotKnowledge(plant_spec(n, m, limit), preview))
+    made = MfacLaw(MfacConfig(**settings), RobotKnowledge(plant_spec(n, m, limit), preview))
+    return Commanding(made, seen(np.zeros(n), np.zeros(m)))
 
 
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 8), m=st.integers(1, 4), lam=st.floats(1e-3, 10.0))

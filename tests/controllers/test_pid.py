@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kit.toy import plant_spec, seen
+from kit.toy import Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.pid import PidConfig, PidLaw
@@ -20,15 +20,14 @@ def look(feature, valid=True):
 
 
 def fresh(limit=100.0, **settings):
-    law = PidLaw(PidConfig(**{"damping": 0.0, **settings}), knowledge(limit))
-    law.reset(look([0.0, 0.0]))
-    return law
+    return Commanding(PidLaw(PidConfig(**{"damping": 0.0, **settings}), knowledge(limit)), look([0.0, 0.0]))
 
 
 def test_the_first_step_equals_the_one_computed_by_hand():
     law = PidLaw(PidConfig(proportional_gain=2.0, integral_gain=4.0, damping=0.0), knowledge(n=1, m=1))
+    first = seen([0.0], [0.0])
     # e = 0.1, I = 0.05 · 0.1 = 0.005, v = 2 · 0.1 + 4 · 0.005 = 0.22, u = 0.22 / 0.5
-    u = law.command(Estimate(np.array([[0.5]])), seen([0.0], [0.0]), np.full((2, 1), 0.1))
+    _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.full((2, 1), 0.1))
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
 

@@ -80,6 +80,20 @@ def only_controller(network):
     return SimpleNamespace(controller=network)
 
 
+class Commanding:
+    """A law with the state of one run, or of several side by side."""
+
+    def __init__(self, law, observation):
+        self.law, self.state = law, law.start(observation)
+
+    def command(self, estimate, observation, reference):
+        self.state, u = self.law.command(self.state, estimate, observation, reference)
+        return u
+
+    def diagnostics(self):
+        return self.law.diagnostics(self.state)
+
+
 class ToyArm:
     """q(k+1) = q(k) + Σ_i g_i dq(k−i), y(k) = turn A q(k − latency)."""
 
