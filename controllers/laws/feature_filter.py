@@ -10,58 +10,62 @@ camera that was moved) restarts it.
 
 from __future__ import annotations
 
-from typing import final
+from typing import NamedTuple
 
 import numpy as np
 
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch
 
 REST_DRIFT = 1e-4  # [m] r, process noise of z per period at rest
 RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y
 
 
-@final
-class FeatureFilter:
-    """z and its variance p."""
+class FeatureFilter(NamedTuple):
+    """The state of the filter.
 
-    def __init__(self, noise: NoiseLevel, model_error: float, feature: FloatArray, *, find_noise: bool) -> None:
-        """Start at a feature.
+    Attributes:
+        feature: z, (..., m), m.
+        variance: p, (...), m².
+        noise: σ, standard deviation of the feature per axis.
+    """
+
+    feature: FloatArray
+    variance: FloatArray
+    noise: NoiseLevel
+
+    def restart(self, feature: FloatArray) -> FeatureFilter:
+        """Return the filter at a feature y, (..., m), m."""
+        return self._replace(feature=feature, variance=self.noise.variance)
+
+    def advance(self, jacobian: FloatArray, joint_step: FloatArray, model_error: float) -> FeatureFilter:
+        """Return the filter one period later, before the frame of that period.
 
         Args:
-            noise: σ, m, standard deviation of the feature an axis.
+            jacobian: Ĵ, (..., m, n), m/rad.
+            joint_step: Δq, (..., n), rad.
             model_error: c, error of the Jacobian as a share of ‖Ĵ‖.
-            feature: y, (m,), m.
+        """
+        flat = jacobian.reshape(*jacobian.shape[:-2], -1)
+        uncertainty = np.vecdot(flat, flat) * np.vecdot(joint_step, joint_step) / joint_step.shape[-1]
+        return self._replace(
+            feature=self.feature + np.matvec(jacobian, joint_step),
+            variance=self.variance + model_error**2 * uncertainty + REST_DRIFT**2,
+        )
+
+    def correct(self, feature: FloatArray, find_noise: bool) -> FeatureFilter:
+        """Return the filter after a valid frame.
+
+        Args:
+            feature: y, (..., m), m.
             find_noise: learn σ from y − z.
         """
-        self._noise, self._model_error, self._find_noise = noise, model_error, find_noise
-        self._restart(feature)
-
-    def _restart(self, feature: FloatArray) -> None:
-        self.feature = feature
-        self.variance = self._noise.variance
-
-    def advance(self, jacobian: FloatArray, joint_step: FloatArray, feature: FloatArray | None) -> None:
-        """Advance by one period.
-
-        Args:
-            jacobian: Ĵ, (m, n), m/rad.
-            joint_step: Δq, (n,), rad.
-            feature: y, (m,), m; None where the frame is lost.
-        """
-        sigma2 = self._noise.variance
-        z = self.feature + jacobian @ joint_step
-        uncertainty = float(np.vdot(jacobian, jacobian)) * float(joint_step @ joint_step) / len(joint_step)
-        p = self.variance + self._model_error**2 * uncertainty + REST_DRIFT**2
-        if feature is None:
-            self.feature, self.variance = z, p
-            return
-        error = feature - z
-        square = float(error @ error) / len(z)
-        if self._find_noise:
-            self._noise.learn(square, 1.0, p)
-        if square > RESTART_RATIO * (p + sigma2):
-            self._restart(feature)
-            return
-        share = p / (p + sigma2)
-        self.feature, self.variance = np.asarray(z + share * error), (1.0 - share) * p
+        z, p, noise = self
+        error, innovation_variance = feature - z, p + noise.variance
+        square = np.vecdot(error, error) / feature.shape[-1]
+        share = p / innovation_variance
+        if find_noise:
+            noise = noise.learn(square, 1.0, p)
+        corrected = FeatureFilter(z + share[..., None] * error, (1.0 - share) * p, noise)
+        return branch(square > RESTART_RATIO * innovation_variance, FeatureFilter.restart, corrected, feature)

@@ -11,42 +11,62 @@ that is still to come (`joint_response`).
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.laws.feature_filter import FeatureFilter
-from servobench.controllers.laws.joint_response import JointResponse
+from servobench.controllers.laws.joint_response import JointResponse, pushed
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
-from servobench.plant.signals import Observation
+from servobench.plant.lanes import branch
+from servobench.plant.signals import BoolArray, Observation
+
+IntArray = npt.NDArray[np.int_]
+PERIODS = np.arange(MAX_DELAY + 2)
+EXPOSURE_AND_BEFORE = np.array([[0], [1]])  # [periods] the exposure of a frame and the period before
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Prediction:
+class Prediction(NamedTuple):
     """What the predict stage hands to a law.
 
     Attributes:
-        feature: ŷ, (m,), m.
-        joint_position: q̂, (n,), rad.
-        lead: [periods] by which the reference is to be shifted, a fraction.
+        feature: ŷ, (..., m), m.
+        joint_position: q̂, (..., n), rad.
+        lead: (...) [periods] by which the reference is to be shifted, a fraction.
     """
 
     feature: FloatArray
     joint_position: FloatArray
-    lead: float
+    lead: FloatArray
+
+
+class PredictorState(NamedTuple):
+    """The state of the predict stage.
+
+    Attributes:
+        response: of the joints.
+        filter: of the feature.
+        delay: (...) [periods] of the camera, at which the filter runs; −1 before the first frame.
+        past: q(k), q(k−1), …, (..., `MAX_DELAY` + 2, n), rad.
+    """
+
+    response: JointResponse
+    filter: FeatureFilter
+    delay: IntArray
+    past: FloatArray
 
 
 @final
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Predictor:
     """ŷ, q̂ and lead as above; each half can be switched off, and with both off they are what is measured.
 
     The keywords are those settings of `RbfnnBridgedConfig`.
     """
 
-    joints: int
     _: KW_ONLY
     bridge: bool = True
     response_length: int = 12
@@ -55,78 +75,85 @@ class Predictor:
     find_noise: bool = True
     model_error: float = 0.2
 
-    def __post_init__(self) -> None:
-        """Start with an arm at rest."""
-        self.reset()
+    def start(self, observation: Observation) -> PredictorState:
+        """Return the state of an arm at rest."""
+        q, y = observation.joint_position, observation.feature
+        noise = NoiseLevel.guess(self.feature_noise, y.shape[:-1])
+        return PredictorState(
+            response=JointResponse.immediate(self.response_length, q),
+            filter=FeatureFilter(y, noise.variance, noise),
+            delay=np.full(y.shape[:-1], -1),
+            past=np.repeat(q[..., None, :], MAX_DELAY + 2, axis=-2),
+        )
 
-    def reset(self) -> None:
-        """Forget everything."""
-        self._response = JointResponse(self.response_length, self.joints)
-        self._filter: FeatureFilter | None = None
-        self._noise = NoiseLevel(self.feature_noise)
-        self._filtered_delay = 0
-        self._past: FloatArray | None = None  # q(k), q(k−1), …
-
-    @property
-    def lead(self) -> float:
-        """The present lead [periods]."""
-        return self._response.lead if self.bridge else 0.0
-
-    def predict(self, estimate: Estimate, observation: Observation) -> Prediction:
-        """Return the prediction of this period.
+    def predict(
+        self, state: PredictorState, estimate: Estimate, observation: Observation
+    ) -> tuple[PredictorState, Prediction]:
+        """Return the new state and the prediction of this period.
 
         Raises:
             ValueError: a delay beyond what is kept of the past.
         """
-        if not 0 <= estimate.delay <= MAX_DELAY:
+        delay, J, q = state.delay * 0 + estimate.delay, estimate.jacobian, observation.joint_position
+        if (delay != delay.clip(0, MAX_DELAY)).any():
             raise ValueError(f"delay must be from 0 to {MAX_DELAY} periods, got {estimate.delay}")
-        J, past = estimate.jacobian, pushed(self._past, observation.joint_position, MAX_DELAY + 2)
-        self._past, delay, flight = past, 0, np.zeros(self.joints)
+        past, response = pushed(state.past, q), state.response
         if self.bridge:
-            self._response.learn(past[0] - past[1])
-            delay, flight = estimate.delay, self._response.flight()
-        seen = self._seen(J, past, delay, observation)
-        return Prediction(seen + J @ (past[0] - past[delay] + flight), past[0] + flight, self.lead)
-
-    def note(self, joint_step: FloatArray) -> None:
-        """Take the joint step (n,), rad, that left the chain."""
-        self._response.command(joint_step)
-
-    def _seen(self, jacobian: FloatArray, past: FloatArray, delay: int, observation: Observation) -> FloatArray:
-        """Return z, (m,), m: where the feature was at its exposure, `delay` periods ago."""
-        y = observation.feature
-        if not self.observe:
-            return y
-        if self._filter is None or delay != self._filtered_delay:
-            self._filter = FeatureFilter(self._noise, self.model_error, y, find_noise=self.find_noise)
-            self._filtered_delay = delay
+            response = response.learn(q - past[..., 1, :])
+            bound = q + response.flight()
         else:
-            step = past[delay] - past[delay + 1]
-            self._filter.advance(jacobian, step, y if observation.feature_valid else None)
-        return self._filter.feature
+            delay, bound = delay * 0, q
+        chosen = (delay[..., None, None] + EXPOSURE_AND_BEFORE == PERIODS).astype(np.float64) @ past
+        found, exposed = state.filter._replace(feature=observation.feature), chosen[..., 0, :]
+        if self.observe:
+            found = self._observe(state, delay, J, exposed - chosen[..., 1, :], observation)
+        feature = found.feature + np.matvec(J, bound - exposed)
+        return PredictorState(response, found, delay, past), Prediction(feature, bound, response.lead)
+
+    def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
+        """Return the state after the joint step (..., n), rad, left the chain."""
+        return state._replace(response=state.response.command(joint_step))
+
+    def _observe(
+        self,
+        state: PredictorState,
+        delay: IntArray,
+        jacobian: FloatArray,
+        joint_step: FloatArray,
+        observation: Observation,
+    ) -> FeatureFilter:
+        """Return the filter at the exposure, `delay` periods ago, up to which the joints moved by `joint_step`."""
+        same, y = delay == state.delay, observation.feature
+        found = branch(same, self._follow, state.filter, jacobian, joint_step, y, observation.feature_valid)
+        return branch(np.logical_not(same), FeatureFilter.restart, found, y)
+
+    def _follow(
+        self,
+        state: FeatureFilter,
+        jacobian: FloatArray,
+        joint_step: FloatArray,
+        feature: FloatArray,
+        valid: bool | BoolArray,
+    ) -> FeatureFilter:
+        state = state.advance(jacobian, joint_step, self.model_error)
+        return branch(valid, FeatureFilter.correct, state, feature, self.find_noise)
 
 
-def pushed(history: FloatArray | None, newest: FloatArray, length: int) -> FloatArray:
-    """Return the history (length, …) with the newest value first; a first value fills it."""
-    if history is None:
-        return np.repeat(newest[None], length, axis=0)
-    return np.concatenate([newest[None], history[:-1]])
-
-
-def shifted(reference: FloatArray, lead: float, rows: int) -> FloatArray:
-    """Return the reference `lead` periods later, (rows, m): interpolated, and extrapolated beyond its end.
+def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:
+    """Return the reference `lead` periods later, (..., rows, m): interpolated, and extrapolated beyond its end.
 
     Args:
-        reference: (1 + preview, m), m.
-        lead: periods, at least 0.
+        reference: (..., 1 + preview, m), m.
+        lead: (...), periods, at least 0.
         rows: how many instants are wanted, at most 1 + preview.
     """
-    if lead == 0.0 or len(reference) == 1:
-        return reference[:rows]
-    whole = int(lead)
-    missing = whole + rows + 1 - len(reference)
-    if missing > 0:
-        further = np.arange(1, missing + 1)[:, None] * (reference[-1] - reference[-2])
-        reference = np.concatenate([reference, reference[-1] + further])
-    before = reference[whole : whole + rows]
-    return np.asarray(before + (lead - whole) * (reference[whole + 1 : whole + 1 + rows] - before))
+    last = reference.shape[-2] - 1
+    if last == 0 or not np.any(lead):
+        return reference[..., :rows, :]
+    whole = np.floor(lead)
+    index = whole.astype(np.int_)[..., None] + np.arange(rows + 1)
+    inside = np.minimum(index, last)
+    beyond = (index - inside)[..., None] * (reference[..., -1:, :] - reference[..., -2:-1, :])
+    found = np.take_along_axis(reference, inside[..., None], axis=-2) + beyond
+    before = found[..., :-1, :]
+    return np.asarray(before + (lead - whole)[..., None, None] * (found[..., 1:, :] - before))
