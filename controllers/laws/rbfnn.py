@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, final
+from typing import Annotated, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 from annotated_types import Lt
@@ -10,15 +10,16 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.inverses import project_to_row_space
+from servobench.controllers.laws.joint_response import pushed
 from servobench.controllers.laws.law import Law, Stage
 from servobench.controllers.laws.limit import largest_excess, scale_to_limit
-from servobench.controllers.laws.prediction import pushed
-from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
+from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, sum_of_squares, update_step
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import norm, where
 from servobench.plant.settings import Count, NonNegative, Positive, settings
-from servobench.plant.signals import Observation
+from servobench.plant.signals import BoolArray, Observation
 
 
 @settings
@@ -41,8 +42,30 @@ class RbfnnConfig:
     """Learn nothing that drives a limited command further; false as in the paper."""
 
 
+class RbfnnState(NamedTuple):
+    """The state of the law.
+
+    Attributes:
+        learned: W − W(0), (..., n, p, N_h).
+        errors: e(k), e(k−1), …, (..., L_e, m), m.
+        positions: q(k−1), q(k−2), …, (..., L_c, n), rad.
+        started: (...), whether there was a command.
+        predicted: e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them.
+        step_size: α of the last update, (...).
+        wanted: (..., n), rad, the joint step of the last command before it was limited.
+    """
+
+    learned: FloatArray
+    errors: FloatArray
+    positions: FloatArray
+    started: BoolArray
+    predicted: FloatArray
+    step_size: FloatArray
+    wanted: FloatArray
+
+
 @final
-class RbfnnLaw(Law):
+class RbfnnLaw(Law[RbfnnState]):
     """u(k) = (ψ(k) ξ(k) − q) / dt, with ψ_j = W_j h(ξ) learned online.
 
         ξ(k) = [e(k) … e(k−L_e+1), q(k−1) … q(k−L_c)]                        (eq. 11)
@@ -50,8 +73,8 @@ class RbfnnLaw(Law):
         W_j ← W_j + α Σ_{t=1..T} [Ĵᵀ e(k+t)] ξ_j(k+t−1) h(k+t−1)ᵀ             (eqs. 18, 19)
         α = k Σ ‖e(k+t)‖² / (ε + ‖Σ_t …‖²_F),   0 < k < 2                     (eq. 23)
 
-    e(k+t) come from `roll_out`; the command uses the new weights. Symbols: e = y_ref − y (m,) m; q joint position (n,)
-    rad; Ĵ (m, n) m/rad; W_j (n, N_h); T horizon; α step size.
+    e(k+t) come from `roll_out`; the command uses the new weights. Symbols: e = y_ref − y (..., m) m; q joint position
+    (..., n) rad; Ĵ (..., m, n) m/rad; W_j (..., n, N_h); T horizon; α step size.
 
     Departures from the paper:
     - ε, and the joint-speed limit in prediction and command.
@@ -86,75 +109,75 @@ class RbfnnLaw(Law):
         self._network = network
         self._period = spec.period
         self._step_limit = spec.joint_velocity_limit * spec.period
-        self._forget()
 
-    @property
-    def weights(self) -> FloatArray:
-        """W as it is now, (n, p, N_h); a copy."""
-        return np.asarray(self._network.weights + self._learned)
+    def start(self, observation: Observation) -> RbfnnState:
+        """Return the state of the offline network."""
+        network, lead, q = self._network, observation.feature.shape[:-1], observation.joint_position
+        return RbfnnState(
+            learned=np.zeros((*lead, *network.weights.shape)),
+            errors=np.zeros((*lead, network.error_history, network.m)),
+            positions=np.repeat(q[..., None, :], network.position_history, axis=-2),
+            started=np.full(lead, False),
+            predicted=np.zeros((*lead, self._config.horizon, network.m)),
+            step_size=np.zeros(lead),
+            wanted=np.zeros(q.shape),
+        )
 
-    @property
-    def wanted(self) -> FloatArray:
-        """The joint step of the last command before it was limited, (n,), rad."""
-        return self._wanted
-
-    def _forget(self) -> None:
-        self._learned = np.zeros(self._network.weights.shape)
-        self._errors: FloatArray | None = None
-        self._positions: FloatArray | None = None
-        self._step_size = 0.0
-        self._wanted = np.zeros(self._network.n)
-        self._ahead: RollOut | None = None
-
-    def reset(self, observation: Observation) -> None:
-        """Restore the offline network and empty both histories."""
-        self._forget()
-
-    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return u, (n,), rad/s; see `Law.command`."""
-        config, network, jacobian = self._config, self._network, estimate.jacobian
-        self._errors = pushed(self._errors, reference[0] - observation.feature, network.error_history)
-        if self._positions is None or config.position == "measured":
-            self._positions = pushed(self._positions, observation.joint_position, network.position_history)
+    def command(
+        self, state: RbfnnState, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[RbfnnState, FloatArray]:
+        """Return the new state and u, (..., n), rad/s; see `Law.command`."""
+        config, jacobian, learned = self._config, estimate.jacobian, state.learned
+        errors = pushed(state.errors, reference[..., 0, :] - observation.feature)
+        errors = where(state.started, errors, errors[..., :1, :])
+        positions = state.positions
+        if config.position == "measured":
+            positions = pushed(positions, observation.joint_position)
         if config.row_space_only:
-            self._learned = project_to_row_space(self._learned, jacobian)
-        history, reference_steps = (self._errors, self._positions), self._reference_steps(reference)
-        ahead = self._ahead = roll_out(network, self.weights, jacobian, history, reference_steps, self._step_limit)
-        wanted = self._wanted = self._learn(jacobian, ahead) if observation.feature_valid else ahead.wanted
+            learned = project_to_row_space(learned, jacobian)
+        weights, steps = self._network.weights + learned, self._reference_steps(reference)
+        ahead = roll_out(self._network, weights, jacobian, (errors, positions), steps, self._step_limit)
+        direction = descent_direction(jacobian, ahead)
+        alpha, wanted = self._update(direction, ahead, observation.feature_valid)
+        learned = learned + alpha[..., None, None, None] * direction
         step = scale_to_limit(wanted, self._step_limit)
         if config.position == "commanded":
-            self._positions = pushed(self._positions, self._positions[0] + step, network.position_history)
-        return step / self._period
+            positions = pushed(positions, positions[..., 0, :] + step)
+        alpha = np.where(observation.feature_valid, alpha, state.step_size)
+        new = RbfnnState(learned, errors, positions, np.full_like(state.started, True), ahead.errors, alpha, wanted)
+        return new, step / self._period
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: RbfnnState) -> Diagnostics:
         """Return criterion I_c (m²), step size α, predicted error ‖e(k+T)‖ (m), norms of weights, saturation."""
         return {
-            "criterion": self._ahead.criterion if self._ahead else 0.0,
-            "step_size": self._step_size,
-            "predicted_error": float(np.linalg.norm(self._ahead.errors[-1])) if self._ahead else 0.0,
-            "controller_weight_norm": float(np.linalg.norm(self.weights)),
-            "learned_weight_norm": float(np.linalg.norm(self._learned)),
-            "saturated": float(largest_excess(self._wanted, self._step_limit) > 1.0),
+            "criterion": 0.5 * sum_of_squares(state.predicted, 2),
+            "step_size": state.step_size,
+            "predicted_error": norm(state.predicted[..., -1, :]),
+            "controller_weight_norm": np.sqrt(sum_of_squares(self._network.weights + state.learned, 3)),
+            "learned_weight_norm": np.sqrt(sum_of_squares(state.learned, 3)),
+            "saturated": largest_excess(state.wanted, self._step_limit) > 1.0,
         }
 
     def _reference_steps(self, reference: FloatArray) -> FloatArray:
-        """Return how the reference is assumed to move in each of the T steps, (T, m), m."""
+        """Return how the reference is assumed to move in each of the T steps, (..., T, m), m."""
+        horizon = self._config.horizon
         if not self._config.preview:
-            return np.zeros((self._config.horizon, self._network.m))
-        return reference[1 : self._config.horizon + 1] - reference[: self._config.horizon]
+            return np.zeros((*reference.shape[:-2], horizon, self._network.m))
+        return np.asarray(reference[..., 1 : horizon + 1, :] - reference[..., :horizon, :])
 
-    def _learn(self, jacobian: FloatArray, ahead: RollOut) -> FloatArray:
-        """Update the weights and return the joint step that the new ones want, (n,), rad.
+    def _update(self, direction: FloatArray, ahead: RollOut, valid: bool | BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return α, (...), and the joint step that the weights want with the update α G, (..., n), rad.
 
-        Anti-windup: where the old weights exceed the limit, an update that exceeds it further is dropped.
+        α is 0 without a valid feature. Anti-windup: where the old weights exceed the limit, an update that exceeds it
+        further is dropped.
         """
-        direction = descent_direction(jacobian, ahead)
-        alpha = update_step(direction, ahead, self._config.k, self._config.epsilon)
-        renewed = ahead.wanted + alpha * controller_output(direction, ahead.xi[0], ahead.h[0])
+        config = self._config
+        alpha = update_step(direction, ahead, config.k, config.epsilon) * np.asarray(valid)
+        push = controller_output(direction, ahead.xi[..., 0, :], ahead.h[..., 0, :])
+        renewed = ahead.wanted + alpha[..., None] * push
+        if not config.anti_windup:
+            return alpha, renewed
         before = largest_excess(ahead.wanted, self._step_limit)
-        if self._config.anti_windup and before > 1.0 and largest_excess(renewed, self._step_limit) > before:
-            self._step_size = 0.0
-            return ahead.wanted
-        self._step_size = alpha
-        self._learned = self._learned + alpha * direction
-        return renewed
+        useful = (before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before)
+        alpha = alpha * useful
+        return alpha, ahead.wanted + alpha[..., None] * push

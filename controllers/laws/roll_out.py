@@ -12,35 +12,30 @@ paper writes a negative α into an update with the opposite sign.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
-from servobench.controllers.networks.rbf import ControllerNetwork, information_vector
+from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import transposed
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class RollOut:
+class RollOut(NamedTuple):
     """What the predicted loop went through.
 
     Attributes:
-        errors: e(k+1) … e(k+T), (T, m), m.
-        xi: ξ(k) … ξ(k+T−1), (T, p).
-        h: h(k) … h(k+T−1), (T, N_h).
-        wanted: ψ(ξ) ξ − q(k−1), (n,), rad, the first joint step before it is limited.
+        errors: e(k+1) … e(k+T), (..., T, m), m.
+        xi: ξ(k) … ξ(k+T−1), (..., T, p).
+        h: h(k) … h(k+T−1), (..., T, N_h).
+        wanted: ψ(ξ) ξ − q(k−1), (..., n), rad, the first joint step before it is limited.
     """
 
     errors: FloatArray
     xi: FloatArray
     h: FloatArray
     wanted: FloatArray
-
-    @property
-    def criterion(self) -> float:
-        """I_c = ½ Σ ‖e(k+t)‖² (eq. 15), m²."""
-        return 0.5 * float(np.vdot(self.errors, self.errors))
 
 
 def roll_out(
@@ -55,33 +50,35 @@ def roll_out(
 
     Args:
         network: structure, centres and widths.
-        weights: W, (n, p, N_h), as they are now.
-        jacobian: Ĵ, (m, n), m/rad.
-        history: errors e(k) …, (L_e, m), and joint positions q(k−1) …, (L_c, n), the newest first.
-        reference_steps: y_ref(k+t) − y_ref(k+t−1) for t = 1 … T, (T, m), m.
+        weights: W, (..., n, p, N_h), as they are now.
+        jacobian: Ĵ, (..., m, n), m/rad.
+        history: errors e(k) …, (..., L_e, m), and joint positions q(k−1) …, (..., L_c, n), the newest first.
+        reference_steps: y_ref(k+t) − y_ref(k+t−1) for t = 1 … T, (..., T, m), m.
         step_limit: (n,), rad, largest joint step of a period.
 
     Returns:
         Errors, information vectors and hidden layers.
     """
-    (n, p, hidden), horizon = weights.shape, len(reference_steps)
-    m, newest = len(jacobian), history[0].size  # q(k−1) begins at `newest` in ξ
-    flat, A = weights.reshape(n * p, hidden), _shift(m, n, *map(len, history)).copy()
-    A[:m, p : p + n] = -jacobian
-    states, hs = np.empty((horizon + 1, A.shape[1])), np.empty((horizon, hidden))
-    xis = states[:, :p]  # a state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ
-    xis[0], states[:-1, p + n :] = information_vector(*history), reference_steps
-    reach, wanted = 1.0 / step_limit, np.zeros(n)
+    *lead, horizon, m = reference_steps.shape
+    n, p, hidden = weights.shape[-3:]
+    lengths = history[0].shape[-2], history[1].shape[-2]
+    newest = m * lengths[0]  # q(k−1) begins here in ξ
+    A = np.broadcast_to(_shift(m, n, *lengths), (*lead, p, p + n + m)).copy()
+    A[..., :m, p : p + n] = -jacobian
+    states, hs = np.empty((*lead, horizon + 1, p + n + m)), np.empty((*lead, horizon, hidden))
+    xis = states[..., :p]  # a state is [ξ, Δq, y_ref(k+t) − y_ref(k+t−1)], and A times it is the next ξ
+    xis[..., 0, :], states[..., :-1, p + n :] = information_vector(*history), reference_steps
+    reach, wanted = 1.0 / step_limit, np.zeros((*lead, n))
     for t in range(horizon):
-        state, xi = states[t], xis[t]
-        h = hs[t] = network.features(xi)
-        dq = flat.dot(h).reshape(n, p).dot(xi) - xi[newest : newest + n]
+        state, xi = states[..., t, :], xis[..., t, :]
+        h = hs[..., t, :] = network.features(xi)
+        dq = controller_output(weights, xi, h) - xi[..., newest : newest + n]
         if t == 0:
             wanted = dq
-        excess = max(map(abs, (dq * reach).tolist()))
-        state[p : p + n] = dq / excess if excess > 1.0 else dq
-        A.dot(state, out=xis[t + 1])
-    return RollOut(xis[1:, :m].copy(), xis[:-1].copy(), hs, wanted)
+        excess = np.maximum.reduce(np.abs(dq) * reach, axis=-1, keepdims=True, initial=1.0)
+        state[..., p : p + n] = dq / excess
+        xis[..., t + 1, :] = np.matvec(A, state)
+    return RollOut(xis[..., 1:, :m].copy(), xis[..., :-1, :].copy(), hs, wanted)
 
 
 @cache
@@ -101,16 +98,24 @@ def _shift(m: int, n: int, error_history: int, position_history: int) -> FloatAr
 
 
 def descent_direction(jacobian: FloatArray, ahead: RollOut) -> FloatArray:
-    """Return G = −∂I_c/∂W with the paper's truncation, (n, p, N_h) (eq. 18)."""
-    n, p, hidden = jacobian.shape[1], ahead.xi.shape[1], ahead.h.shape[1]
+    """Return G = −∂I_c/∂W with the paper's truncation, (..., n, p, N_h) (eq. 18)."""
     pull = ahead.errors @ jacobian
-    outer = (pull[:, :, None] * ahead.xi[:, None, :]).reshape(len(pull), n * p)
-    return np.asarray((outer.T @ ahead.h).reshape(n, p, hidden))
+    outer = pull[..., :, None] * ahead.xi[..., None, :]
+    *lead, horizon, n, p = outer.shape
+    return np.asarray(transposed(outer.reshape(*lead, horizon, n * p)) @ ahead.h).reshape(*lead, n, p, -1)
 
 
-def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float) -> float:
-    """Return α = k Σ‖e(k+t)‖² / (ε + ‖G‖²_F) (eq. 23 with ε); 0 where there is nothing to descend."""
-    norm = float(np.vdot(direction, direction))
-    if epsilon + norm == 0.0:
-        return 0.0
-    return k * float(np.vdot(ahead.errors, ahead.errors)) / (epsilon + norm)
+def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float) -> FloatArray:
+    """Return α = k Σ‖e(k+t)‖² / (ε + ‖G‖²_F), (...), (eq. 23 with ε); 0 where there is nothing to descend."""
+    return step_size(k * sum_of_squares(ahead.errors, 2), epsilon + sum_of_squares(direction, 3))
+
+
+def step_size(wanted: FloatArray, size: FloatArray) -> FloatArray:
+    """Return wanted / size, (...), and 0 where the size is 0."""
+    return np.divide(wanted, size, where=size > 0.0, out=np.zeros_like(size))
+
+
+def sum_of_squares(array: FloatArray, axes: int) -> FloatArray:
+    """Return the sum of squares over the last axes, (...)."""
+    flat = array.reshape(*array.shape[:-axes], -1)
+    return np.asarray(np.vecdot(flat, flat))
