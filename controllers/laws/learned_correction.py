@@ -17,16 +17,37 @@ learned while the command is limited.
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.laws.inverses import damped_inverse
+from servobench.controllers.laws.limit import largest_excess
 from servobench.controllers.laws.posture import step_with_posture
+from servobench.controllers.laws.roll_out import step_size, sum_of_squares
 from servobench.controllers.networks.rbf import ControllerNetwork
 from servobench.plant.checks import FloatArray
-from servobench.plant.signals import Observation
+from servobench.plant.lanes import norm, outer, transposed
+from servobench.plant.signals import BoolArray, Observation
+
+
+class CorrectionState(NamedTuple):
+    """The state of the law.
+
+    Attributes:
+        C: (..., m + 1, (m + n) N_h): C above without the last update, and in the last row its ξ ⊗ h.
+        update: α e(k+1) of the last update, (..., m), m.
+        jacobian: Ĵ of the last step, (..., m, n), m/rad.
+        predicted: e(k+1), (..., m), m.
+        step_size: α, (...).
+    """
+
+    C: FloatArray
+    update: FloatArray
+    jacobian: FloatArray
+    predicted: FloatArray
+    step_size: FloatArray
 
 
 @final
@@ -34,7 +55,9 @@ from servobench.plant.signals import Observation
 class LearnedCorrection:
     """The law above. W, (n, m + n, N_h), lies in the row space of Ĵ, so that W = Ĵᵀ C is held by C, half its size.
 
-    C ← (1 − l) (ĴĴᵀ + δ²I)⁻¹ Ĵ(k) Ĵ(k−1)ᵀ C + α e(k+1) (ξ ⊗ h)
+    C(k) = (1 − l) (ĴĴᵀ + δ²I)⁻¹ Ĵ(k) Ĵ(k−1)ᵀ [C(k−1) + (α e(k) (ξ ⊗ h))(k−1)]
+
+    An update enters C at the next period, in one product with the projection, which halves the memory traffic.
 
     Attributes:
         network: has the hidden layer; its ξ must hold one error and one joint position.
@@ -60,75 +83,81 @@ class LearnedCorrection:
     damping: float
 
     def __post_init__(self) -> None:
-        """Check the network and start without weights."""
+        """Check the network."""
         if (self.network.error_history, self.network.position_history) != (1, 1):
             raise ValueError(
                 "error_history and position_history must be 1 for base 'jacobian', got "
                 f"{self.network.error_history} and {self.network.position_history}"
             )
-        self._reach: FloatArray = 1.0 / self.limit
-        self._forget()
 
-    def reset(self, observation: Observation) -> None:
-        """Set all weights to zero."""
-        self._forget()
-
-    def _forget(self) -> None:
-        network = self.network
-        self._C: FloatArray = np.zeros((network.m, (network.m + network.n) * network.weights.shape[2]))
-        self._jacobian: FloatArray = np.zeros((network.m, network.n))  # Ĵ of the last step
-        self.step_size = 0.0
-        self._predicted: FloatArray = np.zeros(0)  # e(k+1), m
+    def start(self, observation: Observation) -> CorrectionState:
+        """Return the state without weights."""
+        lead = observation.feature.shape[:-1]
+        m, n, hidden = self.network.m, self.network.n, self.network.weights.shape[2]
+        zero, J = np.zeros((*lead, m)), np.zeros((*lead, m, n))
+        C = np.zeros((*lead, m + 1, (m + n) * hidden))
+        return CorrectionState(C=C, update=zero, jacobian=J, predicted=zero, step_size=np.zeros(lead))
 
     def step(
-        self, jacobian: FloatArray, error: FloatArray, joint_position: FloatArray, forward: FloatArray, learn: bool
-    ) -> FloatArray:
-        """Return the joint step that is wanted, before any limit.
+        self,
+        state: CorrectionState,
+        jacobian: FloatArray,
+        error: FloatArray,
+        joint_position: FloatArray,
+        forward: FloatArray,
+        learn: bool | BoolArray,
+    ) -> tuple[CorrectionState, FloatArray]:
+        """Return the new state and the joint step that is wanted, before any limit.
 
         Args:
-            jacobian: Ĵ, (m, n), m/rad.
-            error: e, (m,), m.
-            joint_position: q, (n,), rad.
-            forward: feedforward feature step (m,), m: the reference's own motion, which does not enter the error.
-            learn: whether the weights may be updated.
+            state: after the last step.
+            jacobian: Ĵ, (..., m, n), m/rad.
+            error: e, (..., m), m.
+            joint_position: q, (..., n), rad.
+            forward: feedforward feature step (..., m), m: the reference's own motion, which does not enter the error.
+            learn: (...), whether the weights may be updated.
 
         Returns:
-            dq, (n,), rad.
+            The state, and dq, (..., n), rad.
         """
         pinv = damped_inverse(jacobian, self.damping)
         away = self.posture - joint_position
         wanted = step_with_posture(pinv, jacobian, self.error_share * error, away, self.posture_share)
-        following = pinv.dot(forward)
+        following = np.matvec(pinv, forward)
         if self.k == 0.0:
-            return np.asarray(wanted + following)
-        kept = (1.0 - self.leak) * self._jacobian.dot(pinv).T
-        C = self._C = kept.dot(self._C)
-        self._jacobian = jacobian
-        xi = np.concatenate([error, joint_position])
-        seen = np.multiply.outer(xi, self.network.features(xi)).ravel()  # ξ ⊗ h
-        wanted += C.dot(seen).dot(jacobian)
-        excess = max(1.0, float(max(map(abs, (wanted * self._reach).tolist()))))
-        ahead = self._predicted = error - jacobian.dot(wanted) / excess
-        self.step_size = 0.0
-        if not learn or excess > 1.0:
-            return np.asarray(wanted + following)
-        pull = ahead.dot(jacobian)
-        others = float(seen.dot(seen))  # ‖G‖² without what Ĵᵀe adds
-        self.step_size = self.k * float(ahead.dot(ahead)) / (self.epsilon + float(pull.dot(pull)) * others)
-        C += np.multiply.outer(self.step_size * ahead, seen)
-        return np.asarray(wanted + (self.step_size * others) * pull + following)
+            return state, wanted + following
+        C = self._projected(state, pinv, np.concatenate([error, joint_position], axis=-1))
+        seen = C[..., -1, :]
+        wanted = wanted + np.vecmat(np.matvec(C[..., :-1, :], seen), jacobian)
+        excess = np.maximum(largest_excess(wanted, self.limit), 1.0)
+        ahead = error - np.matvec(jacobian, wanted) / excess[..., None]
+        pull = np.vecmat(ahead, jacobian)
+        others = np.vecdot(seen, seen)  # ‖G‖² without what Ĵᵀe adds
+        alpha = step_size(self.k * np.vecdot(ahead, ahead), self.epsilon + np.vecdot(pull, pull) * others)
+        alpha = alpha * (learn & (excess <= 1.0))
+        new = CorrectionState(C, alpha[..., None] * ahead, jacobian, ahead, alpha)
+        return new, wanted + (alpha * others)[..., None] * pull + following
 
-    @property
-    def weights(self) -> FloatArray:
-        """W as it is now, (n, m + n, N_h)."""
-        network = self.network
-        return np.asarray(self._jacobian.T @ self._C).reshape(network.n, network.m + network.n, -1)
+    def _projected(self, state: CorrectionState, pinv: FloatArray, xi: FloatArray) -> FloatArray:
+        """Return C with the last update, on the row space of the present Ĵ, and the present ξ ⊗ h below it."""
+        kept = (1.0 - self.leak) * transposed(state.jacobian @ pinv)
+        C = np.empty_like(state.C)
+        both = np.concatenate([kept, np.matvec(kept, state.update)[..., None]], axis=-1)
+        np.matmul(both, state.C, out=C[..., :-1, :])
+        C[..., -1, :] = outer(xi, self.network.features(xi)).reshape(*xi.shape[:-1], -1)
+        return C
 
-    def diagnostics(self) -> Diagnostics:
+    def weights(self, state: CorrectionState) -> FloatArray:
+        """Return W after the last update, (..., n, m + n, N_h)."""
+        C = state.C[..., :-1, :] + outer(state.update, state.C[..., -1, :])
+        n, m = self.network.n, self.network.m
+        return (transposed(state.jacobian) @ C).reshape(*C.shape[:-2], n, m + n, -1)
+
+    def diagnostics(self, state: CorrectionState) -> Diagnostics:
         """Return criterion I_c (m²), step size α, predicted error ‖e(k+1)‖ (m) and norm of the weights."""
         return {
-            "criterion": 0.5 * float(self._predicted.dot(self._predicted)),
-            "step_size": self.step_size,
-            "predicted_error": float(np.linalg.norm(self._predicted)),
-            "learned_weight_norm": float(np.linalg.norm(self.weights)),
+            "criterion": 0.5 * np.vecdot(state.predicted, state.predicted),
+            "step_size": state.step_size,
+            "predicted_error": norm(state.predicted),
+            "learned_weight_norm": np.sqrt(sum_of_squares(self.weights(state), 3)),
         }

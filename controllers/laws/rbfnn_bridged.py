@@ -13,7 +13,7 @@ model that its networks were trained on. What exceeds the limits of joint speed 
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Literal, final
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 from annotated_types import Lt
@@ -24,12 +24,13 @@ from servobench.controllers.laws.inverses import damped_inverse
 from servobench.controllers.laws.law import Law, Stage
 from servobench.controllers.laws.learned_correction import LearnedCorrection
 from servobench.controllers.laws.limit import largest_excess, redistribute, scale_to_limit
-from servobench.controllers.laws.prediction import Predictor, shifted
+from servobench.controllers.laws.prediction import Predictor, PredictorState, shifted
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork
 from servobench.controllers.rotation import nearest_rotation
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import transposed
 from servobench.plant.settings import Count, NonNegative, Positive, Share, settings
 from servobench.plant.signals import Observation
 
@@ -81,13 +82,27 @@ class RbfnnBridgedConfig:
             raise ValueError("k must be above 0 for base 'network', got 0")
 
 
+class BridgedState(NamedTuple):
+    """The state of the law.
+
+    Attributes:
+        learned: of `LearnedCorrection` or of `RbfnnLaw`.
+        predictor: of the predict stage.
+        wanted: (..., n), rad, the joint step of the last command before it was limited.
+    """
+
+    learned: Any
+    predictor: PredictorState
+    wanted: FloatArray
+
+
 @final
-class RbfnnBridgedLaw(Law):
+class RbfnnBridgedLaw(Law[BridgedState]):
     """u = dq / dt with dq as above, limited such that the feature's direction stays.
 
-    Symbols: e error (m,) m; q joint position (n,) rad; Ĵ (m, n) m/rad; z, ŷ feature (m,) m; d delay of the camera,
-    periods, from the estimate; lead, periods, a fraction: between two instants the reference is interpolated,
-    beyond the preview it goes on as in its last period.
+    Symbols: e error (..., m) m; q joint position (..., n) rad; Ĵ (..., m, n) m/rad; z, ŷ feature (..., m) m;
+    d delay of the camera, periods, from the estimate; lead, periods, a fraction: between two instants the reference is
+    interpolated, beyond the preview it goes on as in its last period.
     """
 
     owns: ClassVar[frozenset[Stage]] = frozenset({"predict", "posture", "limit"})
@@ -106,7 +121,7 @@ class RbfnnBridgedLaw(Law):
         if config.feedforward and knowledge.preview < 1:
             raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
         self._config, self._period = config, spec.period
-        self._n, self._m = spec.n, spec.m
+        self._m = spec.m
         self._limit: FloatArray = spec.joint_velocity_limit * spec.period
         self._model = networks.jacobian
         centres = networks.jacobian.centres
@@ -118,7 +133,6 @@ class RbfnnBridgedLaw(Law):
             self._law = self._correction(network, centres.mean(axis=(0, 1)))
         self._rows = 1 + knowledge.preview if config.base == "network" else 1 + int(config.feedforward)
         self._predictor = Predictor(
-            spec.n,
             bridge=config.bridge,
             response_length=config.response_length,
             observe=config.observe,
@@ -126,7 +140,6 @@ class RbfnnBridgedLaw(Law):
             find_noise=config.find_noise,
             model_error=config.model_error,
         )
-        self._wanted = np.zeros(self._n)
 
     def _correction(self, network: ControllerNetwork, posture: FloatArray) -> LearnedCorrection:
         config = self._config
@@ -142,55 +155,58 @@ class RbfnnBridgedLaw(Law):
             damping=config.damping,
         )
 
-    def reset(self, observation: Observation) -> None:
-        """Forget everything that was learned and seen."""
-        self._law.reset(observation)
-        self._predictor.reset()
-        self._wanted = np.zeros(self._n)
+    def start(self, observation: Observation) -> BridgedState:
+        """Return the state of one that has learned and seen nothing."""
+        zero = np.zeros_like(observation.joint_position)
+        return BridgedState(self._law.start(observation), self._predictor.start(observation), zero)
 
-    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return u, (n,), rad/s; see `Law.command`.
+    def command(
+        self, state: BridgedState, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[BridgedState, FloatArray]:
+        """Return the new state and u, (..., n), rad/s; see `Law.command`.
 
         Raises:
             ValueError: a delay beyond what the law keeps of the past.
         """
         config, J = self._config, estimate.jacobian
-        bound = self._predictor.predict(estimate, observation)
-        ahead = shifted(reference, bound.lead, self._rows)
-        wanted = self._wanted = self._wanted_step(J, bound.feature, bound.joint_position, ahead, observation)
+        predictor, bound = self._predictor.predict(state.predictor, estimate, observation)
+        q, later = bound.joint_position, shifted(reference, bound.lead, self._rows)
+        learned, wanted = self._wanted_step(state, J, observation.seen_as(q, bound.feature), later)
         if config.redistribute:
             lower, upper = self._region
-            further = np.maximum(bound.joint_position - lower, 0.0), np.maximum(upper - bound.joint_position, 0.0)
+            further = np.maximum(q - lower, 0.0), np.maximum(upper - q, 0.0)
             dq = redistribute(wanted, J, self._limit, config.damping, further)
         else:
             dq = scale_to_limit(wanted, self._limit)
-        self._predictor.note(dq)
-        return dq / self._period
+        return BridgedState(learned, self._predictor.note(predictor, dq), wanted), dq / self._period
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, state: BridgedState) -> Diagnostics:
         """Return criterion, α, predicted error, norm of what was learned, lead (periods), saturation."""
-        learned = self._law.diagnostics()
-        saturated = float(largest_excess(self._wanted, self._limit) > 1.0)
-        return {**{name: learned[name] for name in LEARNED}, "lead": self._predictor.lead, "saturated": saturated}
+        learned = self._law.diagnostics(state.learned)
+        saturated = largest_excess(state.wanted, self._limit) > 1.0
+        lead = state.predictor.response.lead
+        return {**{name: learned[name] for name in LEARNED}, "lead": lead, "saturated": saturated}
 
     def _wanted_step(
-        self, jacobian: FloatArray, y: FloatArray, q: FloatArray, reference: FloatArray, observation: Observation
-    ) -> FloatArray:
-        """Return the joint step before it is limited, (n,), rad, for predicted feature and joints."""
-        config, law, forward = self._config, self._law, np.zeros(self._m)
-        if config.feedforward:
-            forward = reference[1] - reference[0]
+        self, state: BridgedState, jacobian: FloatArray, ahead: Observation, reference: FloatArray
+    ) -> tuple[Any, FloatArray]:
+        """Return the new state of the inner law and the joint step before it is limited, (..., n), rad."""
+        config, law, y, q = self._config, self._law, ahead.feature, ahead.joint_position
+        forward = reference[..., 1, :] - reference[..., 0, :] if config.feedforward else np.zeros_like(y)
         if isinstance(law, LearnedCorrection):
-            return law.step(jacobian, reference[0] - y, q, forward, observation.feature_valid)
+            return law.step(state.learned, jacobian, reference[..., 0, :] - y, q, forward, ahead.feature_valid)
         if config.feedforward:
-            reference = np.repeat(reference[:1], len(reference), axis=0)
+            reference = np.repeat(reference[..., :1, :], reference.shape[-2], axis=-2)
         F = self._frame(jacobian, q)
-        predicted = Observation(observation.time, q, F @ y, observation.feature_valid)
-        law.command(Estimate(F @ jacobian), predicted, reference @ F.T)
-        return np.asarray(law.wanted + damped_inverse(jacobian, config.damping) @ forward)
+        turned = ahead.seen_as(q, np.matvec(F, y))
+        learned, _ = law.command(state.learned, Estimate(F @ jacobian), turned, reference @ transposed(F))
+        return learned, learned.wanted + np.matvec(damped_inverse(jacobian, config.damping), forward)
 
     def _frame(self, jacobian: FloatArray, q: FloatArray) -> FloatArray:
-        """Return the rotation from the camera's frame into that of the model, (m, m): the nearest of Ĵ to the model."""
+        """Return the rotation from the camera's frame into that of the model, (..., m, m): nearest of Ĵ to the model.
+
+        Without `frame` it is the identity.
+        """
         if not self._config.frame:
             return np.eye(self._m)
-        return nearest_rotation(self._model.jacobian(q) @ jacobian.T)
+        return nearest_rotation(self._model.jacobian(q) @ transposed(jacobian))

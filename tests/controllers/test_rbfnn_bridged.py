@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kit.toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, A, M, N, ToyArm, networks, plant_spec, seen
+from kit.toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, A, Commanding, M, N, ToyArm, networks, plant_spec, seen
 from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
@@ -15,15 +15,14 @@ from servobench.controllers.laws.learned_correction import LearnedCorrection
 from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, update_step
 from servobench.controllers.networks.rbf import ControllerNetwork
-from servobench.controllers.servo import ServoController
+from servobench.controllers.servo import Servo, ServoController
 
 TURN = Rotation.from_rotvec(np.radians(100.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
 
 
-def law(**config):
+def law(first=None, **config):
     made = RbfnnBridgedLaw(RbfnnBridgedConfig(**config), KNOWLEDGE, networks())
-    made.reset(seen(np.zeros(N), np.zeros(M)))
-    return made
+    return Commanding(made, seen(np.zeros(N), np.zeros(M)) if first is None else first)
 
 
 def still(target):
@@ -32,13 +31,14 @@ def still(target):
 
 def test_the_first_step_by_hand():
     """dq = γ J⁺ e + J⁺ r + κ (I − J⁺J)(q_c − q): nothing is in flight, nothing learned with k = 0; q_c = 0."""
-    made = law(k=0.0, damping=1e-9)
     q, e, r = np.full(N, 0.1), np.array([0.01, -0.02, 0.005]), np.array([0.001, 0.0, 0.002])
     reference = still(e) + np.arange(1 + PREVIEW)[:, None] * r
     pinv = np.linalg.pinv(A)
     posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (np.zeros(N) - q)
     expected = (1.0 - np.exp(-14.0 * PERIOD)) * pinv @ e + pinv @ r + posture
-    np.testing.assert_allclose(made.command(Estimate(A), seen(q, np.zeros(M)), reference), expected / PERIOD, atol=1e-7)
+    first = seen(q, np.zeros(M))
+    u = law(first, k=0.0, damping=1e-9).command(Estimate(A), first, reference)
+    np.testing.assert_allclose(u, expected / PERIOD, atol=1e-7)
 
 
 def test_a_delay_beyond_what_is_kept_of_the_past_is_refused():
@@ -65,19 +65,34 @@ def gains(**changes):
     return {**settings, "damping": 1e-9, **changes}
 
 
-def correction(**changes):
-    return LearnedCorrection(networks().controller, np.zeros(N), np.full(N, 10.0), **gains(**changes))
+class Correcting:
+    """A learned correction with its state."""
 
+    def __init__(self, **changes):
+        self.law = LearnedCorrection(networks().controller, np.zeros(N), np.full(N, 10.0), **gains(**changes))
+        self.state = self.law.start(seen(np.zeros(N), np.zeros(M)))
 
-def learned_before(made, rng, scale):
-    """Give the correction weights as if it had learned at another Jacobian, and return them."""
-    made._jacobian, made._C = rng.normal(size=(M, N)), scale * rng.normal(size=made._C.shape)
-    return made.weights
+    def step(self, *arguments, learn):
+        self.state, dq = self.law.step(self.state, *arguments, learn)
+        return dq
+
+    def diagnostics(self):
+        return self.law.diagnostics(self.state)
+
+    @property
+    def weights(self):
+        return self.law.weights(self.state)
+
+    def learned_before(self, rng, scale):
+        """Take weights as if they had been learned at another Jacobian, and return them."""
+        J, C, update = rng.normal(size=(M, N)), rng.normal(size=self.state.C.shape), rng.normal(size=M)
+        self.state = self.state._replace(jacobian=J, C=scale * C, update=scale * update)
+        return self.weights
 
 
 def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself():
     """The paper's oracle (T = 1, ε = 0, no limit) holds with Ĵ⁺ in the place of the offline network."""
-    made, e, q = correction(), np.array([0.2, -0.1, 0.3]), np.full(N, 0.2)
+    made, e, q = Correcting(), np.array([0.2, -0.1, 0.3]), np.full(N, 0.2)
     dq = made.step(A, e, q, np.zeros(M), learn=True)
     predicted = 0.6 * e  # by the law without what is learned
     assert made.diagnostics()["predicted_error"] == pytest.approx(np.linalg.norm(predicted), rel=1e-9)
@@ -86,8 +101,8 @@ def test_one_update_lowers_the_predicted_error_by_1_minus_k_along_itself():
 
 def test_the_update_is_that_of_the_paper_with_a_horizon_of_one():
     """Eqs. 18, 19 and 23 by the functions of `rbfnn`, for the loop with all three terms."""
-    made, rng = correction(epsilon=1e-3), np.random.default_rng(1)
-    before = learned_before(made, rng, 0.1)
+    made, rng = Correcting(epsilon=1e-3), np.random.default_rng(1)
+    before = made.learned_before(rng, 0.1)
     e, q = np.array([0.2, -0.1, 0.3]), rng.normal(scale=0.3, size=N)
     dq = made.step(A, e, q, np.zeros(M), learn=True)
     projected = np.einsum("ij,jpl->ipl", np.linalg.pinv(A) @ A, before)
@@ -103,9 +118,9 @@ def test_the_update_is_that_of_the_paper_with_a_horizon_of_one():
 
 
 def test_what_was_learned_leaks_and_stays_out_of_the_null_space():
-    made = correction(leak=0.5, k=1e-12)
+    made = Correcting(leak=0.5, k=1e-12)
     rng = np.random.default_rng(0)
-    before = learned_before(made, rng, 1.0)
+    before = made.learned_before(rng, 1.0)
     made.step(A, np.zeros(M), np.zeros(N), np.zeros(M), learn=False)
     np.testing.assert_allclose(
         np.einsum("mn,npl->mpl", A, made.weights), 0.5 * np.einsum("mn,npl->mpl", A, before), atol=1e-7
@@ -115,7 +130,7 @@ def test_what_was_learned_leaks_and_stays_out_of_the_null_space():
 
 
 def test_nothing_is_learned_from_an_invalid_feature_or_at_the_limit():
-    made = correction()
+    made = Correcting()
     made.step(A, np.full(M, 0.1), np.zeros(N), np.zeros(M), learn=False)
     assert not made.weights.any()
     made.step(A, np.full(M, 100.0), np.zeros(N), np.zeros(M), learn=True)
@@ -126,7 +141,7 @@ def test_nothing_is_learned_from_an_invalid_feature_or_at_the_limit():
 
 def test_what_is_learned_stays_within_the_bound_of_the_leak():
     """‖W‖ ≤ k E_max / (2 l √ε), whatever the errors and Jacobians are."""
-    made, rng, largest = correction(epsilon=1e-3, leak=0.02, k=0.5), np.random.default_rng(8), 0.0
+    made, rng, largest = Correcting(epsilon=1e-3, leak=0.02, k=0.5), np.random.default_rng(8), 0.0
     for _ in range(300):
         J = rng.normal(size=(M, N))
         made.step(J, rng.normal(scale=0.3, size=M), rng.normal(size=N), np.zeros(M), learn=True)
@@ -139,7 +154,7 @@ def controller(estimator=None, **config):
     parts = networks()
     made = RbfnnBridgedLaw(RbfnnBridgedConfig(**config), KNOWLEDGE, parts)
     aligned = RbfAlignedEstimator(RbfAlignedConfig() if estimator is None else estimator, KNOWLEDGE, parts)
-    return ServoController(aligned, made, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE)
+    return ServoController(Servo(aligned, made, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE))
 
 
 def closed_loop(servo, arm, target, steps):
@@ -168,7 +183,7 @@ def test_the_error_of_what_the_arm_is_bound_for_contracts_as_promised():
     for k, (J, e, dq, after) in enumerate(closed_loop(servo, arm, target, 60)):
         if k < 12 or np.linalg.norm(e) < 1e-6:
             continue
-        assert servo.estimator.estimate(arm.q).delay == 2
+        assert servo.servo.estimator.estimate(servo.state.estimator, arm.q).delay == 2
         delta = np.linalg.norm(np.eye(M) - TURN @ A @ damped_inverse(J, 1e-6), 2)
         f = min(1.0, float(np.linalg.norm(J @ dq) / (gamma * np.linalg.norm(e))))
         limited += f < 0.99
@@ -219,8 +234,9 @@ def test_a_moving_reference_is_followed_with_a_tenth_of_a_period_of_lag():
 def test_the_law_of_the_paper_runs_in_the_frame_of_its_model():
     """base 'network': turning the camera changes nothing in the joint steps once the Jacobian is known."""
     e, q = np.array([0.02, -0.01, 0.03]), np.full(N, 0.1)
+    first = seen(q, np.zeros(M))
     steps = [
-        law(base="network", horizon=8, frame=frame).command(Estimate(turn @ A), seen(q, np.zeros(M)), still(turn @ e))
+        law(first, base="network", horizon=8, frame=frame).command(Estimate(turn @ A), first, still(turn @ e))
         for turn, frame in ((np.eye(M), True), (TURN, True), (TURN, False))
     ]
     np.testing.assert_allclose(steps[1], steps[0], atol=1e-9)

@@ -1,0 +1,74 @@
+"""Test of all laws over leading axes: a lane has the same bits alone and among others, in any order."""
+
+import numpy as np
+import pytest
+
+from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, M, N, networks
+from servobench.controllers.estimate import Estimate
+from servobench.controllers.parts import LAWS
+from servobench.plant.signals import trusted_observation
+
+LANES, PERIODS = 3, 60
+SETTINGS = [
+    ("pid", {"integral_gain": 0.5, "derivative_gain": 0.1, "feedforward": True}),
+    ("pid", {"damping": 0.0}),
+    ("mfac", {"feedforward": True}),
+    ("mpc", {}),
+    ("rbfnn", {}),
+    ("rbfnn", {"row_space_only": False, "position": "commanded", "anti_windup": False, "preview": False}),
+    ("rbfnn_bridged", {}),
+    ("rbfnn_bridged", {"base": "network", "find_noise": False, "redistribute": False}),
+    ("rbfnn_bridged", {"bridge": False, "observe": False, "k": 0.0}),
+]
+
+
+def closed_loop(law, lanes):
+    """Run y(k) = A_lane q(k − delay) with lost frames; return commands, diagnostics and where frames were valid."""
+    rng = np.random.default_rng(3)
+    turned = A + 0.1 * rng.normal(size=(LANES, M, N))
+    J = turned + 0.03 * rng.normal(size=(PERIODS, LANES, M, N))
+    noise, valid = 0.002 * rng.normal(size=(PERIODS, LANES, M)), rng.random((PERIODS, LANES)) < 0.8
+    phase = 0.1 * np.arange(PERIODS + PREVIEW + 1)[:, None] + np.arange(LANES)
+    reference = np.stack([0.3 * np.sin(phase), 0.2 * np.cos(phase), 0.1 * phase], axis=-1)
+    for lane in range(LANES):
+        reference[20 + 9 * lane :, lane] += 0.3  # a step that no joint can follow at once, in each lane at another time
+    delay, q = np.array([0, 3, 1])[lanes], np.zeros((*np.shape(lanes), N))
+    past, seen, found = [q] * 4, np.zeros((*np.shape(lanes), M)), []
+    for k in range(PERIODS):
+        late = np.stack(past[-4:])[::-1]
+        exposed = np.take_along_axis(late, np.asarray(delay)[None, ..., None], axis=0)[0]
+        now = np.matvec(turned[lanes], exposed) + noise[k, lanes]
+        seen = np.where(valid[k, lanes][..., None], now, seen)
+        look = trusted_observation(k * PERIOD, q, seen, valid[k, lanes], np.repeat(valid[k, lanes][..., None], M, -1))
+        if k == 0:
+            state = law.start(look)
+        ahead = np.moveaxis(reference[k : k + PREVIEW + 1, lanes], 0, -2)
+        state, u = law.command(state, Estimate(J[k, lanes], delay), look, np.ascontiguousarray(ahead))
+        found.append((u, dict(law.diagnostics(state))))
+        q = q + 0.9 * u * PERIOD
+        past.append(q)
+    return found, valid
+
+
+@pytest.mark.parametrize(("name", "changes"), SETTINGS)
+def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes):
+    part = LAWS[name]
+    law = part.make(part.config(**changes), KNOWLEDGE, *([networks()] if part.trained else []))
+    order = np.array([2, 0, 1])
+    (together, valid), (permuted, _) = closed_loop(law, np.arange(LANES)), closed_loop(law, order)
+    for lane in range(LANES):
+        alone, _ = closed_loop(law, lane)
+        for (u, numbers), (u_among, among), (u_permuted, _) in zip(alone, together, permuted, strict=True):
+            np.testing.assert_array_equal(u, u_among[lane])
+            np.testing.assert_array_equal(u, u_permuted[order == lane][0])
+            for key, value in numbers.items():
+                np.testing.assert_array_equal(value, among[key][lane], err_msg=key)
+    saturated = np.array([numbers["saturated"] for _, numbers in together if "saturated" in numbers])
+    for differs in (saturated.T, valid.T) if saturated.size else (valid.T,):
+        assert differs.any()
+        assert not differs.all()
+        assert (differs.any(axis=0) & ~differs.all(axis=0)).any()  # in one period in some lanes only
+
+
+def test_all_laws_are_in_the_table():
+    assert {name for name, _ in SETTINGS} == set(LAWS)
