@@ -5,7 +5,7 @@
 
 Every checkout carries out the same sweep in turn, in an environment of its own where it has one in `.venv`, so that
 other load on the machine falls on all. A sweep of `--few` robots is subtracted from one of `--robots`: what is left is
-the cost of a run, its building, judging and writing included. Version 0.1.0, whose packages have other names, works too.
+the cost of a run, its building, judging and writing included. Version 0.1.0 works, too.
 """
 
 from __future__ import annotations
