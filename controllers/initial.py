@@ -217,7 +217,7 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             raise ControllerDiverged(
                 f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
-        return np.asarray(transposed(np.linalg.solve(Q, Y)))
+        return np.ascontiguousarray(transposed(np.linalg.solve(Q, Y)))
 
 
 def _entry(rows: FloatArray, index: IntArray) -> FloatArray:

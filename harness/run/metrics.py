@@ -91,7 +91,7 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, F
     )
     # Column after column: the order of a sum decides its last bits, and stored tables are compared bit for bit.
     feature, reference, command = map(_columns, (steps.true_feature, steps.reference, steps.command))
-    evaluated = error[..., steps.time >= evaluate_from - 1e-9]
+    evaluated = error[..., np.searchsorted(steps.time, evaluate_from - 1e-9) :]
     final = error[..., -max(1, round(FINAL_SPAN / spec.period)) :]
     way = norm(reference[..., 0] - feature[..., 0]) if fixed else path_length(reference)
     effort = np.abs(command)
