@@ -12,6 +12,7 @@ from kit.documents import ROOT
 EXAMPLES = {
     "own_controller": r"ResolvedRate +\d.*\n.*constant.*\n.*ukf_mfac",
     "fmu_in_fmpy": r"nominal: ball at \[.*\n.*off by 3°: ball at",
+    "what_if": r" 2\.0 +0 +\d\.\d +\d\.\d\n(.*\n)* +10\.0 +90 +4\d\d\.\d",
     "sweep_in_pandas": r"completed +18\n(.*\n)*.*constant +ukf_mfac\n",
 }
 
