@@ -1,4 +1,6 @@
-"""Tests of the composed controller: what it tells its parts, what it refuses, what it forgets."""
+"""Tests of the composed controller: what it hands to its parts, what it refuses, what each lane does."""
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,44 +15,46 @@ from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.prediction import Prediction, Predictor
-from servobench.controllers.servo import ServoController
+from servobench.controllers.servo import Servo, ServoController
 from servobench.plant.faults import ControllerDiverged
 
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
 KNOWLEDGE = RobotKnowledge(plant_spec(3, 2, reach=1.0), 1, nominal_jacobian=lambda q: J0)
 
 
+class Recorded(NamedTuple):
+    J: np.ndarray
+
+
 class Recorder(Estimator):
     def __init__(self):
         self.motions = []
 
-    def reset(self, jacobian):
-        self.J = jacobian
+    def start(self, jacobian):
+        return Recorded(jacobian)
 
-    def update(self, motion):
+    def update(self, state, motion):
         self.motions.append(motion)
+        return state
 
-    def jacobian(self, joint_position):
-        return self.J.copy()
-
-    def diagnostics(self):
-        return {"motions": float(len(self.motions))}
+    def diagnostics(self, state):
+        return {"motions": len(self.motions)}
 
 
 class Broken(Law):
-    def reset(self, observation):
-        pass
+    def start(self, observation):
+        return ()
 
-    def command(self, estimate, observation, reference):
-        return np.array([0.0, np.nan, 0.0])
+    def command(self, state, estimate, observation, reference):
+        return state, np.array([0.0, np.nan, 0.0])
 
-    def diagnostics(self):
+    def diagnostics(self, state):
         return {}
 
 
 def servo(estimator, law=None, predictor=None):
     law = MfacLaw(MfacConfig(), KNOWLEDGE) if law is None else law
-    return ServoController(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE, predictor)
+    return ServoController(Servo(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE, predictor))
 
 
 def test_a_motion_spans_the_gap_that_lost_frames_leave():
@@ -89,7 +93,7 @@ def test_the_first_step_equals_the_law_at_the_first_jacobian():
     controller, law = servo(ConstantEstimator()), MfacLaw(MfacConfig(), KNOWLEDGE)
     first, reference = seen(np.zeros(3), [0.1, 0.0]), np.full((2, 2), 0.12)
     controller.reset(first, 0)
-    expected = law.command(Estimate(J0), first, reference)
+    _, expected = law.command(law.start(first), Estimate(J0), first, reference)
     np.testing.assert_array_equal(controller.step(first, reference).joint_velocity, expected)
     assert controller.diagnostics()["probing"] == 0.0
 
@@ -106,35 +110,33 @@ def test_an_estimate_that_is_not_finite_is_a_named_fault():
     controller = servo(estimator)
     controller.reset(first, 0)
     controller.step(first, np.zeros((2, 2)))
-    estimator.J = np.full((2, 3), np.nan)
+    controller.state = controller.state._replace(estimator=Recorded(np.full((2, 3), np.nan)))
     with pytest.raises(ControllerDiverged, match="jacobian is not finite at 0 s"):
         controller.step(first, np.zeros((2, 2)))
 
 
 def test_a_predictor_stands_before_the_law_and_gets_the_command():
-    calls = []
-
     class Doubling:
-        def reset(self):
-            calls.append("reset")
+        def start(self, observation):
+            return ()
 
-        def predict(self, estimate, observation):
-            return Prediction(2.0 * observation.feature, observation.joint_position, 1.0)
+        def predict(self, state, estimate, observation):
+            return state, Prediction(2.0 * observation.feature, observation.joint_position, np.array(1.0))
 
-        def note(self, joint_step):
-            calls.append(joint_step)
+        def note(self, state, joint_step):
+            return (*state, joint_step)
 
     controller, law = servo(ConstantEstimator(), predictor=Doubling()), MfacLaw(MfacConfig(), KNOWLEDGE)
     first = seen(np.zeros(3), [0.1, 0.0])
     controller.reset(first, 0)
     u = controller.step(first, np.array([[0.0, 0.0], [0.3, 0.2]])).joint_velocity
     doubled = seen(np.zeros(3), [0.2, 0.0])
-    np.testing.assert_array_equal(u, law.command(Estimate(J0), doubled, np.array([[0.3, 0.2], [0.6, 0.4]])))
-    assert calls[0] == "reset"
-    np.testing.assert_array_equal(calls[1], u * 0.05)
+    shifted = np.array([[0.3, 0.2], [0.6, 0.4]])
+    np.testing.assert_array_equal(u, law.command(law.start(first), Estimate(J0), doubled, shifted)[1])
+    np.testing.assert_array_equal(controller.state.predictor, [u * 0.05])
 
 
 def test_a_second_predict_stage_is_refused():
     law = MpcLaw(MpcConfig(use_preview=False), KNOWLEDGE)
     with pytest.raises(ValueError, match="predictor must be None for MpcLaw, which predicts itself"):
-        servo(ConstantEstimator(), law, Predictor(3))
+        servo(ConstantEstimator(), law, Predictor())

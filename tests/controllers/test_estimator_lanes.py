@@ -1,0 +1,99 @@
+"""Test of all estimators over leading axes: a lane has the same bits alone and among others, in any order."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kit.toy import KNOWLEDGE, PERIOD, M, N, jacobian_network, only_jacobian
+from servobench.controllers.estimators.estimator import Motion
+from servobench.controllers.initial import InitialConfig, initial_jacobian
+from servobench.controllers.parts import ESTIMATORS
+from servobench.plant.lanes import branch
+from servobench.plant.signals import trusted_observation
+
+LANES, PERIODS = 3, 70
+NETWORK = jacobian_network(N, M, units=5)
+KNOWING = dataclasses.replace(KNOWLEDGE, true_jacobian=NETWORK.jacobian)
+SETTINGS = [
+    *((name, {}) for name in ESTIMATORS),
+    ("kalman", {"form": "full"}),
+    ("ukf", {"form": "sigma_points"}),
+    ("rbf", {"window": 1}),
+    ("rbf_aligned", {"window": 3, "rotation_deviation": 0.0, "forgetting": 0.9, "margin": 0.0}),
+    ("rbf_aligned", {"align": False, "find_delay": False, "detect_moves": False, "find_noise": False}),
+]
+
+
+def seen():
+    """Return joint positions, features and where they are valid, each with axes of periods and lanes.
+
+    One lane rests for a while, one loses 20 frames at a stretch, one sees a camera that is moved.
+    """
+    rng, t = np.random.default_rng(5), np.arange(PERIODS)[:, None, None]
+    steps = 0.05 * np.sin(2 * np.pi * t / rng.uniform(10.0, 30.0, (LANES, N)) + rng.uniform(0.0, 6.0, (LANES, N)))
+    steps[10:16, 0] = 0.0
+    q = np.cumsum(steps, axis=0)
+    turns = np.stack([np.eye(M), -np.eye(M), np.eye(M)[[1, 2, 0]]])
+    moved = np.concatenate([np.zeros((1, LANES, M)), np.matvec(turns @ NETWORK.jacobian(q[:-1]), np.diff(q, axis=0))])
+    y = np.cumsum(moved, axis=0) + 0.001 * rng.normal(size=moved.shape)
+    y[40:, 2] += 3.0
+    valid = rng.random((PERIODS, LANES)) < 0.85
+    valid[20:40, 1] = False
+    valid[0] = True
+    return q, y, valid
+
+
+def learned(estimator, lanes):
+    """Return Ĵ, delay, noise level and diagnostics of every period."""
+    q, y, valid = (each[:, lanes] for each in seen())
+    state = estimator.start(NETWORK.jacobian(q[0]))
+    last, found = (q[0], y[0], np.zeros(np.shape(valid[0]))), []
+    for k in range(1, PERIODS):
+        motion = Motion(last[0], q[k] - last[0], y[k] - last[1], 0.1 - y[k], (k - last[2]) * PERIOD)
+        state = branch(valid[k], estimator.update, state, motion)
+        last = branch(valid[k], lambda _, now: now, last, (q[k], y[k], np.full(np.shape(valid[k]), float(k))))
+        estimate = estimator.estimate(state, q[k])
+        late = np.broadcast_to(estimate.delay, np.shape(valid[k]))
+        numbers = dict(estimator.diagnostics(state)) | {"J": estimate.jacobian, "late": late}
+        found.append(numbers | ({} if estimate.noise is None else {"noise": estimate.noise}))
+    return found
+
+
+@pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
+def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes):
+    part, order = ESTIMATORS[name], np.array([2, 0, 1])
+    estimator = part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+    together, permuted = learned(estimator, np.arange(LANES)), learned(estimator, order)
+    for lane in range(LANES):
+        for alone, among, other in zip(learned(estimator, lane), together, permuted, strict=True):
+            for key, value in alone.items():
+                np.testing.assert_array_equal(value, among[key][lane], err_msg=key)
+                np.testing.assert_array_equal(value, other[key][order.tolist().index(lane)], err_msg=key)
+
+
+def test_probing_has_the_same_bits_alone_and_among_others():
+    provider = initial_jacobian(InitialConfig("probe", settle_periods=2, average_periods=2), KNOWLEDGE)
+    rng = np.random.default_rng(1)
+    valid, noise = rng.random((250, LANES)) < 0.7, 0.001 * rng.normal(size=(250, LANES, M))
+
+    def probed(lanes):
+        q, velocities, state = np.zeros((*np.shape(lanes), N)), [], None
+        for k in range(250):
+            y = np.matvec(NETWORK.jacobian(np.zeros(N)), q) + noise[k, lanes]
+            look = trusted_observation(k * PERIOD, q, y, valid[k, lanes], np.repeat(valid[k, lanes][..., None], M, -1))
+            state, u, done = provider.step(provider.start(look) if state is None else state, look)
+            q = q + u * PERIOD
+            velocities.append((u, done))
+        return velocities, provider.jacobian(state)
+
+    (together, J), finished = probed(np.arange(LANES)), set()
+    for lane in range(LANES):
+        alone, J_alone = probed(lane)
+        np.testing.assert_array_equal(J_alone, J[lane])
+        for (u, done), (u_among, done_among) in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(u, u_among[lane])
+            assert done == done_among[lane]
+        finished.add(sum(not done for _, done in alone))
+    assert len(finished) > 1  # not all at the same time
+    assert max(finished) < 250
