@@ -13,7 +13,6 @@ from servobench.fmus.compile import CompilationFailed, CompilerMissing
 from servobench.fmus.export import ExportOptions, export_fmu, fingerprint
 from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.bench import Bench, SensingConfig
-from servobench.plant.checks import as_vector
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
@@ -57,9 +56,8 @@ def cached_fmu(fmi_version: int) -> Path:
 
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
-    """Return the mapping of the exported UR5, with the true model of `setup` as its parameters."""
+    """Return the mapping of the exported UR5, with the true model of `setup` as its parameters, (..., size)."""
     model, start = setup.robot()
-    start = as_vector("start", start, model.arm.n)
     actuation = Actuation(config.lag, config.max_joint_speed, config.joint_range, start)
     parameters = parameters_of(model, actuation)
     del parameters["home"]
@@ -96,4 +94,5 @@ ENTRY = PlantEntry(
     summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
     config=Ur5FmuConfig,
     build=build_ur5,
+    side_by_side=True,
 )

@@ -16,7 +16,7 @@ from math import prod
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel
 
@@ -127,7 +127,7 @@ class Actuation:
         lag: time constants of the velocity loops [s].
         max_speed: limit of the joint speeds [rad/s].
         joint_range: distance of the stops from zero [rad].
-        home: (n,) reported joint positions at the start [rad].
+        home: (..., n) reported joint positions at the start [rad].
     """
 
     lag: float
@@ -137,25 +137,25 @@ class Actuation:
 
 
 def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:
-    """Return the FMU's parameters for `model` and `actuation` as flat arrays by group."""
+    """Return the FMU's parameters for `model` and `actuation` by group, (..., size)."""
     arm, n = model.arm, model.arm.n
     columns = {"a": 0, "y": 1, "d": 2}
     angles = {"alpha": 0, "pitch": 1, "yaw": 2}
     return {
-        "base_position": arm.translation[0],
-        "base_rpy": arm.rpy[0],
-        **{name: arm.translation[1:, column] for name, column in columns.items()},
-        **{name: arm.rpy[1:, column] for name, column in angles.items()},
+        "base_position": arm.translation[..., 0, :],
+        "base_rpy": arm.rpy[..., 0, :],
+        **{name: arm.translation[..., 1:, column] for name, column in columns.items()},
+        **{name: arm.rpy[..., 1:, column] for name, column in angles.items()},
         "joint_offset": arm.joint_offset,
         "gear_ratio": arm.gear_ratio,
         "tool": arm.tool,
-        "camera_position": model.X_BC[:3, 3],
-        "camera_rpy": rpy_from_rotation(model.X_BC[:3, :3]),
+        "camera_position": model.X_BC[..., :3, 3],
+        "camera_rpy": rpy_from_rotation(model.X_BC[..., :3, :3]),
         "lag": np.full(n, actuation.lag),
         "max_speed": np.full(n, actuation.max_speed),
         "joint_lower": np.full(n, -actuation.joint_range),
         "joint_upper": np.full(n, actuation.joint_range),
-        "home": as_vector("home", actuation.home, n),
+        "home": as_array("home", actuation.home, (*model.lead, n)),
     }
 
 

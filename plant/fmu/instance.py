@@ -35,31 +35,35 @@ STATUS_LEVELS = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR,
 
 
 class Port:
-    """Variables that are read or written together, with their buffer.
+    """Variables that are read or written together, with their buffer; instances side by side have a row each.
 
     Attributes:
-        labels: a name for each number, for messages.
-        values: (size,), the buffer.
+        values: (..., size), the buffer.
         variables: value references and their number, for C.
     """
 
-    def __init__(self, variables: Sequence[Variable]) -> None:
-        """Prepare the buffer."""
-        self.labels = tuple(label for variable in variables for label in variable.labels())
-        self.values: FloatArray = np.zeros(total_size(variables))
+    def __init__(self, variables: Sequence[Variable], lead: tuple[int, ...] = ()) -> None:
+        """Prepare the buffer, whose leading axis is `lead`."""
+        self._variables = variables
+        self.values: FloatArray = np.zeros((*lead, total_size(variables)))
+        self._address = self.values.ctypes.data
         count = len(variables)
         references = (ctypes.c_uint32 * count)(*(variable.reference for variable in variables))
         self.variables = references, ctypes.c_size_t(count)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each number of a row, for messages."""
+        return tuple(label for variable in self._variables for label in variable.labels())
 
     @property
     def summary(self) -> str:
         """A few names, for messages."""
         return ", ".join(self.labels[:3]) + (", …" if len(self.labels) > 3 else "")
 
-    @property
-    def pointer(self) -> Any:  # noqa: ANN401 - a ctypes pointer
-        """The buffer, for C."""
-        return self.values.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+    def pointer(self, row: int = 0) -> ctypes.c_void_p:
+        """Return a row of the buffer, for C."""
+        return ctypes.c_void_p(self._address + row * self.values.shape[-1] * self.values.itemsize)
 
 
 class MessageLog:
@@ -107,8 +111,13 @@ class Instance(ABC):
     deserialise: ClassVar[str]
     early: ClassVar[str]
 
-    def __init__(self, description: FmuDescription, root: Path) -> None:
-        """Load the library and make an instance.
+    def __init__(self, description: FmuDescription, root: Path, library: Any = None) -> None:  # noqa: ANN401 - ctypes
+        """Make an instance.
+
+        Args:
+            description: of the FMU.
+            root: folder to which it is extracted.
+            library: from `load_library`, which the caller unloads; None: the instance loads one of its own.
 
         Raises:
             ValueError: no library for this machine, or one that cannot be loaded.
@@ -117,7 +126,8 @@ class Instance(ABC):
         self.description = description
         self.root = root
         self.log = MessageLog(description.path.name)
-        self._library = load_library(description, root)
+        self._owns_library = library is None
+        self._library = load_library(description, root) if library is None else library
         self._component = ctypes.c_void_p()
         try:
             self._component = ctypes.c_void_p(self._instantiate())
@@ -137,65 +147,77 @@ class Instance(ABC):
         """Go through initialisation, to begin at `time`."""
 
     @abstractmethod
-    def _taker(self, step: ctypes.c_double) -> Callable[[float], float | None]:
-        """Return a function that takes one step from a time, s, and returns where it ended if it ended early.
+    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """Return a function that takes a step of size `step`, s, at the time `now`, s, as both are at every call.
 
-        It reads the size of the step from `step` at every call.
+        It returns 0 where the step was taken without anything to report; any other result is for `finish`.
+        """
+
+    @abstractmethod
+    def _reached(self, status: int, time: float) -> float | None:
+        """Return where a step from `time`, s, ended if it ended early, by the result of its `step_call`.
+
+        Raises:
+            FmuError: it failed.
         """
 
     def stepper(self, step: float) -> Callable[[float], None]:
         """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
-        take = self._taker(ctypes.c_double(step))
+        now = ctypes.c_double()
+        call = self.step_call(now, ctypes.c_double(step))
 
         def advance(time: float) -> None:
-            reached = take(time)
-            if reached is not None:
-                self._resume(reached, time, step)
+            now.value = time
+            self.finish(call(), time, step)
 
         return advance
 
-    def _resume(self, reached: float | None, time: float, step: float) -> None:
-        """Resume a step that ended early, until the whole step is done.
+    def finish(self, status: int, time: float, step: float) -> None:
+        """Check a step by the result of its `step_call` and resume it until the whole step is done.
 
         Raises:
             FmuError: it failed, or made no progress.
         """
-        end, least, rest = time + step, MIN_PROGRESS * step, ctypes.c_double()
-        take = self._taker(rest)
+        if not status:
+            return
+        reached, end, least = self._reached(status, time), time + step, MIN_PROGRESS * step
+        now, rest = ctypes.c_double(), ctypes.c_double()
+        call = self.step_call(now, rest)
         while reached is not None:
             if not reached > time + least:
                 raise self.log.failure(f"{self.prefix}DoStep", f"{self.early} at {reached:.6g} s, no further")
             if reached > end - least:
                 return
-            time, rest.value = reached, end - reached
-            reached = take(time)
+            time = now.value = reached
+            rest.value = end - reached
+            reached = self._reached(call(), time)
 
     def reset(self) -> None:
         """Return to the state after instantiation."""
         self.call("Reset")
 
     @abstractmethod
-    def _buffer(self, port: Port) -> tuple[Any, ...]:
-        """Return the arguments that pass a port's buffer to C."""
+    def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
+        """Return the arguments that pass a row of a port's buffer to C."""
 
-    def access(self, verb: Literal["Get", "Set"], port: Port) -> RawCall:
-        """Return a function that reads or writes the port's variables by its buffer, for the inner loop."""
+    def access(self, verb: Literal["Get", "Set"], port: Port, row: int = 0) -> RawCall:
+        """Return a function that reads or writes the port's variables by a row of its buffer, for the inner loop."""
         function = self.function(f"{verb}{self.real}")
-        return partial(function, self._component, *port.variables, *self._buffer(port))
+        return partial(function, self._component, *port.variables, *self._buffer(port, row))
 
     def reader(self, port: Port) -> Call:
         """Return a function that reads the port's variables into its buffer and checks the status."""
         read = self.access("Get", port)
         return lambda: self.check(f"reading {port.summary}", read())
 
-    def writer(self, port: Port) -> Call:
-        """Return a function that writes the port's buffer into its variables and checks the status."""
-        write = self.access("Set", port)
+    def writer(self, port: Port, row: int = 0) -> Call:
+        """Return a function that writes a row of the port's buffer into its variables and checks the status."""
+        write = self.access("Set", port, row)
         return lambda: self.check(f"writing {port.summary}", write())
 
     def derivative(self, unknowns: Port, knowns: Port) -> None:
         """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
-        buffers = (*self._buffer(knowns), *self._buffer(unknowns))
+        buffers = (*self._buffer(knowns, 0), *self._buffer(unknowns, 0))
         self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
 
     def save(self) -> ctypes.c_void_p:
@@ -227,15 +249,15 @@ class Instance(ABC):
         return state
 
     def close(self) -> None:
-        """Free the instance and unload the library; calling it twice is allowed."""
+        """Free the instance and unload a library of its own; calling it twice is allowed."""
         if self._component.value:
             release = self.function("FreeInstance")
             release.restype = None
             release(self._component)
             self._component = ctypes.c_void_p()
-        if self._library is not None:
+        if self._owns_library and self._library is not None:
             unload_library(self._library)
-            self._library = None
+        self._library = None
 
     def check(self, function: str, status: int) -> None:
         """Raise unless `status` is good.

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import weakref
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from servobench.plant.fmu.instance import DISCARD, Instance, MessageLog, Port
+from servobench.plant.fmu.instance import DISCARD, Instance, MessageLog, Port, RawCall
 
 CO_SIMULATION = 1
 LAST_SUCCESSFUL_TIME = 2
@@ -68,28 +67,20 @@ class Instance2(Instance):
         self.call("EnterInitializationMode")
         self.call("ExitInitializationMode")
 
-    def _taker(self, step: ctypes.c_double) -> Callable[[float], float | None]:
-        now = ctypes.c_double()
-        call = partial(self.function("DoStep"), self._component, now, step, ctypes.c_int(1))
+    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """See `Instance.step_call`."""
+        return partial(self.function("DoStep"), self._component, now, step, ctypes.c_int(1))
 
-        def take(time: float) -> float | None:
-            now.value = time
-            status = call()
-            if status == DISCARD:
-                return self._last_successful_time()
-            if status:
-                self.check("fmi2DoStep", status)
+    def _reached(self, status: int, time: float) -> float | None:
+        if status != DISCARD:
+            self.check("fmi2DoStep", status)
             return None
-
-        return take
-
-    def _last_successful_time(self) -> float:
         reached = ctypes.c_double()
         self.call("GetRealStatus", ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached))
         return reached.value
 
-    def _buffer(self, port: Port) -> tuple[Any, ...]:
-        return (port.pointer,)
+    def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
+        return (port.pointer(row),)
 
 
 def _callbacks(log: MessageLog) -> _Callbacks:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.instance import Instance, Port
+from servobench.plant.fmu.instance import OK, WARNING, Instance, Port, RawCall
 
 LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 
@@ -21,6 +20,7 @@ class Instance3(Instance):
 
     def _instantiate(self) -> int | None:
         log = self.log
+        self._end, self._early, self._last_time = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double()
 
         def on_message(_environment: int | None, status: int, _category: bytes, message: bytes) -> None:
             log.add(status, (message or b"").decode("utf-8", errors="replace"))
@@ -51,22 +51,18 @@ class Instance3(Instance):
         self.call("EnterInitializationMode", no, nothing, ctypes.c_double(time), no, nothing)
         self.call("ExitInitializationMode")
 
-    def _taker(self, step: ctypes.c_double) -> Callable[[float], float | None]:
-        now, reached = ctypes.c_double(), ctypes.c_double()
-        event, end, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
-        results = [ctypes.byref(result) for result in (event, end, early, reached)]
+    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """See `Instance.step_call`."""
+        end, early = self._end, self._early
+        results = [ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)]
         call = partial(self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results)
+        return lambda: call() or (WARNING if end.value or early.value else OK)
 
-        def take(time: float) -> float | None:
-            now.value = time
-            status = call()
-            if status:
-                self.check("fmi3DoStep", status)
-            if end.value:
-                raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
-            return reached.value if early.value else None
+    def _reached(self, status: int, time: float) -> float | None:
+        self.check("fmi3DoStep", status)
+        if self._end.value:
+            raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
+        return self._last_time.value if self._early.value else None
 
-        return take
-
-    def _buffer(self, port: Port) -> tuple[Any, ...]:
-        return port.pointer, ctypes.c_size_t(port.values.size)
+    def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
+        return port.pointer(row), ctypes.c_size_t(port.values.shape[-1])

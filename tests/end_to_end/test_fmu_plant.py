@@ -155,6 +155,41 @@ def test_misbehaviour_at_run_time_is_an_fmu_error(tmp_path, version, quirk, mess
         crane(tmp_path, version, parameters={"quirk": np.array(float(quirk))}).step(Command([0.0, 0.0]))
 
 
+@pytest.mark.parametrize(("quirk", "message"), [(1.0, "DoStep returned error"), (7.0, "not finite for place")])
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_instance_that_fails_does_not_disturb_those_beside_it(tmp_path, version, quirk, message):
+    starts, commands = np.array([[0.3, 1.2], [0.1, 0.9], [-0.4, 1.5]]), np.random.default_rng(0).normal(size=(9, 3, 2))
+    path = build_crane(tmp_path / "crane.fmu", version)
+
+    def seen_alone(lane):
+        plant = Bench(FmuWorld(FmuMapping(path, **NAMES[version]), starts[lane], PERIOD), 0, SensingConfig(0.0))
+        plant.reset(0)
+        seen = [plant.step(Command(u)) for u in commands[:, lane]]
+        plant.close()
+        return [(each.joint_position.tobytes(), each.feature.tobytes()) for each in seen]
+
+    alone = [seen_alone(lane) for lane in range(3)]
+    mapping = FmuMapping(path, **NAMES[version], parameters={"quirk": np.array([[0.0], [quirk], [0.0]])})
+    plant = Bench(FmuWorld(mapping, starts, PERIOD), 0, SensingConfig(0.0))
+    plant.reset([0, 0, 0])
+    lanes = np.arange(3)
+    for k, u in enumerate(commands):
+        seen = plant.step(Command(u[lanes]))
+        assert np.isfinite(seen.feature).all()
+        for place, lane in enumerate(lanes):
+            if place not in plant.faults:
+                assert (seen.joint_position[place].tobytes(), seen.feature[place].tobytes()) == alone[lane][k]
+        if plant.faults and k > 6:  # it rests for a while before it is dropped
+            (fault,) = plant.faults.values()
+            assert (list(plant.faults), message in str(fault)) == ([1], True)
+            plant.keep(np.array([2, 0]))
+            lanes = np.array([2, 0])
+            assert not plant.faults
+    assert len(lanes) == 2
+    plant.close()
+    plant.close()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -186,7 +221,7 @@ def test_a_state_that_cannot_be_serialised_is_kept_by_the_plant_that_saved_it():
         plant.restore(state)
         runs.append([plant.step(Command(np.full(6, -0.5))).feature.tobytes() for _ in range(5)])
     assert runs[0] == runs[1]
-    assert not isinstance(state.world.fmu, bytes)
+    assert not isinstance(state.world.fmu[0], bytes)
     plant.close()
 
 

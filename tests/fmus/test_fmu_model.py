@@ -219,9 +219,10 @@ def test_bytes_that_are_no_state_of_this_model_are_refused(version):
     plant = ENTRY.build(Ur5FmuConfig(fmi_version=version), setup())
     plant.reset(0)
     state = plant.save()
-    for content in (state.world.fmu[:-1], b"x" * len(state.world.fmu)):
+    (saved,) = state.world.fmu
+    for content in (saved[:-1], b"x" * len(saved)):
         with pytest.raises(FmuError, match="these bytes are no state of this model"):
-            plant.restore(replace(state, world=replace(state.world, fmu=content)))
+            plant.restore(replace(state, world=replace(state.world, fmu=(content,))))
     plant.close()
 
 

@@ -24,7 +24,7 @@ MOVED = np.array([mismatched("camera_rotation=40deg", seed).X_BC for seed in SEE
 WORST = {"command_delay_periods": 3, "latency_periods": 2, "drop_probability": 0.2}
 
 
-@pytest.fixture(params=["kinematic"])
+@pytest.fixture(params=["kinematic", "fmu"])
 def build(request):
     """Return a function that builds a plant for one lane or for an array of lanes, under bad sensing."""
     entry, opened = find_plant(request.param), []
