@@ -15,7 +15,7 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.mpc.closed_form import decay_targets
+from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot.hand_eye import hand_eye_spec
@@ -24,6 +24,7 @@ from servobench.plant.signals import Observation
 
 PROBLEMS, FACTOR, AGREEMENT = 60, 10.0, 5e-4  # IPOPT stops some 1e-4 rad short: its barrier
 CONFIG = MpcConfig()
+SHARES = decay_shares(CONFIG.horizon, CONFIG.rho)
 MODEL = nominal_ur5()
 SPEC = hand_eye_spec(MODEL, 0.05, 1.0, 2 * np.pi)
 START = np.array([2.8, -1.4, 2.3, 2.2, -1.2, -0.2])
@@ -80,7 +81,7 @@ class DoMpc:
     def step(self, J: FloatArray, observation: Observation, reference: FloatArray) -> FloatArray:
         """Return the first joint step, (n,), rad."""
         error = reference[0] - observation.feature
-        targets = decay_targets(error, reference[1:] - reference[0], CONFIG.rho)
+        targets = decay_targets(error, reference[1:] - reference[0], SHARES)
         self._template["_tvp", :, "J"] = [J] * (CONFIG.horizon + 1)
         self._template["_tvp", :, "target"] = [np.zeros(SPEC.m), *targets]
         self._template["_tvp", :, "weight"] = [0.0] + [1.0] * CONFIG.horizon
@@ -105,11 +106,13 @@ def main() -> None:
         print(f"mpc_step: skipped: `pip install do-mpc` into this environment to compare ({error})")
         return
     law = MpcLaw(CONFIG, RobotKnowledge(SPEC, CONFIG.horizon))
+    state = law.start(problems()[0][1])
     times: tuple[list[float], list[float]] = ([], [])
     difference = 0.0
     for J, observation, reference in problems():
         started = time.process_time()
-        own_step = law.command(Estimate(J), observation, reference) * SPEC.period
+        state, velocity = law.command(state, Estimate(J), observation, reference)
+        own_step = velocity * SPEC.period
         between = time.process_time()
         other_step = other.step(J, observation, reference)
         ended = time.process_time()

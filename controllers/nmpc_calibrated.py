@@ -11,9 +11,9 @@ import casadi
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
-from servobench.controllers.laws.mpc.closed_form import decay_targets, move_weights
-from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
-from servobench.controllers.laws.mpc.qp import QpShape, QpSolution, Solver
+from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets, move_weights
+from servobench.controllers.laws.mpc.limits import joint_bounds
+from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, Share, settings
@@ -59,8 +59,8 @@ class NmpcCalibrated(Controller):
     over speed, acceleration and position limits; e = y_ref(k+d) − h(q̂(k+d)) − b, β = exp(−ρ). The joints are taken
     as ideal after d periods: q̂(k+d) = q + the last d steps sent. b follows the camera, b ← b + γ (y − h(q) − b); with
     the default γ = 0 the controller does not look at it and shows what perfect calibration alone is worth. Each
-    iteration is a Gauss-Newton step: h is linearised along the present plan and the program of `mpc_qp` gives the next
-    one, starting from the last plan shifted by one period. Not in the paper.
+    iteration is a Gauss-Newton step: h is linearised along the present plan, at first the last one shifted by one
+    period, and the program of `laws.mpc.qp` gives the next one. Not in the paper.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
@@ -84,32 +84,31 @@ class NmpcCalibrated(Controller):
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
         self._along_plan = self._model.map(config.horizon)
-        self._weights = move_weights(config.horizon, 1.0, config.terminal_weight)
+        self._shares = decay_shares(config.horizon, config.rho)
+        limited = math.isfinite(config.joint_acceleration_limit)
         shape = QpShape(
-            n=n,
-            m=m,
-            weights=self._weights,
+            weights=move_weights(config.horizon, 1.0, config.terminal_weight),
             move_weight=np.full(n, config.move_weight),
             constant_gain=None,
-            limit_acceleration=math.isfinite(config.joint_acceleration_limit),
+            largest_move=self._spec.joint_velocity_limit * self._spec.period,
+            largest_change=np.full(n, config.joint_acceleration_limit * self._spec.period**2) if limited else None,
             limit_position=config.limit_position,
             view_rows=np.zeros((0, m)),
             varying_jacobian=True,
         )
-        self._program = LimitedProgram(shape, config.solver)
+        self._program = QpProgram(shape, config.solver)
         self._b: FloatArray = np.zeros(m)
         self._jacobian: FloatArray | None = None
         self._forget()
 
     def reset(self, observation: Observation, seed: int) -> None:
-        """Forget plan, warm start, commands sent and disturbance; nothing is random.
+        """Forget plan, commands sent and disturbance; nothing is random.
 
         Raises:
             ValueError: an observation of the wrong size.
         """
         del seed
         self._knowledge.check(observation)
-        self._program.reset()
         self._forget()
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
@@ -128,7 +127,7 @@ class NmpcCalibrated(Controller):
         start = present + sum(self._sent, np.zeros(self._spec.n))
         rows = reference[delay : delay + config.horizon + 1]
         error = rows[0] - self._evaluate(start)[0] - self._b
-        wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], config.rho) - self._b
+        wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
         plan, success = self._improve(start, wanted)
         limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan[0] / self._spec.period, -limit, limit) if success else np.zeros(self._spec.n)
@@ -146,7 +145,7 @@ class NmpcCalibrated(Controller):
         return None if self._jacobian is None else self._jacobian.copy()
 
     def _shared(self) -> Iterable[object]:
-        return self._knowledge, self._model, self._along_plan
+        return self._knowledge, self._model, self._along_plan, self._program
 
     def _forget(self) -> None:
         n, delay = self._spec.n, self._config.delay_periods
@@ -172,7 +171,6 @@ class NmpcCalibrated(Controller):
         config = self._config
         bounds = joint_bounds(
             self._spec,
-            config.horizon,
             self._last,
             acceleration_limit=config.joint_acceleration_limit,
             joint_position=start,

@@ -4,9 +4,9 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 from servobench.controllers.laws.mpc.closed_form import (
-    constant_step,
+    UnlimitedPlan,
+    decay_shares,
     decay_targets,
-    free_moves,
     horizon_integrals,
     move_weights,
     preview_weights,
@@ -83,6 +83,10 @@ def random_problem(seed, m=3, n=6):
     return rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.1, 1.0, n)
 
 
+def constant_step(J, target, a, Q):
+    return UnlimitedPlan.of_constant_step(a, 10, Q).minimise(J, target[None])[0][0]
+
+
 def printed_equation_46(J, e, Q, abc):
     return np.linalg.pinv(abc.a * J + np.linalg.pinv(J.T) @ Q) @ ((abc.b - abc.c) * e)
 
@@ -133,9 +137,10 @@ def test_constant_step_by_hand():
 
 def test_free_moves_satisfy_the_stationarity_of_their_criterion():
     J, e, Q = random_problem(1)
-    targets = decay_targets(e, np.random.default_rng(0).normal(size=(5, 3)), 0.3)
+    targets = decay_targets(e, np.random.default_rng(0).normal(size=(5, 3)), decay_shares(5, 0.3))
     weights = move_weights(5, 0.9, 2.0)
-    moves = free_moves(J, targets, weights, Q)
+    moves, travel = UnlimitedPlan.of_free_moves(weights, Q).minimise(J, targets)
+    np.testing.assert_allclose(travel, np.cumsum(moves, axis=0), atol=1e-14)
     misses = targets - np.cumsum(moves, axis=0) @ J.T
     for s in range(5):
         gradient = -J.T @ (weights[s:, None] * misses[s:]).sum(axis=0) + Q * moves[s]
@@ -145,5 +150,5 @@ def test_free_moves_satisfy_the_stationarity_of_their_criterion():
 def test_decay_targets_leave_the_share_beta_of_the_error():
     e = np.array([0.2, -0.1])
     reference_step = np.array([[0.01, 0.0], [0.02, 0.0]])
-    left = e + reference_step - decay_targets(e, reference_step, 0.5)
+    left = e + reference_step - decay_targets(e, reference_step, decay_shares(2, 0.5))
     np.testing.assert_allclose(left, np.exp(-0.5 * np.array([[1.0], [2.0]])) * e, atol=1e-15)

@@ -53,10 +53,11 @@ def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
         NmpcCalibratedConfig(**common), knowledge(spec, lambda q: casadi.DM(J) @ q + casadi.DM(offset))
     )
     q = np.zeros(4)
+    state = law.start(Observation(0.0, q, offset))
     for k in range(10):
         reference = offset + rng.normal(scale=0.02, size=(13, 2)) + [0.3, -0.2]
         observation = Observation(0.05 * k, q, J @ q + offset)
-        linear = law.command(Estimate(J), observation, reference)
+        state, linear = law.command(state, Estimate(J), observation, reference)
         np.testing.assert_allclose(controller.step(observation, reference).joint_velocity, linear, atol=1e-7)
         q = q + 0.05 * linear
 

@@ -19,10 +19,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 
 from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import transposed
 
 _SERIES_BELOW = 0.5  # under it the series of 18 terms is exact to rounding, above it the closed form is
 _SERIES_TERMS = 18
@@ -76,19 +78,28 @@ def _power(alpha: float, tau: float) -> float:
     return value if value > _MIN_POWER else 0.0
 
 
-def decay_targets(error: FloatArray, reference_step: FloatArray, rho: float) -> FloatArray:
+def decay_shares(horizon: int, rho: float) -> FloatArray:
+    """Return the share 1 − β^τ of the error that should be gone after τ = 1 … H periods, (H,).
+
+    Args:
+        horizon: H, periods.
+        rho: ρ, β = exp(−ρ).
+    """
+    return np.array([-math.expm1(-rho * tau) for tau in range(1, horizon + 1)])
+
+
+def decay_targets(error: FloatArray, reference_step: FloatArray, shares: FloatArray) -> FloatArray:
     """Return the feature displacements that the prediction should follow: r_τ + (1 − β^τ) e for τ = 1 … H.
 
     Args:
-        error: e = y_ref − y now, (m,), m.
-        reference_step: r_τ = y_ref(k+τ) − y_ref(k), (H, m), m.
-        rho: ρ, β = exp(−ρ).
+        error: e = y_ref − y now, (..., m), m.
+        reference_step: r_τ = y_ref(k+τ) − y_ref(k), (..., H, m), m.
+        shares: 1 − β^τ, (H,).
 
     Returns:
-        (H, m), m.
+        (..., H, m), m.
     """
-    share = [-math.expm1(-rho * tau) for tau in range(1, len(reference_step) + 1)]
-    return np.asarray(reference_step + np.outer(share, error))
+    return np.asarray(reference_step + shares[:, None] * error[..., None, :])
 
 
 def move_weights(horizon: int, alpha: float, terminal_weight: float) -> FloatArray:
@@ -110,37 +121,70 @@ def preview_weights(horizon: int, alpha: float) -> FloatArray:
     return v[1:]
 
 
-def constant_step(J: FloatArray, target: FloatArray, a: float, Q: FloatArray) -> FloatArray:
-    """Return the minimiser of ½ a ‖J dq‖² − targetᵀ J dq + ½ dqᵀ Q dq: (a JᵀJ + Q) dq = Jᵀ target.
+@final
+class UnlimitedPlan:
+    """The minimiser without limits, of free moves or of one constant step, for many runs at once.
 
-    With target = (b − c) e it is eq. 46 for Q = q I; for another Q the printed eq. 46 is not this minimiser.
+        min  ½ Σ_st C_st (J dq_s)ᵀ(J dq_t) − Σ_t p_tᵀ J dq_t + ½ Σ_t dq_tᵀ Q dq_t
 
-    Args:
-        J: (m, n), m/rad.
-        target: (m,), m times periods².
-        a: periods³.
-        Q: diagonal, (n,), positive.
+    Its stationarity C (dq Jᵀ) J + dq Q = p J holds for dq = Z J Q⁻¹ with C Z G + Z = p, G = J Q⁻¹ Jᵀ. With C = U Λ Uᵀ,
+    once for all, and G = V S Vᵀ, m × m, the solution is Z = U [(Uᵀ p V)_ij / (1 + λ_i s_j)] Vᵀ.
 
-    Returns:
-        dq, (n,), rad a period.
+    | here | meaning | shape | unit |
+    |---|---|---|---|
+    | `coupling` | C | (moves, moves) | 1 |
+    | `pull` | p = pull · targets | (moves, moves) | 1 |
+    | `travel` | S = travel · dq, the way after each move | (moves, moves) | 1 |
     """
-    # The m × m form costs less than the n × n one: dq = Q⁻¹ Jᵀ (I + a J Q⁻¹ Jᵀ)⁻¹ target.
-    weighted = J / Q
-    return np.asarray(weighted.T @ np.linalg.solve(np.eye(len(J)) + a * (weighted @ J.T), target))
 
+    def __init__(self, coupling: FloatArray, pull: FloatArray, travel: FloatArray, move_weight: FloatArray) -> None:
+        """Diagonalise the coupling.
 
-def free_moves(J: FloatArray, targets: FloatArray, weights: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the minimiser of ½ Σ_t w_t ‖target_t − J Σ_{s≤t} dq_s‖² + ½ Σ_t dq_tᵀ Q dq_t, (H, n), rad.
+        Args:
+            coupling: C, see above.
+            pull: see above.
+            travel: see above.
+            move_weight: diagonal of Q, (n,), positive, m²/rad².
+        """
+        eigenvalues, U = np.linalg.eigh(coupling)
+        self._move_weight = move_weight
+        self._eigenvalues = np.maximum(eigenvalues, 0.0)[:, None]
+        self._forth, self._back = U.T @ pull, np.concatenate([U, travel @ U])
 
-    Args:
-        J: (m, n), m/rad.
-        targets: (H, m), m.
-        weights: w, (H,).
-        Q: diagonal, (n,), positive.
-    """
-    horizon, n = len(targets), J.shape[1]
-    tail = np.cumsum(weights[::-1])[::-1]  # Σ_{t≥s} w_t, the weight that move s meets
-    coupling = np.minimum.outer(tail, tail)
-    hessian = np.kron(coupling, J.T @ J) + np.diag(np.tile(Q, horizon))
-    pull = np.cumsum((weights[:, None] * targets)[::-1], axis=0)[::-1] @ J
-    return np.asarray(np.linalg.solve(hessian, pull.ravel()).reshape(horizon, n))
+    @classmethod
+    def of_free_moves(cls, weights: FloatArray, move_weight: FloatArray) -> UnlimitedPlan:
+        """Return that of ½ Σ_t w_t ‖target_t − J Σ_{s≤t} dq_s‖² + ½ Σ_t dq_tᵀ Q dq_t.
+
+        Args:
+            weights: w, (H,).
+            move_weight: diagonal of Q, (n,), positive.
+        """
+        until = np.tri(len(weights))
+        return cls(until.T * weights @ until, until.T * weights, until, move_weight)
+
+    @classmethod
+    def of_constant_step(cls, gain: float, horizon: int, move_weight: FloatArray) -> UnlimitedPlan:
+        """Return that of ½ a ‖J dq‖² − targetᵀ J dq + ½ dqᵀ Q dq: (a JᵀJ + Q) dq = Jᵀ target.
+
+        With target = (b − c) e it is eq. 46 for Q = q I; for another Q the printed eq. 46 is not this minimiser.
+
+        Args:
+            gain: a, periods³.
+            horizon: H, periods; the way is H dq.
+            move_weight: diagonal of Q, (n,), positive.
+        """
+        return cls(np.array([[gain]]), np.eye(1), np.array([[float(horizon)]]), move_weight)
+
+    def minimise(self, J: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the moves dq and the ways S, both (..., moves, n), rad.
+
+        Args:
+            J: (..., m, n), m/rad.
+            targets: (..., moves, m); for a constant step m times periods².
+        """
+        weighted = J / self._move_weight
+        s, V = np.linalg.eigh(weighted @ transposed(J))
+        along = self._forth @ targets @ V / (1.0 + self._eigenvalues * s[..., None, :])
+        both = self._back @ (along @ (transposed(V) @ weighted))
+        moves = len(self._forth)
+        return both[..., :moves, :], both[..., moves:, :]

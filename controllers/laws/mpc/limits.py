@@ -1,78 +1,72 @@
-"""The limits of a robot's joints as bounds of a predictive program, and the program that drops those out of reach."""
+"""The limits of a robot as bounds of a predictive program, and the check of plans against them for all runs at once."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import final
-
 import numpy as np
 
-from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, QpSolution, Solver
+from servobench.controllers.laws.mpc.qp import QpBounds, QpShape
 from servobench.plant.checks import FloatArray
-from servobench.plant.signals import PlantSpec
+from servobench.plant.lanes import transposed
+from servobench.plant.signals import BoolArray, PlantSpec
+
+
+def view_rows(tangent: tuple[float, ...], m: int) -> FloatArray:
+    """Return V with V y ≥ 0 inside the pyramid |x| ≤ z·h, |y| ≤ z·v: (4, 3), or no rows without tangents (h, v)."""
+    if not tangent:
+        return np.zeros((0, m))
+    h, v = tangent
+    return np.array([[1.0, 0.0, h], [-1.0, 0.0, h], [0.0, 1.0, v], [0.0, -1.0, v]])
 
 
 def joint_bounds(
     spec: PlantSpec,
-    moves: int,
     last_step: FloatArray,
     *,
     acceleration_limit: float,
     joint_position: FloatArray,
     view_margin: FloatArray,
 ) -> QpBounds:
-    """Return the bounds on `moves` steps from `joint_position` on.
+    """Return the bounds on the steps from `joint_position` on.
 
     A joint beyond its position limit may not go further out, and need not be back at once: noise on an encoder never
     makes the program infeasible.
 
     Args:
         spec: limits and period.
-        moves: number of free moves.
-        last_step: the step before the first move, (n,), rad.
+        last_step: the step before the first move, (..., n), rad.
         acceleration_limit: rad/s², may be infinite.
-        joint_position: (n,), rad.
-        view_margin: (v,), see `QpBounds`.
+        joint_position: (..., n), rad.
+        view_margin: (..., v), see `QpBounds`.
     """
-    largest = spec.joint_velocity_limit * spec.period
-    change = np.full(spec.n, acceleration_limit * spec.period**2)
-    upper = np.empty((moves, spec.n))
-    upper[:] = largest
-    lower = -upper
-    lower[0] = np.maximum(lower[0], last_step - change)
-    upper[0] = np.minimum(upper[0], last_step + change)
+    largest, change = spec.joint_velocity_limit * spec.period, acceleration_limit * spec.period**2
     return QpBounds(
-        move_lower=lower,
-        move_upper=upper,
-        change=change,
+        first_lower=np.maximum(-largest, last_step - change),
+        first_upper=np.minimum(largest, last_step + change),
         travel_lower=np.minimum(spec.joint_lower - joint_position, 0.0),
         travel_upper=np.maximum(spec.joint_upper - joint_position, 0.0),
         view_margin=view_margin,
     )
 
 
-@final
-class LimitedProgram:
-    """A `QpProgram` that leaves the position rows out while no joint can reach a limit within the horizon.
+def exceeds(shape: QpShape, bounds: QpBounds, J: FloatArray, plan: FloatArray, travel: FloatArray) -> BoolArray:
+    """Return whether a plan breaks any limit, (...).
 
-    Rows that no feasible plan touches change nothing but the time: they are a third of it for six joints and ten moves.
+    Args:
+        shape: kinds of limits.
+        bounds: of these runs.
+        J: (..., m, n), m/rad.
+        plan: dq_t, (..., moves, n), rad.
+        travel: S_t, (..., moves, n), rad.
     """
-
-    def __init__(self, shape: QpShape, solver: Solver) -> None:
-        """Build the program, twice where the shape limits positions."""
-        self._horizon = shape.horizon
-        self._without = QpProgram(replace(shape, limit_position=False), solver)
-        self._with = QpProgram(shape, solver) if shape.limit_position else self._without
-
-    def reset(self) -> None:
-        """Forget the warm starts."""
-        self._without.reset()
-        if self._with is not self._without:
-            self._with.reset()
-
-    def solve(self, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> QpSolution:
-        """Solve for new parameters; see `QpProgram.solve`."""
-        reach = self._horizon * np.maximum(bounds.move_upper[-1], -bounds.move_lower[-1])
-        free = (bounds.travel_upper > reach).all() and (bounds.travel_lower < -reach).all()
-        program = self._without if free else self._with
-        return program.solve(J, targets, bounds)
+    first = plan[..., 0, :]
+    broken = (np.abs(plan) > shape.largest_move).any(axis=(-2, -1))
+    broken = broken | ((first > bounds.first_upper) | (first < bounds.first_lower)).any(axis=-1)
+    if shape.largest_change is not None:
+        broken = broken | (np.abs(plan[..., 1:, :] - plan[..., :-1, :]) > shape.largest_change).any(axis=(-2, -1))
+    if shape.limit_position:
+        beyond = (travel > bounds.travel_upper[..., None, :]) | (travel < bounds.travel_lower[..., None, :])
+        broken = broken | beyond.any(axis=(-2, -1))
+    if len(shape.view_rows):
+        seen = travel @ transposed(shape.view_rows @ J)
+        broken = broken | (seen < bounds.view_margin[..., None, :]).any(axis=(-2, -1))
+    return np.asarray(broken)

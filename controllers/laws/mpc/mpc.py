@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from typing import Annotated, ClassVar, Final, Literal, final
+from typing import Annotated, ClassVar, Final, Literal, NamedTuple, final
 
 import numpy as np
 from annotated_types import Le
@@ -14,17 +13,18 @@ from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, Stage
 from servobench.controllers.laws.limit import scale_to_limit
 from servobench.controllers.laws.mpc.closed_form import (
-    constant_step,
+    UnlimitedPlan,
+    decay_shares,
     decay_targets,
-    free_moves,
     horizon_integrals,
     move_weights,
     preview_weights,
 )
-from servobench.controllers.laws.mpc.limits import LimitedProgram, joint_bounds
-from servobench.controllers.laws.mpc.qp import QpBounds, QpShape, QpSolution, Solver
+from servobench.controllers.laws.mpc.limits import exceeds, joint_bounds, view_rows
+from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
+from servobench.plant.lanes import branch, lane_by_lane, norm, transposed, where
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, settings
 from servobench.plant.signals import Observation
 
@@ -60,7 +60,7 @@ class MpcConfig:
     view_tangent: tuple[Positive, ...] = ()
     """[1] (horizontal, vertical): |x| ≤ z·h and |y| ≤ z·v for y = (x, y, z); empty: no limit."""
     solver: Solver = "daqp"
-    """Solver of the quadratic programs: the fastest of CasADi's here, or another for a cross-check."""
+    """Solver of the quadratic programs; "qpoases" for a cross-check."""
     fallback: Literal["hold", "closed_form", "raise"] = "hold"
     """Without a solution: zero velocity, the law without limits scaled to the speed limit, or `SolverFailed`."""
 
@@ -70,8 +70,46 @@ class MpcConfig:
             raise ValueError(f"view_tangent must be empty or (horizontal, vertical), got {self.view_tangent}")
 
 
+class Plan(NamedTuple):
+    """The moves of the last command and how they were found.
+
+    Attributes:
+        moves: dq_1 … dq_H, or the one constant step, (..., moves, n), rad.
+        success: (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before the first command.
+        iterations: (...), of the solver; 0 without an active limit.
+        active_limits: (...), NaN without a solution.
+    """
+
+    moves: FloatArray
+    success: FloatArray
+    iterations: FloatArray
+    active_limits: FloatArray
+
+
+class MpcState(NamedTuple):
+    """The state of the predictive law.
+
+    Attributes:
+        sent: (..., delay, n), rad, the last steps sent, the newest one last.
+        last: (..., n), rad, the last step sent.
+        fallbacks: (...), commands without a solution so far.
+        J: (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two.
+        targets: (..., moves, m), of the last command.
+        final: (..., m), m, error after H periods if the arm stood still.
+        plan: of the last command.
+    """
+
+    sent: FloatArray
+    last: FloatArray
+    fallbacks: FloatArray
+    J: FloatArray
+    targets: FloatArray
+    final: FloatArray
+    plan: Plan
+
+
 @final
-class MpcLaw(Law):
+class MpcLaw(Law[MpcState]):
     """Receding-horizon law on the affine prediction y(k+τ) = ŷ + Ĵ Σ_{s≤τ} dq_s, after eq. 46.
 
     With e = y_ref − y now, r_τ = y_ref(k+τ) − y_ref(k), β = exp(−ρ), the predicted displacement should follow
@@ -83,7 +121,8 @@ class MpcLaw(Law):
 
     with w_τ = α^τ, plus `terminal_weight` at τ = H, over the joint limits; the first step is sent, u = dq / dt.
     One target for both makes them one family: for a reference at rest, without active limits, "constant" is
-    (a ĴᵀĴ + Q) dq = (b − c) Ĵᵀ e, eq. 46 for Q = q I.
+    (a ĴᵀĴ + Q) dq = (b − c) Ĵᵀ e, eq. 46 for Q = q I. The plan without limits has a closed form; where it keeps all
+    limits it is the optimum, and only the other lanes solve the quadratic program.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
@@ -116,119 +155,140 @@ class MpcLaw(Law):
         self._config, self._spec = config, spec
         weight = as_vector("joint_weight", config.joint_weight or np.ones(spec.n), spec.n)
         self._Q: FloatArray = config.move_weight * weight
-        self._weights = move_weights(config.horizon, config.alpha, config.terminal_weight)
+        self._shares = decay_shares(config.horizon, config.rho)
         self._integrals = horizon_integrals(config.horizon, config.alpha, config.rho)
         self._preview_weights = preview_weights(config.horizon, config.alpha)
-        self._gain = self._integrals.a + config.terminal_weight * config.horizon**2
-        self._view = _view_rows(config.view_tangent, spec.m)
+        weights = move_weights(config.horizon, config.alpha, config.terminal_weight)
+        gain = self._integrals.a + config.terminal_weight * config.horizon**2
         constant = config.mode == "constant"
-        shape = QpShape(
-            n=spec.n,
-            m=spec.m,
-            weights=self._weights,
+        change = np.full(spec.n, config.joint_acceleration_limit * spec.period**2)
+        self._shape = QpShape(
+            weights=weights,
             move_weight=self._Q,
-            constant_gain=self._gain if constant else None,
-            limit_acceleration=math.isfinite(config.joint_acceleration_limit) and not constant,
+            constant_gain=gain if constant else None,
+            largest_move=spec.joint_velocity_limit * spec.period,
+            largest_change=change if math.isfinite(config.joint_acceleration_limit) and not constant else None,
             limit_position=config.limit_position,
-            view_rows=self._view,
+            view_rows=view_rows(config.view_tangent, spec.m),
         )
-        self._program = LimitedProgram(shape, config.solver)
-        self._forget()
+        self._unlimited = (
+            UnlimitedPlan.of_constant_step(gain, config.horizon, self._Q)
+            if constant
+            else UnlimitedPlan.of_free_moves(weights, self._Q)
+        )
+        self._program = QpProgram(self._shape, config.solver)
 
-    def reset(self, observation: Observation) -> None:
-        """Forget the warm start and the commands sent; the arm is at rest."""
-        del observation
-        self._program.reset()
-        self._forget()
+    def start(self, observation: Observation) -> MpcState:
+        """Return the state of an arm at rest."""
+        lead, shape = observation.feature.shape[:-1], self._shape
+        n, m, moves = self._spec.n, self._spec.m, shape.moves
+        unknown = np.full(lead, np.nan)
+        return MpcState(
+            sent=np.zeros((*lead, self._config.delay_periods, n)),
+            last=np.zeros((*lead, n)),
+            fallbacks=np.zeros(lead),
+            J=np.full((*lead, m, n), np.nan),
+            targets=np.full((*lead, moves, m), np.nan),
+            final=np.full((*lead, m), np.nan),
+            plan=Plan(np.zeros((*lead, moves, n)), unknown, unknown, unknown),
+        )
 
-    def command(self, estimate: Estimate, observation: Observation, reference: FloatArray) -> FloatArray:
-        """Return the first step of the best plan as a joint velocity; see `Law.command`.
+    def command(
+        self, state: MpcState, estimate: Estimate, observation: Observation, reference: FloatArray
+    ) -> tuple[MpcState, FloatArray]:
+        """Return the state and the first step of the best plan as a joint velocity; see `Law.command`.
 
         Raises:
-            SolverFailed: no solution, and the fallback is "raise".
+            SolverFailed: no solution in at least one lane, and the fallback is "raise".
         """
-        config, delay, jacobian = self._config, self._config.delay_periods, estimate.jacobian
-        feature = observation.feature + jacobian @ sum(self._sent, np.zeros(self._spec.n))
-        rows = reference[delay : delay + config.horizon + 1] if config.use_preview else reference[:1]
-        error = rows[0] - feature
-        travel = rows[1:] - rows[0] if config.use_preview else np.zeros((config.horizon, self._spec.m))
-        targets = self._program_targets(error, travel)
-        bounds = self._bounds(observation.joint_position, feature)
-        solution = self._program.solve(jacobian, targets, bounds)
-        step = solution.moves[0] if solution.success else self._fall_back(jacobian, targets, solution.status)
-        self._note(solution, error + travel[-1], jacobian, step)
+        J = estimate.jacobian
+        feature, error, ahead = self._look_ahead(state.sent, J, observation, reference)
+        targets = self._program_targets(error, ahead)
+        moves, travel = self._unlimited.minimise(J, targets)
+        bounds = joint_bounds(
+            self._spec,
+            state.last,
+            acceleration_limit=self._config.joint_acceleration_limit,
+            joint_position=observation.joint_position,
+            # A ball that is out of view already may not get further out.
+            view_margin=np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0),
+        )
+        zero = np.zeros(feature.shape[:-1])
+        plan = Plan(moves, zero + 1.0, zero, zero)
+        plan = branch(exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds)
         limit = self._spec.joint_velocity_limit
-        velocity = np.clip(step / self._spec.period, -limit, limit)
-        self._last = velocity * self._spec.period
-        self._sent.append(self._last)
-        return np.asarray(velocity)
+        velocity = np.clip(plan.moves[..., 0, :] / self._spec.period, -limit, limit)
+        last = velocity * self._spec.period
+        sent = np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :]
+        fallbacks = np.asarray(state.fallbacks + (1.0 - plan.success))
+        return MpcState(sent, last, fallbacks, J, targets, error + ahead[..., -1, :], plan), velocity
 
-    def diagnostics(self) -> Diagnostics:
-        """Return success and iterations of the solver, objective, fallbacks so far, active limits, predicted error."""
-        return dict(self._diagnostics)
+    def _look_ahead(
+        self, sent: FloatArray, J: FloatArray, observation: Observation, reference: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return ŷ, e and r_1 … r_H, all at the instant when a command first acts."""
+        horizon, delay = self._config.horizon, self._config.delay_periods
+        feature = observation.feature + np.matvec(J, np.add.reduce(sent, axis=-2))
+        if not self._config.use_preview:
+            return feature, reference[..., 0, :] - feature, np.zeros((horizon, self._spec.m))
+        rows = reference[..., delay : delay + horizon + 1, :]
+        return feature, rows[..., 0, :] - feature, rows[..., 1:, :] - rows[..., :1, :]
 
-    def _forget(self) -> None:
-        delay, n = self._config.delay_periods, self._spec.n
-        self._last = np.zeros(n)
-        self._sent: deque[FloatArray] = deque([np.zeros(n)] * delay, maxlen=delay)
-        self._fallbacks = 0
-        self._diagnostics: dict[str, float] = {}
+    def diagnostics(self, state: MpcState) -> Diagnostics:
+        """Return success and iterations of the solver, objective, fallbacks so far, active limits, predicted error.
 
-    def _program_targets(self, error: FloatArray, travel: FloatArray) -> FloatArray:
-        """The targets of the program, (H, m) m, or integrated over the horizon, (1, m), in constant-move mode."""
-        targets = decay_targets(error, travel, self._config.rho)
+        Without an active limit the plan is that of the closed form, after no iteration.
+        """
+        plan, moves = state.plan, state.plan.moves
+        travel = moves.sum(axis=-2) * (self._config.horizon / self._shape.moves)
+        return {
+            "solver_success": plan.success,
+            "solver_iterations": plan.iterations,
+            "objective": where(plan.success > 0.0, self._objective(state), np.asarray(math.nan)),
+            "fallbacks": state.fallbacks,
+            "active_limits": plan.active_limits,
+            "predicted_terminal_error": norm(state.final - np.matvec(state.J, travel)),
+        }
+
+    def _objective(self, state: MpcState) -> FloatArray:
+        """Return the criterion of the plan, (...), m²."""
+        shape, moves, J, targets = self._shape, state.plan.moves, state.J, state.targets
+        effort = 0.5 * (self._Q * moves**2).sum(axis=(-2, -1))
+        if shape.constant_gain is not None:
+            step = moves @ transposed(J)
+            return np.asarray(effort + (0.5 * shape.constant_gain * step**2 - targets * step).sum(axis=(-2, -1)))
+        miss = targets - np.cumsum(moves, axis=-2) @ transposed(J)
+        return np.asarray(effort + 0.5 * (shape.weights[:, None] * miss**2).sum(axis=(-2, -1)))
+
+    def _program_targets(self, error: FloatArray, ahead: FloatArray) -> FloatArray:
+        """Return the targets of the program, (..., H, m) m, or integrated over the horizon, (..., 1, m)."""
+        targets = decay_targets(error, ahead, self._shares)
         if self._config.mode == "moves":
             return targets
-        integral = (self._integrals.b - self._integrals.c) * error + self._preview_weights @ travel
-        terminal = self._config.terminal_weight * self._config.horizon * targets[-1]
-        return np.asarray((integral + terminal)[None, :])
+        integral = (self._integrals.b - self._integrals.c) * error + np.vecmat(self._preview_weights, ahead)
+        terminal = self._config.terminal_weight * self._config.horizon * targets[..., -1, :]
+        return np.asarray((integral + terminal)[..., None, :])
 
-    def _bounds(self, joint_position: FloatArray, feature: FloatArray) -> QpBounds:
-        config = self._config
-        moves = config.horizon if config.mode == "moves" else 1
-        # A ball that is out of view already may not get further out.
-        margin = np.minimum(-self._view @ feature, 0.0)
-        return joint_bounds(
-            self._spec,
-            moves,
-            self._last,
-            acceleration_limit=config.joint_acceleration_limit,
-            joint_position=joint_position,
-            view_margin=margin,
-        )
+    def _limited(self, plan: Plan, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> Plan:
+        """Return the best plan within the limits."""
+        solve = lane_by_lane("(k,n),(m,n),(k,m),(n),(n),(n),(n),(v)->(k,n),(),(),()")(self._solve)
+        return Plan(*(np.asarray(part) for part in solve(plan.moves, J, targets, *bounds)))
 
-    def _fall_back(self, jacobian: FloatArray, targets: FloatArray, status: str) -> FloatArray:
+    def _solve(
+        self, moves: FloatArray, J: FloatArray, targets: FloatArray, *bounds: FloatArray
+    ) -> tuple[FloatArray, float, float, float]:
+        """Return the entries of a single run's plan; `moves` are the best ones without limits."""
+        solution = self._program.solve(J, targets, QpBounds(*bounds))
+        if solution.success:
+            active = np.count_nonzero(np.abs(solution.multiplier) > _MIN_MULTIPLIER)
+            return solution.moves, 1.0, solution.iterations, float(active)
+        step = self._fall_back(moves[0], solution.status)
+        return np.tile(step, (len(moves), 1)), 0.0, solution.iterations, math.nan
+
+    def _fall_back(self, free_step: FloatArray, status: str) -> FloatArray:
         """Return the step to send without a solution, (n,) rad."""
-        self._fallbacks += 1
         if self._config.fallback == "raise":
             raise SolverFailed(f"{self._config.solver} found no solution within the limits: {status}")
         if self._config.fallback == "hold":
             return np.zeros(self._spec.n)
-        if self._config.mode == "constant":
-            step = constant_step(jacobian, targets[0], self._gain, self._Q)
-        else:
-            step = free_moves(jacobian, targets, self._weights, self._Q)[0]
-        return scale_to_limit(step, self._spec.joint_velocity_limit * self._spec.period)
-
-    def _note(self, solution: QpSolution, final: FloatArray, J: FloatArray, step: FloatArray) -> None:
-        """Keep the diagnostics; `final` is the error after H periods if the arm stood still, (m,) m."""
-        horizon, count = self._config.horizon, len(solution.moves)
-        travel = solution.moves.sum(axis=0) * (horizon / count) if solution.success else horizon * step
-        multipliers = np.concatenate([solution.bound_multiplier, solution.row_multiplier])
-        active = float(np.count_nonzero(np.abs(multipliers) > _MIN_MULTIPLIER)) if solution.success else math.nan
-        self._diagnostics = {
-            "solver_success": float(solution.success),
-            "solver_iterations": solution.iterations,
-            "objective": solution.objective if solution.success else math.nan,
-            "fallbacks": float(self._fallbacks),
-            "active_limits": active,
-            "predicted_terminal_error": float(np.linalg.norm(final - J @ travel)),
-        }
-
-
-def _view_rows(tangent: tuple[float, ...], m: int) -> FloatArray:
-    """Return V with V y ≥ 0 inside the pyramid |x| ≤ z·h, |y| ≤ z·v: (4, 3), or no rows without tangents."""
-    if not tangent:
-        return np.zeros((0, m))
-    h, v = tangent
-    return np.array([[1.0, 0.0, h], [-1.0, 0.0, h], [0.0, 1.0, v], [0.0, -1.0, v]])
+        return scale_to_limit(free_step, self._shape.largest_move)

@@ -1,4 +1,4 @@
-"""The quadratic programs of the predictive law, built once in CasADi and solved with new parameters every period.
+"""The quadratic program of the predictive law: stated once in CasADi, solved by DAQP for one run at a time.
 
 Moves dq_1 … dq_H are condensed: the predicted displacement of the feature after t moves is J S_t, S_t = Σ_{s≤t} dq_s.
 
@@ -10,52 +10,85 @@ Moves dq_1 … dq_H are condensed: the predicted displacement of the feature aft
 
 Where the Jacobian varies along the horizon, as for a nonlinear model linearised along a trajectory, J is J_t.
 The constant-move program has one move dq = dq_1 = … = dq_H and all position limits at S_H = H dq.
+
+CasADi turns this statement into a function of J and the targets that returns the matrices of ½ xᵀHx + gᵀx + c and A x.
+Every solve starts cold, so that a solution depends on its arguments alone: the best possible warm start would save
+DAQP a sixth of its time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-from dataclasses import dataclass
-from typing import Any, Final, Literal, TypeAlias
+import math
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any, Final, Literal, NamedTuple, TypeAlias, final
 
+import daqp
 import numpy as np
 
 from servobench.plant.checks import FloatArray
 
 Solver: TypeAlias = Literal["daqp", "qpoases"]
 # Tolerances are those of the constraints in rad: far below an encoder step, far above rounding.
-_SOLVER_OPTIONS: Final[dict[Solver, dict[str, Any]]] = {
-    "daqp": {"daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}},
-    "qpoases": {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12},
+_DAQP_OPTIONS: Final = {"primal_tol": 1e-10, "dual_tol": 1e-12, "iter_limit": 2000}
+_QPOASES_OPTIONS: Final = {"printLevel": "none", "nWSR": 2000, "terminationTolerance": 1e-12}
+_DAQP_STATUS: Final = {
+    -1: "infeasible",
+    -2: "cycling",
+    -3: "unbounded",
+    -4: "iteration limit reached",
+    -5: "not convex",
+    -6: "overdetermined",
 }
 
 
 @dataclass(frozen=True, eq=False)
 class QpShape:
-    """What fixes the structure of a program.
+    """The part of a program that is the same in every period.
 
     Attributes:
-        n: joints.
-        m: features.
         weights: w, (H,), weights of the predicted errors; in constant-move mode only their number counts.
         move_weight: diagonal of Q, (n,).
         constant_gain: a of eq. 46 in constant-move mode, None for H free moves.
-        limit_acceleration: whether rows for the acceleration are wanted.
-        limit_position: whether rows for the joint positions are wanted.
+        largest_move: (n,), rad.
+        largest_change: (n,), rad, largest change from one move to the next; None for no limit.
+        limit_position: whether the joint positions are limited.
         view_rows: V, (v, m); no rows = no limit on the view.
         varying_jacobian: whether every period has a Jacobian of its own; for free moves only.
     """
 
-    n: int
-    m: int
     weights: FloatArray
     move_weight: FloatArray
     constant_gain: float | None
-    limit_acceleration: bool
+    largest_move: FloatArray
+    largest_change: FloatArray | None
     limit_position: bool
     view_rows: FloatArray
     varying_jacobian: bool = False
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether all entries are equal."""
+        return isinstance(other, QpShape) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        """Return a hash of all entries."""
+        return hash(self._key())
+
+    def _key(self) -> tuple[object, ...]:
+        parts = (getattr(self, field.name) for field in fields(self))
+        return tuple((part.shape, part.tobytes()) if isinstance(part, np.ndarray) else part for part in parts)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.move_weight)
+
+    @property
+    def m(self) -> int:
+        """Number of features."""
+        return int(self.view_rows.shape[1])
 
     @property
     def horizon(self) -> int:
@@ -68,22 +101,19 @@ class QpShape:
         return self.horizon if self.constant_gain is None else 1
 
 
-@dataclass(frozen=True, eq=False)
-class QpBounds:
-    """Bounds of one solve.
+class QpBounds(NamedTuple):
+    """The bounds that change from period to period; many runs side by side have leading axes.
 
     Attributes:
-        move_lower: (moves, n), rad.
-        move_upper: (moves, n), rad.
-        change: (n,), rad, largest change from one move to the next.
-        travel_lower: (n,), rad, of S_t.
-        travel_upper: (n,), rad, of S_t.
-        view_margin: (v,), least V J S_t.
+        first_lower: (..., n), rad, of the first move.
+        first_upper: (..., n), rad.
+        travel_lower: (..., n), rad, of S_t.
+        travel_upper: (..., n), rad.
+        view_margin: (..., v), smallest V J S_t.
     """
 
-    move_lower: FloatArray
-    move_upper: FloatArray
-    change: FloatArray
+    first_lower: FloatArray
+    first_upper: FloatArray
     travel_lower: FloatArray
     travel_upper: FloatArray
     view_margin: FloatArray
@@ -96,136 +126,128 @@ class QpSolution:
     Attributes:
         success: whether the rest can be used.
         moves: (moves, n), rad.
-        objective: value of the criterion without its constant part, m².
-        bound_multiplier: (moves·n,), positive at an upper bound and negative at a lower one.
-        row_multiplier: (rows,), the same for the linear rows.
+        objective: value of the criterion, m².
+        multiplier: (moves·n + rows,), of the moves and of those rows that are within reach: positive at an upper bound,
+            negative at a lower one.
         status: the solver's own word.
-        iterations: NaN where the solver does not report them.
+        iterations: of the solver.
     """
 
     success: bool
     moves: FloatArray
     objective: float
-    bound_multiplier: FloatArray
-    row_multiplier: FloatArray
+    multiplier: FloatArray
     status: str
     iterations: float
 
 
+@final
 class QpProgram:
-    """A parametric quadratic program with its solver and warm start; the parameters are J and the targets.
+    """A parametric quadratic program; the parameters are J, the targets and the bounds.
 
     In free-moves mode there are H targets (m,) in m; in constant-move mode there is one, already integrated over the
     horizon: ∫ τ α^τ target(τ) dτ.
     """
 
     def __init__(self, shape: QpShape, solver: Solver) -> None:
-        """Build the program.
+        """Build the function of the matrices.
 
         Args:
             shape: sizes, weights and the kinds of rows.
             solver: its name.
         """
         self._shape = shape
-        self._solver = solver
-        self.x, self.p, self.objective, self.rows = _expressions(shape)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the warm start; the solver is made anew because it may keep a working set of its own."""
-        import casadi  # noqa: PLC0415 - other methods start without it
-
-        problem = {"x": self.x, "p": self.p, "f": self.objective, "g": self.rows}
-        options = {"error_on_fail": False, "print_time": False, **_SOLVER_OPTIONS[self._solver]}
-        with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made and first used
-            self._function = casadi.qpsol("mpc", self._solver, problem, options)
-            self._connect()
-            self._evaluate()
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> QpProgram:
-        """Return a program with a solver of its own at the same warm start."""
-        copy = QpProgram.__new__(QpProgram)
-        copy._shape, copy._solver = self._shape, self._solver
-        copy.x, copy.p, copy.objective, copy.rows = self.x, self.p, self.objective, self.rows
-        copy.reset()
-        for name, array in self._arrays.items():
-            copy._arrays[name][:] = array
-        for name, array in self._results.items():
-            copy._results[name][:] = array
-        return copy
-
-    def _connect(self) -> None:
-        """Give the solver views of our arrays, so that a solve converts nothing; all start at zero."""
-        buffer: Any
-        buffer, self._evaluate = self._function.buffer()
-        self._buffer = buffer
-        inputs, outputs = self._function.name_in(), self._function.name_out()
-        self._arrays = {name: np.zeros(self._function.numel_in(i)) for i, name in enumerate(inputs)}
-        self._results = {name: np.zeros(self._function.numel_out(i)) for i, name in enumerate(outputs)}
-        for i, name in enumerate(inputs):
-            buffer.set_arg(i, self._arrays[name].data)
-        for i, name in enumerate(outputs):
-            buffer.set_res(i, self._results[name].data)
+        self._solve = _solve_daqp if solver == "daqp" else _solve_qpoases
+        self._largest = np.tile(shape.largest_move, shape.moves)
+        self._function = _matrices(shape)
+        count = self._largest.size
+        self._J = np.zeros(self._function.numel_in(0))
+        self._targets = np.zeros(self._function.numel_in(1))
+        self._H, self._g, self._c = np.zeros((count, count)), np.zeros(count), np.zeros(1)
+        self._A = np.zeros((self._function.numel_out(3) // count, count))
+        self._buffer, self._evaluate = self._function.buffer()  # the second one does not keep the first one alive
+        for i, array in enumerate((self._J, self._targets)):
+            self._buffer.set_arg(i, array.data)
+        for i, array in enumerate((self._H, self._g, self._c, self._A)):
+            if array.size:
+                self._buffer.set_res(i, array.data)
 
     def solve(self, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> QpSolution:
-        """Solve for new parameters, starting from the last solution shifted by one move.
+        """Solve for new parameters.
 
         Args:
             J: (m, n), or (H, m, n) where it varies, m/rad.
             targets: (moves, m).
             bounds: finite or infinite, lower ≤ upper.
         """
-        arrays, results = self._arrays, self._results
-        arrays["p"][:] = np.concatenate([np.swapaxes(J, -1, -2).ravel(), targets.ravel()])
-        arrays["lbx"][:], arrays["ubx"][:] = bounds.move_lower.ravel(), bounds.move_upper.ravel()
-        arrays["lbg"][:], arrays["ubg"][:] = self._row_bounds(bounds)
+        self._J[:], self._targets[:] = J.ravel(), targets.ravel()
         self._evaluate()
-        stats = self._buffer.stats()
-        moves = results["x"].reshape(self._shape.moves, self._shape.n).copy()
-        success = bool(stats["success"]) and bool(np.isfinite(moves).all())
-        if success:
-            self._warm_start(moves)
-        return QpSolution(
-            success=success,
-            moves=moves,
-            objective=float(results["f"][0]),
-            bound_multiplier=results["lam_x"].copy(),
-            row_multiplier=results["lam_g"].copy(),
-            status=str(stats["unified_return_status"]),
-            iterations=float(stats["iter_count"]) if stats["iter_count"] >= 0 else float("nan"),
-        )
-
-    def _warm_start(self, moves: FloatArray) -> None:
-        self._arrays["x0"][:] = np.concatenate([moves[1:], moves[-1:]]).ravel()
-        self._arrays["lam_x0"][:] = self._results["lam_x"]
-        self._arrays["lam_g0"][:] = self._results["lam_g"]
+        n, lower, upper = self._shape.n, -self._largest, self._largest.copy()
+        lower[:n], upper[:n] = bounds.first_lower, bounds.first_upper
+        row_lower, row_upper = self._row_bounds(bounds)
+        # Rows that no move within its limits can touch change nothing but the time.
+        reach = np.abs(self._A) @ self._largest
+        near = (row_lower > -reach) | (row_upper < reach)
+        lower, upper = np.concatenate([lower, row_lower[near]]), np.concatenate([upper, row_upper[near]])
+        x, value, multiplier, status, iterations = self._solve(self._H, self._g, self._A[near], lower, upper)
+        success = not status and bool(np.isfinite(x).all())
+        return QpSolution(success, x.reshape(-1, n), value + float(self._c[0]), multiplier, status, float(iterations))
 
     def _row_bounds(self, bounds: QpBounds) -> tuple[FloatArray, FloatArray]:
-        """The bounds of the rows, in the order in which `_expressions` stacks them."""
+        """Return the bounds of the rows in the order in which `_matrices` stacks them."""
         shape = self._shape
-        lower, upper = [], []
-        if shape.limit_acceleration:
-            lower.append(_repeat(-bounds.change, shape.moves - 1))
-            upper.append(_repeat(bounds.change, shape.moves - 1))
+        lower: list[FloatArray] = []
+        upper: list[FloatArray] = []
+        if shape.largest_change is not None:
+            lower += [-shape.largest_change] * (shape.moves - 1)
+            upper += [shape.largest_change] * (shape.moves - 1)
         if shape.limit_position:
-            lower.append(_repeat(bounds.travel_lower, shape.moves))
-            upper.append(_repeat(bounds.travel_upper, shape.moves))
-        lower.append(_repeat(bounds.view_margin, shape.moves))
-        upper.append(np.full(lower[-1].size, np.inf))
+            lower += [bounds.travel_lower] * shape.moves
+            upper += [bounds.travel_upper] * shape.moves
+        lower += [bounds.view_margin] * shape.moves
+        upper += [np.full(shape.moves * len(shape.view_rows), math.inf)]
         return np.concatenate(lower), np.concatenate(upper)
 
 
-def _repeat(row: FloatArray, count: int) -> FloatArray:
-    """Return `row` `count` times in a row; numpy's own `tile` costs as much as a small solve."""
-    return np.broadcast_to(row, (count, row.size)).ravel()
+_Answer: TypeAlias = tuple[
+    FloatArray, float, FloatArray, str, int
+]  # x, criterion, multipliers, error or "", iterations
 
 
-def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
-    """Return variables, parameters, criterion and rows as SX expressions."""
+def _solve_daqp(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray) -> _Answer:
+    x, value, flag, information = daqp.solve(H, g, A, upper, lower, **_DAQP_OPTIONS)
+    status = "" if flag == 1 else _DAQP_STATUS.get(flag, f"exit flag {flag}")
+    return x, value, information["lam"], status, information["iterations"]
+
+
+def _solve_qpoases(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray) -> _Answer:
+    """Solve with a solver of its own, because qpOASES starts from the working set of the solve before."""
+    import casadi  # noqa: PLC0415 - other methods start without it
+
+    n = len(g)
+    structure = {"h": casadi.Sparsity.dense(n, n), "a": casadi.Sparsity.dense(len(A), n)}
+    options: dict[str, Any] = {"error_on_fail": False, "print_time": False, **_QPOASES_OPTIONS}
+    with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made and first used
+        solver = casadi.conic("mpc", "qpoases", structure, options)
+        found = solver(h=H, g=g, a=A, lbx=lower[:n], ubx=upper[:n], lba=lower[n:], uba=upper[n:])
+    statistics = solver.stats()
+    multiplier = np.concatenate([np.asarray(found[name]).ravel() for name in ("lam_x", "lam_a")])
+    status = "" if statistics["success"] else str(statistics["return_status"])
+    return np.asarray(found["x"]).ravel(), float(found["cost"]), multiplier, status, statistics["iter_count"]
+
+
+@lru_cache(maxsize=16)
+def _matrices(shape: QpShape) -> Any:  # noqa: ANN401 - casadi.Function
+    """Return (J, targets) -> H, g, c, Aᵀ of the criterion ½ xᵀHx + gᵀx + c and the rows A x, as dense matrices.
+
+    CasADi stores columns first: what it takes and returns is transposed here, so that numpy sees rows first. Building
+    takes longer than many a run, so that controllers of equal programs share the function.
+    """
     import casadi  # noqa: PLC0415 - other methods start without it
 
     blocks = shape.horizon if shape.varying_jacobian else 1
-    J = [casadi.SX.sym(f"J{t}", shape.m, shape.n) for t in range(blocks)]
+    transposed = [casadi.SX.sym(f"J{t}", shape.n, shape.m) for t in range(blocks)]
+    J = [block.T for block in transposed]
     dq = casadi.SX.sym("dq", shape.n, shape.moves)
     targets = casadi.SX.sym("targets", shape.m, shape.moves)
     travel = casadi.cumsum(dq, 1) if shape.constant_gain is None else shape.horizon * dq
@@ -237,12 +259,15 @@ def _expressions(shape: QpShape) -> tuple[Any, Any, Any, Any]:
         step = J[0] @ dq
         cost = 0.5 * shape.constant_gain * casadi.dot(step, step) - casadi.dot(targets, step)
     cost += 0.5 * casadi.dot(casadi.repmat(casadi.DM(shape.move_weight), 1, shape.moves), dq**2)
-    rows = []
-    if shape.limit_acceleration:
+    rows = [casadi.SX(0, 1)]
+    if shape.largest_change is not None:
         rows.append(casadi.vec(dq[:, 1:] - dq[:, :-1]))
     if shape.limit_position:
         rows.append(casadi.vec(travel))
     if len(shape.view_rows):
         rows.append(casadi.vec(casadi.DM(shape.view_rows) @ shift))
-    parameters = casadi.vertcat(*(casadi.vec(block) for block in (*J, targets)))
-    return casadi.vec(dq), parameters, cost, casadi.vertcat(*rows)
+    x = casadi.vec(dq)
+    A, _ = casadi.linear_coeff(casadi.vertcat(*rows), x)
+    results = casadi.cse([casadi.densify(part) for part in (*casadi.quadratic_coeff(cost, x), A.T)])
+    create: Any = casadi.Function  # its annotations do not know SX
+    return create("program", [casadi.horzcat(*transposed), targets], results)
