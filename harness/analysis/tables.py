@@ -30,6 +30,7 @@ Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 
 SWEPT: Final = ("noise_factor", "latency_periods")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
+SWEEP_COLUMNS: Final = (*CONDITIONS, "task", "controller", "status", "settling_time_s")  # what `sweep_tables` reads
 TAIL: Final = 0.95
 MAX_REASON: Final = 60  # characters of a reason that are shown in a table
 SUMMARY_LEGEND: Final = (

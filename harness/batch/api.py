@@ -16,8 +16,10 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Cell, Execution, carry_out, comparison
+from servobench.harness.batch.blocks import Cell
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.grid import Grid
 from servobench.harness.config.registry import controller_names, offering
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
@@ -107,7 +109,7 @@ def compare(
         ConfigurationError: something that cannot be used; it is a ValueError.
     """
     names, entries = _named(controllers)
-    chosen = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
+    chosen = range(seeds) if isinstance(seeds, int) else tuple(seeds)
     batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen)
     for what, values in (("controllers", names), ("plants", plants), ("tasks", tasks), ("mismatches", mismatches),
                          ("seeds", chosen)):  # fmt: skip
@@ -120,8 +122,8 @@ def compare(
         carry_out(comparison(batch, whole, entries), Path(out), how)
         return results.load_runs(Path(out))
     with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
-        cells = [Cell(request) for request in batch.requests()]
-        carry_out(Campaign(cells, whole, entries=entries), Path(folder), replace(how, resume=False))
+        campaign = Campaign(Grid(Cell, batch.requests()), whole, entries=entries)
+        carry_out(campaign, Path(folder), replace(how, resume=False))
         return results.load_runs(Path(folder))
 
 

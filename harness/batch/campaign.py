@@ -1,63 +1,35 @@
 """The one driver of all batches: runs into one results folder, resumable, with every failure of a run as a row.
 
-`compare`, `sweep`, `robustness` and `claims` are campaigns; `tune` uses the lower half, `carry_out_chunks`. Runs go to
-workers in chunks. Each finished chunk becomes a part of the results folder, written by this process; what is there
-counts. A campaign that is resumed carries out the runs that are missing, so that its tables are those of an undisturbed
-one, wall-clock columns aside.
-
-A run that kills its process (an FMU may), or takes longer than the time limit, becomes a row that says so. If it was
-one of a chunk, the runs of that chunk are carried out again one by one, so that the others are not lost.
+`compare`, `sweep`, `robustness` and `claims` are campaigns; `tune` uses the lower half, the module `blocks`. Each block
+of runs that is finished becomes a part of the results folder, written by this process; what is there counts. A campaign
+that is resumed carries out the runs that are missing, so that its tables are those of an undisturbed one, wall-clock
+columns aside. Runs are made when they are needed, so that the memory of this process does not grow with their number.
 """
 
 from __future__ import annotations
 
-import pickle
-from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain, pairwise
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any, Final
+from typing import Any
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
+from servobench.harness.batch.blocks import BLOCK, CHUNK, Cell, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
+from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.manifest import describe_batch
+from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Workers, open_workers
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run import episode
-from servobench.harness.run.episode import CRASHED, TIMED_OUT, RunResult, describe_error, failed_row
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, known_sections, resolve_sections, select
+from servobench.harness.run.together import side_by_side_key
 
-CHUNK: Final = 8  # [runs] without steps; a crash costs at most so many, and messages and files cost little
-LOST: Final = "the run killed the process that carried it out"
 Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A run and its further columns in the table of runs."""
-
-    request: RunRequest
-    columns: Mapping[str, Any] = field(default_factory=dict)  # such as the place along the axis that a sweep varies
-    picture: bool = False  # keep what the camera saw last
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Consecutive cells with their settings, and controllers that the registry does not know."""
-
-    index: int  # of the first cell
-    jobs: tuple[tuple[Cell, ResolvedRun], ...]
-    entries: tuple[ControllerEntry, ...] = ()
-
-    def singly(self) -> list[Chunk]:
-        """Return each run as a chunk of its own."""
-        return [Chunk(self.index + i, (job,), self.entries) for i, job in enumerate(self.jobs)]
 
 
 @dataclass(frozen=True)
@@ -72,8 +44,12 @@ class Campaign:
 
 def comparison(batch: Batch, settings: Settings, entries: tuple[ControllerEntry, ...] = ()) -> Campaign:
     """Return the campaign of a comparison, with steps and, for the first seed, what the camera saw last."""
-    cells = [Cell(request, picture=request.seed == min(batch.seeds)) for request in batch.requests()]
-    return Campaign(cells, settings, steps=True, entries=entries)
+    first = min(batch.seeds)
+
+    def cell(request: RunRequest) -> Cell:
+        return Cell(request, picture=request.seed == first)
+
+    return Campaign(Grid(cell, batch.requests()), settings, steps=True, entries=entries)
 
 
 class Observer:
@@ -101,6 +77,7 @@ class Execution:
     run_timeout: float | None = None  # [s] time limit of a run; None for no limit
     resume: bool = False  # carry out what is missing in the folder
     observer: Observer = field(default_factory=Observer)  # receives the progress
+    block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
 
     def of_part(self, folder: Path) -> Execution:
         """Return how a part of a study is carried out: one that was not begun cannot be resumed."""
@@ -121,59 +98,44 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         ConfigurationError: a campaign that cannot be carried out, or a folder that cannot be used.
     """
     with offering(campaign.entries):
-        sections = check_campaign(campaign, how.observer)
-    manifest = describe_batch([cell.request for cell in campaign.cells], sections, steps=campaign.steps)
-    if how.resume:
-        results.read_manifest(folder)
-    names = {"plants": manifest["plants"], "controllers": manifest["controllers"]}
-    with (
-        open_workers(how.workers, how.scheduler, how.run_timeout, **names) as place,
-        results.locked(folder, new=not how.resume),
-    ):
+        runs = survey(Grid(_request, campaign.cells))
+        sections = check_campaign(campaign, runs, how.observer)
+        jobs = _Jobs(campaign, sections, together=how.block > 1)
+        side_by_side = jobs.side_by_side(runs.examples)
+        manifest = describe_batch(runs, sections, side_by_side, steps=campaign.steps)
         if how.resume:
-            check_same_campaign(folder, manifest, how.observer)
-        else:
-            results.create_folder(folder, manifest)
-        if (folder / results.PARTS).is_dir():
-            done = results.finished_runs(folder)
-            how.observer.begin(len(campaign.cells), len(done))
-            size = 1 if campaign.steps or how.run_timeout is not None else CHUNK
-            keep = folder if campaign.steps and place.local else None
-            chunks = _missing_chunks(campaign, sections, done, size)
-            for chunk, outcome in carry_out_chunks(chunks, place, steps=campaign.steps, keep=keep):
-                results.write_part(folder, chunk.index, outcome)
-                how.observer.finished([result.row for result in outcome])
-        results.collect(folder)
+            results.read_manifest(folder)
+        with (
+            open_workers(
+                how.workers, how.scheduler, how.run_timeout, plants=runs.plants, controllers=runs.controllers
+            ) as place,
+            results.locked(folder, new=not how.resume),
+        ):
+            if how.resume:
+                check_same_campaign(folder, manifest, how.observer)
+            else:
+                results.create_folder(folder, manifest)
+            if (folder / results.PARTS).is_dir():
+                _carry_out_missing(campaign, jobs, folder, place, how)
+            results.collect(folder)
 
 
-def check_campaign(campaign: Campaign, observer: Observer) -> dict[str, Any]:
+def check_campaign(campaign: Campaign, runs: Survey, observer: Observer) -> dict[str, Any]:
     """Refuse what cannot be run, before anything is written; networks that are needed are trained.
 
-    Runs are built and thrown away until every plant was built with every mismatch, noise factor, latency and
-    controller, and every task once.
+    The examples among the runs are built and thrown away.
 
     Returns:
         The typed settings of the runs by section.
 
     Raises:
-        ConfigurationError: a name, setting or mismatch that cannot be used, a run that is asked for twice, or a seed
-            that is kept for tuning.
+        ConfigurationError: a name, setting or mismatch that cannot be used, or a seed that is kept for tuning.
     """
-    requests = {cell.request.run_id: cell.request for cell in campaign.cells}
-    if len(requests) < len(campaign.cells):
-        counts = Counter(cell.request.run_id for cell in campaign.cells)
-        raise ConfigurationError(f"the run {counts.most_common(1)[0][0]} is asked for twice")
-    refuse_tuning_seeds(request.seed for request in requests.values())
-    names = {name for request in requests.values() for name in (request.plant, request.controller)}
-    campaign.settings.check_sections([*known_sections(), *names])
-    sections = resolve_sections(requests.values(), campaign.settings)
-    built: set[tuple[object, ...]] = set()
-    for request in requests.values():
-        conditions = (request.mismatch, request.noise_factor, request.latency_periods)
-        new = {(request.plant, *conditions), (request.plant, request.controller), (request.task,)} - built
-        if new:
-            build_once(select(request, sections), observer.training)
-            built |= new
+    refuse_tuning_seeds(chain.from_iterable(runs.seeds))
+    campaign.settings.check_sections([*known_sections(), *runs.plants, *runs.controllers])
+    sections = resolve_sections(runs.examples, campaign.settings)
+    for request in runs.examples:
+        build_once(select(request, sections), observer.training)
     return sections
 
 
@@ -191,101 +153,57 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
             observer.note(f"note: {folder} was begun with other {what}; later runs may differ")
 
 
-def carry_out_chunks(
-    chunks: Iterable[Chunk], workers: Workers, *, steps: bool = False, keep: Path | None = None
-) -> Iterator[tuple[Chunk, list[RunResult]]]:
-    """Carry out chunks of runs and yield each, whole or run by run, with its results as it finishes, in any order.
+class _Jobs:
+    """Makes the jobs of a campaign; runs that differ in seed and mismatch only share their settings."""
 
-    Args:
-        chunks: the runs.
-        workers: where.
-        steps: return the tables of steps too.
-        keep: results folder in which trained networks are kept beside the runs.
-    """
-    waiting = deque(chunks)
-    if workers.submit is None:
-        for chunk in waiting:
-            yield chunk, _carry_out(chunk, steps, keep)
-        return
-    finished: SimpleQueue[tuple[Chunk, Any]] = SimpleQueue()
-    under_way = 0
-    while waiting or under_way:
-        while waiting and under_way < workers.window:
-            chunk = waiting.popleft()
-            future = workers.submit(_unpack, _pack(chunk, steps, keep))
-            future.add_done_callback(lambda done, chunk=chunk: finished.put((chunk, done)))
-            under_way += 1
-        chunk, future = finished.get()
-        under_way -= 1
-        outcome = _outcome(chunk, future, workers)
-        if outcome is None:
-            waiting.extendleft(reversed(chunk.singly()))
-        else:
-            yield chunk, outcome
+    def __init__(self, campaign: Campaign, sections: dict[str, Any], *, together: bool) -> None:
+        self._cells, self._sections = campaign.cells, sections
+        self._together = together and not campaign.steps
+        self._resolved: dict[tuple[object, ...], ResolvedRun] = {}
 
+    def at(self, indices: Iterable[int]) -> Iterator[Job]:
+        """Yield the jobs of some cells."""
+        for index in indices:
+            cell = self._cells[index]
+            run = self._resolve(cell.request)
+            yield Job(index, cell, run, None if cell.picture else self._kind(run))
 
-def _outcome(chunk: Chunk, future: Any, workers: Workers) -> list[RunResult] | None:  # noqa: ANN401 - of pebble or Dask
-    """Return the results of a chunk; None if it died with several runs, which are to be carried out one by one."""
-    try:
-        answer: list[RunResult] | str = future.result()
-    except workers.lost:
-        status, reason = CRASHED, LOST
-    except TimeoutError:
-        status, reason = TIMED_OUT, f"the run took longer than {workers.run_timeout:g} s"
-    except BrokenProcessPool as error:
-        raise ConfigurationError(
-            "the worker processes cannot be started; a script that starts several must keep its calls below "
-            "`if __name__ == '__main__':`"
-        ) from error
-    else:
-        if not isinstance(answer, str):
-            return answer
-        status, reason = CRASHED, answer
-    return [_failed(chunk.jobs[0][0], status, reason)] if len(chunk.jobs) == 1 else None
+    def side_by_side(self, examples: Iterable[RunRequest]) -> dict[str, list[str]]:
+        """Return by plant the controllers whose runs advance together."""
+        found: dict[str, dict[str, None]] = {}
+        for request in examples:
+            if self._kind(self._resolve(request)) is not None:
+                found.setdefault(request.plant, {})[request.controller] = None
+        return {plant: list(controllers) for plant, controllers in found.items()}
+
+    def _resolve(self, request: RunRequest) -> ResolvedRun:
+        known = request.plant, request.controller, request.task, request.noise_factor, request.latency_periods
+        if known not in self._resolved:
+            self._resolved[known] = select(request, self._sections)
+        return replace(self._resolved[known], request=request)
+
+    def _kind(self, run: ResolvedRun) -> Hashable | None:
+        return side_by_side_key(run) if self._together else None
 
 
-def _missing_chunks(campaign: Campaign, sections: dict[str, Any], done: set[int], size: int) -> Iterator[Chunk]:
-    """Yield the runs that are not in `done` in chunks of at most `size` consecutive runs."""
-    chunks: list[list[int]] = []
-    for index in (i for i in range(len(campaign.cells)) if i not in done):
-        if chunks and chunks[-1][-1] == index - 1 and len(chunks[-1]) < size:
-            chunks[-1].append(index)
-        else:
-            chunks.append([index])
-    for own in chunks:
-        cells = [campaign.cells[i] for i in own]
-        yield Chunk(own[0], tuple((cell, select(cell.request, sections)) for cell in cells), campaign.entries)
+def _carry_out_missing(campaign: Campaign, jobs: _Jobs, folder: Path, place: Workers, how: Execution) -> None:
+    """Carry out the runs whose part is not in the folder."""
+    total = len(campaign.cells)
+    done = results.finished_runs(folder)
+    missing = total - sum(map(len, done))
+    how.observer.begin(total, total - missing)
+    gaps = (range(one.stop, next_one.start) for one, next_one in pairwise([range(0), *done, range(total, total)]))
+    blocks = cut(
+        jobs.at(chain.from_iterable(gaps)),
+        even_size(missing, place.count, how.block),
+        1 if campaign.steps or how.run_timeout is not None else CHUNK,
+        campaign.entries,
+    )
+    keep = folder if campaign.steps and place.local else None
+    for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep):
+        results.write_part(folder, block.index, outcome)
+        how.observer.finished([result.row for result in outcome])
 
 
-def _pack(chunk: Chunk, steps: bool, keep: Path | None) -> bytes:
-    try:
-        return pickle.dumps((chunk, steps, keep))
-    except Exception as error:
-        what = f"the run {chunk.jobs[0][0].request.run_id} cannot be sent to another process"
-        raise ConfigurationError(f"{what}: {error}; use one worker") from error
-
-
-def _unpack(task: bytes) -> list[RunResult] | str:
-    """Carry out a task in a worker; where it cannot be read, such as without its plug-in, return why."""
-    try:
-        chunk, steps, keep = pickle.loads(task)
-    except Exception as error:  # noqa: BLE001 - of a plug-in
-        return describe_error(error)
-    return _carry_out(chunk, steps, keep)
-
-
-def _carry_out(chunk: Chunk, steps: bool, keep: Path | None) -> list[RunResult]:
-    with offering(chunk.entries):
-        return [_carry_out_run(cell, run, steps, keep) for cell, run in chunk.jobs]
-
-
-def _carry_out_run(cell: Cell, run: ResolvedRun, steps: bool, keep: Path | None) -> RunResult:
-    try:
-        result = episode.carry_out(run, steps=steps, picture=cell.picture, keep=keep)
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a plug-in does, the others go on
-        return _failed(cell, CRASHED, describe_error(error))
-    return RunResult({**result.row, **cell.columns}, result.steps, result.picture)
-
-
-def _failed(cell: Cell, status: str, reason: str) -> RunResult:
-    return RunResult({**failed_row(cell.request, status, reason), **cell.columns}, None)
+def _request(cell: Cell) -> RunRequest:
+    return cell.request

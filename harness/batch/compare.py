@@ -6,13 +6,14 @@ others, so that no method is judged by a robot on which it was tuned.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Final
 
+from servobench.harness.batch.grid import Grid
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.plant.robot.mismatch import Mismatch
 
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 
@@ -25,18 +26,19 @@ class Batch:
     controllers: tuple[str, ...]
     tasks: tuple[str, ...]
     mismatches: tuple[str, ...]
-    seeds: tuple[int, ...]
+    seeds: Sequence[int]
 
-    def requests(self) -> list[RunRequest]:
+    def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
-        order = product(self.plants, self.tasks, self.mismatches, self.controllers, self.seeds)
-        return [
-            RunRequest(plant, controller, task, read_mismatch(mismatch), seed)
-            for plant, task, mismatch, controller, seed in order
-        ]
+        mismatches = [read_mismatch(text) for text in self.mismatches]
+        return Grid(_request, self.plants, self.tasks, mismatches, self.controllers, self.seeds)
 
 
-def parse_seeds(text: str) -> tuple[int, ...]:
+def _request(plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
+    return RunRequest(plant, controller, task, mismatch, seed)
+
+
+def parse_seeds(text: str) -> Sequence[int]:
     """Return the seeds that `text` names: a count `5`, a list `3,1,4`, or a range `100:120` (end not included).
 
     Raises:
@@ -45,18 +47,18 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     try:
         if ":" in text:
             begin, end = (int(part) for part in text.split(":"))
-            seeds = tuple(range(begin, end))
+            seeds: Sequence[int] = range(begin, end)
         elif "," in text:
-            seeds = tuple(int(part) for part in text.split(",") if part.strip())
+            seeds = tuple(dict.fromkeys(int(part) for part in text.split(",") if part.strip()))
         else:
-            seeds = tuple(range(int(text)))
+            seeds = range(int(text))
     except ValueError as error:
         raise ConfigurationError(
             f"seeds must be a count (5), a list (3,1,4) or a range (100:120), got {text!r}"
         ) from error
     if not seeds or min(seeds) < 0:
         raise ConfigurationError(f"seeds must name at least one seed, none of them negative; got {text!r}")
-    return tuple(dict.fromkeys(seeds))
+    return seeds
 
 
 def tuning_seeds(count: int, offset: int = 0) -> tuple[int, ...]:

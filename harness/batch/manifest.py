@@ -6,14 +6,14 @@ import hashlib
 import json
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from servobench.harness.batch.survey import Survey
 from servobench.harness.config.settings import flatten
-from servobench.harness.run.request import RunRequest
 
 PACKAGES = (
     "servobench",
@@ -31,36 +31,33 @@ PACKAGES = (
 
 
 def describe_batch(
-    requests: Sequence[RunRequest], sections: Mapping[str, Any], *, steps: bool = False
+    runs: Survey, sections: Mapping[str, Any], side_by_side: Mapping[str, list[str]], *, steps: bool = False
 ) -> dict[str, Any]:
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
     Args:
-        requests: the runs asked for.
+        runs: what was asked for.
         sections: their typed settings by section, as `servobench.harness.run.resolved.resolve_sections` returns them.
+        side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
         steps: the table of steps is kept, too.
     """
     configuration = {name: flatten(config) for name, config in sections.items()}
-    identity = {"runs": [request.run_id for request in requests], "configuration": configuration}
-    text = json.dumps({**identity, **({"steps": True} if steps else {})}, sort_keys=True, default=str)
-
-    def used(kind: str) -> list[str]:
-        return list(dict.fromkeys(str(getattr(request, kind)) for request in requests))
-
+    identity = json.dumps([runs.digest, configuration, steps], sort_keys=True, default=str)
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "plants": used("plant"),
-        "controllers": used("controller"),
-        "tasks": used("task"),
-        "mismatches": used("mismatch"),
-        "seeds": sorted({request.seed for request in requests}),
+        "plants": list(runs.plants),
+        "controllers": list(runs.controllers),
+        "tasks": list(runs.tasks),
+        "mismatches": list(runs.mismatches),
+        "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
         "configuration": configuration,
         "packages": {name: _version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
         "git_commit": _git_commit(),
-        "run_count": len(requests),
-        "campaign": hashlib.sha256(text.encode()).hexdigest(),
+        "side_by_side": dict(side_by_side),
+        "run_count": runs.count,
+        "campaign": hashlib.sha256(identity.encode()).hexdigest(),
     }
 
 

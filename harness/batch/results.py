@@ -1,6 +1,6 @@
 """A folder of results: `runs.parquet` (a row a run), `steps.parquet` (a row a period), `manifest.json`.
 
-While runs are under way, finished ones lie below `parts/`: a pair of files for each run or chunk of runs, each written
+While runs are under way, finished ones lie below `parts/`: a pair of files for each run or block of runs, each written
 atomically, steps first, so that a part counts once its rows are there. At the end the parts are put together. If the
 process was killed, `load_runs` and `load_steps` read the parts, and `collect` puts together what there is.
 """
@@ -12,10 +12,10 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import pandas as pd
 import pyarrow as pa
@@ -36,6 +36,7 @@ RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 MANIFEST = "manifest.json"
 LOCK = ".lock"
+ROW_GROUP: Final = 4096  # [rows] of a table that are in memory at a time while parts are put together
 
 
 @contextlib.contextmanager
@@ -125,7 +126,19 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult]) -> None:
     steps = [result.steps for result in outcome if result.steps is not None and len(result.steps)]
     if steps:
         _write_frame(pd.concat(steps, ignore_index=True), folder / PARTS / f"{index:08d}.{STEPS}")
-    _write_frame(pd.DataFrame([result.row for result in outcome]), folder / PARTS / f"{index:08d}.{RUNS}")
+    rows = _table([result.row for result in outcome])
+    write_atomically(folder / PARTS / f"{index:08d}.{RUNS}", partial(pq.write_table, rows))
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
+    """Return rows as a table with the columns of all; NaN is null, and a column of NaN alone is one of numbers."""
+
+    def column(name: str) -> pa.Array:
+        values = [row.get(name) for row in rows]
+        made = pa.array(values, from_pandas=True)
+        return made.cast(pa.float64()) if pa.types.is_null(made.type) and float in map(type, values) else made
+
+    return pa.table({name: column(name) for name in dict.fromkeys(name for row in rows for name in row)})
 
 
 def _write_picture(path: Path, picture: ImageArray) -> None:
@@ -150,10 +163,10 @@ def write_summary(folder: Path, tables: dict[str, pd.DataFrame], manifest: dict[
     write_manifest(folder, manifest)
 
 
-def finished_runs(folder: Path) -> set[int]:
-    """Return the indices of the runs whose part is there."""
+def finished_runs(folder: Path) -> list[range]:
+    """Return the indices of the runs whose part is there, in order."""
     begins = ((int(path.name.split(".")[0]), pq.read_metadata(path).num_rows) for path in _part_files(folder, RUNS))
-    return {index for begin, count in begins for index in range(begin, begin + count)}
+    return [range(begin, begin + count) for begin, count in begins]
 
 
 def collect(folder: Path) -> int:
@@ -171,27 +184,30 @@ def collect(folder: Path) -> int:
         if count >= wanted:  # the tables are whole, at most the clean-up is left
             shutil.rmtree(folder / PARTS, ignore_errors=True)
             return count
-    row_files = _part_files(folder, RUNS)
-    if not row_files:
+    if not _part_files(folder, RUNS):
         raise ConfigurationError(f"{folder} holds no finished run")
     for kind in (STEPS, RUNS):
-        data = _dataset(_part_files(folder, kind))
-        if data is not None:
-            write_atomically(folder / kind, partial(_write_batches, data))
+        files = _part_files(folder, kind)
+        if files:
+            write_atomically(folder / kind, partial(_join, files))
     count = int(pq.read_metadata(folder / RUNS).num_rows)
     if count >= wanted:
         shutil.rmtree(folder / PARTS)
     return count
 
 
-def load_runs(folder: Path) -> pd.DataFrame:
+def load_runs(folder: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
     """Return the table of runs of a results folder, also of one whose batch was killed.
+
+    Args:
+        folder: the folder.
+        columns: names of the columns to read, as far as there are such; None for all.
 
     Raises:
         ConfigurationError: not a results folder, or one of another schema.
     """
     check_folder(folder)
-    return _load(folder, RUNS)
+    return _load(folder, RUNS, columns=columns)
 
 
 def load_steps(folder: Path, run_ids: list[str] | None = None) -> pd.DataFrame:
@@ -261,27 +277,42 @@ def _part_files(folder: Path, kind: str) -> list[Path]:
     return [path for path in files if path.is_file()]
 
 
-def _load(folder: Path, kind: str, only: ds.Expression | None = None) -> pd.DataFrame:
-    data = _dataset([folder / kind] if (folder / kind).is_file() else _part_files(folder, kind))
-    if data is None:
+def _load(
+    folder: Path, kind: str, only: ds.Expression | None = None, columns: Sequence[str] | None = None
+) -> pd.DataFrame:
+    paths = [folder / kind] if (folder / kind).is_file() else _part_files(folder, kind)
+    if not paths:
         return pd.DataFrame()
-    table: pd.DataFrame = data.to_table(filter=only).to_pandas()
+    schema = _common_schema(paths)
+    wanted = [name for name in schema.names if columns is None or name in columns]
+    data = ds.dataset([str(path) for path in paths], schema)
+    table: pd.DataFrame = data.to_table(filter=only, columns=wanted).to_pandas()
     return table
 
 
-def _dataset(paths: Sequence[Path]) -> ds.Dataset | None:
-    """Return tables as one with the columns of all; what a table lacks is null. None where there is no table."""
-    if not paths:
-        return None
-    schemas = [pq.read_schema(path).remove_metadata() for path in paths]
-    return ds.dataset([str(path) for path in paths], pa.unify_schemas(schemas, promote_options="permissive"))
+def _common_schema(paths: Sequence[Path]) -> pa.Schema:
+    """Return the columns of all tables; of a column that one has as nothing, the type is that of the others."""
+    common = pa.schema([])
+    for path in paths:
+        own = pq.read_schema(path).remove_metadata()
+        if own != common:
+            common = pa.unify_schemas([common, own], promote_options="permissive")
+    return common
 
 
-def _write_batches(data: ds.Dataset, path: Path) -> None:
-    """Write a table without holding all of it in memory."""
-    with pq.ParquetWriter(path, data.schema) as writer:
-        for batch in data.to_batches(batch_readahead=1, fragment_readahead=1):
-            writer.write_batch(batch)
+def _join(paths: Sequence[Path], path: Path) -> None:
+    """Write tables as one, holding few rows in memory; what a table lacks is null."""
+    empty = _common_schema(paths).empty_table()
+    with pq.ParquetWriter(path, empty.schema) as writer:
+        waiting = empty
+        for file in paths:
+            with pq.ParquetFile(file) as part:  # threads and datasets would hold memory that grows with the parts
+                waiting = pa.concat_tables([waiting, part.read(use_threads=False)], promote_options="permissive")
+            if len(waiting) >= ROW_GROUP:
+                writer.write_table(waiting)
+                waiting = empty
+        if len(waiting):
+            writer.write_table(waiting)
 
 
 def _write_frame(frame: pd.DataFrame, path: Path) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import product
+from functools import cached_property, lru_cache
 from typing import Any, TypeAlias
 
-from servobench.harness.batch.campaign import Cell
+from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.grid import Grid
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest
-from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
+from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
 
 Variation: TypeAlias = tuple[str, tuple[Magnitude, ...]]
 
@@ -25,27 +26,36 @@ class SweepPlan:
     noise_factors: tuple[float, ...] = (1.0,)  # on the plants' sensor noise
     latencies: tuple[int | None, ...] = (None,)  # [periods]; None for what a plant is configured with
 
-    def cells(self) -> list[Cell]:
+    def cells(self) -> Grid[Cell]:
         """Return the runs, seeds varying fastest."""
-        places: list[tuple[str, Magnitude] | None] = [
-            (axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes
-        ]
-        return [
-            _cell(replace(request, noise_factor=noise, latency_periods=latency), place)
-            for place, noise, latency in product(places or [None], self.noise_factors, self.latencies)
-            for request in self.batch.requests()
-        ]
+        places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
+        return Grid(_cell, places or [Place()], self.noise_factors, self.latencies, self.batch.requests())
 
 
-def place_columns(axis: str = "", magnitude: Magnitude | None = None) -> dict[str, Any]:
-    """Return the columns that say where a run stands on the axis that is varied; empty and NaN where none is."""
-    number, unit = (math.nan, "") if magnitude is None else (magnitude.number, magnitude.unit)
-    return {"axis": axis, "magnitude": number, "unit": unit}
+@dataclass(frozen=True)
+class Place:
+    """Where a run stands on the axis that is varied; without an axis, none is."""
+
+    axis: str = ""
+    magnitude: Magnitude | None = None
+
+    @cached_property
+    def columns(self) -> dict[str, Any]:
+        """The columns of the table of runs that say so; empty and NaN without an axis."""
+        number, unit = (math.nan, "") if self.magnitude is None else (self.magnitude.number, self.magnitude.unit)
+        return {"axis": self.axis, "magnitude": number, "unit": unit}
+
+    def vary(self, request: RunRequest) -> RunRequest:
+        """Return a run with the axis put on top of its mismatch."""
+        if self.magnitude is None:
+            return request
+        return replace(request, mismatch=_with_axis(request.mismatch, self.axis, self.magnitude))
 
 
-def vary(request: RunRequest, axis: str, magnitude: Magnitude) -> RunRequest:
-    """Return a run with one axis put on top of its mismatch."""
-    return replace(request, mismatch=request.mismatch.with_axis(axis, magnitude))
+@lru_cache
+def _with_axis(mismatch: Mismatch, axis: str, magnitude: Magnitude) -> Mismatch:
+    """Return the same object for all runs at one place, so that messages to workers hold it once."""
+    return mismatch.with_axis(axis, magnitude)
 
 
 def parse_variation(text: str) -> Variation:
@@ -63,5 +73,5 @@ def parse_variation(text: str) -> Variation:
         raise ConfigurationError(f"--vary: {error}") from error
 
 
-def _cell(request: RunRequest, place: tuple[str, Magnitude] | None) -> Cell:
-    return Cell(request, place_columns()) if place is None else Cell(vary(request, *place), place_columns(*place))
+def _cell(place: Place, noise: float, latency: int | None, request: RunRequest) -> Cell:
+    return Cell(replace(place.vary(request), noise_factor=noise, latency_periods=latency), place.columns)

@@ -31,9 +31,14 @@ class Workers:
     """A place where runs are carried out."""
 
     submit: Callable[..., Any] | None = None  # as `submit` of an executor; None: runs stay in this process
-    window: int = 1  # number of tasks that are handed out at a time
+    count: int = 1  # number of tasks that are carried out at a time
     lost: tuple[type[BaseException], ...] = ()  # what a future raises if the process that carried out its task died
-    run_timeout: float | None = None  # [s] time limit of a run; None for no limit
+    run_timeout: float | None = None  # [s] time limit of a task; None for no limit
+
+    @property
+    def window(self) -> int:
+        """How many tasks are handed out at a time."""
+        return TASKS_PER_WORKER * self.count
 
     @property
     def local(self) -> bool:
@@ -87,7 +92,7 @@ def open_workers(
                 return pool.schedule(function, arguments, timeout=run_timeout)
 
         try:
-            yield Workers(submit, TASKS_PER_WORKER * count, (ProcessExpired,), run_timeout)
+            yield Workers(submit, count, (ProcessExpired,), run_timeout)
         finally:
             pool.stop()  # type: ignore[no-untyped-call]
             pool.join()
@@ -139,6 +144,6 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
             return client.submit(function, *arguments, pure=False)
 
         threads = sum(client.nthreads().values())
-        yield Workers(submit, TASKS_PER_WORKER * threads, (KilledWorker,))
+        yield Workers(submit, threads, (KilledWorker,))
     finally:
         client.close()

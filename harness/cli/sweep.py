@@ -36,7 +36,7 @@ def sweep(
     config: options.ConfigOption = None,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
-    from servobench.harness.analysis.tables import SWEEP_LEGEND, sweep_tables
+    from servobench.harness.analysis.tables import SWEEP_COLUMNS, SWEEP_LEGEND, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, Execution, carry_out
     from servobench.harness.batch.compare import Batch, parse_seeds
@@ -59,7 +59,7 @@ def sweep(
     campaign = Campaign(plan.cells(), read_settings(config, set_ or []))
     with watching(console, out) as observer:
         carry_out(campaign, out, Execution(workers, scheduler, run_timeout, resume, observer))
-    print_tables(sweep_tables(results.load_runs(out)), SWEEP_LEGEND)
+    print_tables(sweep_tables(results.load_runs(out, SWEEP_COLUMNS)), SWEEP_LEGEND)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from servobench.harness.config.settings import ConfigurationError
@@ -66,7 +66,7 @@ class RunRequest:
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""
-        return {"run_id": self.run_id, **asdict(self), "mismatch": str(self.mismatch)}
+        return {"run_id": self.run_id, **vars(self), "mismatch": str(self.mismatch)}
 
 
 def read_mismatch(text: str) -> Mismatch:

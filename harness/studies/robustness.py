@@ -18,9 +18,11 @@ from matplotlib.figure import Figure
 from servobench.harness.analysis.comparison import settled_share, settling_times
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
-from servobench.harness.batch.campaign import Campaign, Cell, Execution, carry_out
+from servobench.harness.batch.blocks import Cell
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.sweep import place_columns, vary
+from servobench.harness.batch.grid import Grid
+from servobench.harness.batch.sweep import Place
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.panels import draw_places
@@ -31,6 +33,8 @@ from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 BASE: Final = "moderate"
 TASK: Final = "random"
 MOVE: Final = "camera_move"
+LATENCY: Final = "latency"
+NOISE: Final = "noise"
 MOVE_DURATION: Final = 20.0  # [s], of a run whose camera is moved half-way
 
 STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it is
@@ -46,13 +50,14 @@ class Line:
     title: str  # label of the axis
     places: tuple[Magnitude, ...]  # its magnitudes
 
-    def request(self, request: RunRequest, place: Magnitude) -> RunRequest:
-        """Return `request` at one place of this axis."""
-        if self.axis == "latency":
-            return replace(request, latency_periods=int(place.number))
-        if self.axis == "noise":
-            return replace(request, noise_factor=place.number)
-        return vary(request, self.axis, place)
+
+def _cell(place: Place, request: RunRequest) -> Cell:
+    """Return a run at one place of its axis."""
+    if place.magnitude is None or place.axis not in (LATENCY, NOISE):
+        return Cell(place.vary(request), place.columns)
+    number = place.magnitude.number
+    varied = {"latency_periods": int(number)} if place.axis == LATENCY else {"noise_factor": number}
+    return Cell(replace(request, **varied), place.columns)
 
 
 LINES: Final = (
@@ -60,8 +65,8 @@ LINES: Final = (
     Line("links", "link lengths wrong by up to, %", parse_magnitudes("links", "0:30:10%")),
     Line("joint_offsets", "joint zeros wrong by up to, °", parse_magnitudes("joint_offsets", "0:20:5deg")),
     Line("tool", "tool wrong by up to, mm", parse_magnitudes("tool", "0:100:25mm")),
-    Line("latency", "camera latency, periods of 50 ms", tuple(Magnitude(float(n), "periods") for n in range(6))),
-    Line("noise", "sensor noise, times the usual", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
+    Line(LATENCY, "camera latency, periods of 50 ms", tuple(Magnitude(float(n), "periods") for n in range(6))),
+    Line(NOISE, "sensor noise, times the usual", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
     Line(MOVE, "camera moved half-way through the run, °", parse_magnitudes(MOVE, "0:180:45deg")),
 )
 
@@ -96,19 +101,14 @@ def make_map(
     return draw_map(results.load_runs(out), out / FIGURES)
 
 
-def map_cells(plant: str, controllers: Sequence[str], seeds: Sequence[int]) -> tuple[list[Cell], list[Cell]]:
+def map_cells(plant: str, controllers: Sequence[str], seeds: Sequence[int]) -> tuple[Grid[Cell], Grid[Cell]]:
     """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
-    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), tuple(seeds)).requests()
-    static: list[Cell] = []
-    moved: list[Cell] = []
-    for line in LINES:
-        cells = [
-            Cell(line.request(request, place), place_columns(line.axis, place))
-            for place in line.places
-            for request in requests
-        ]
-        (moved if line.axis == MOVE else static).extend(cells)
-    return static, moved
+    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds).requests()
+    static, moved = (
+        [Place(line.axis, magnitude) for line in LINES if (line.axis == MOVE) == moves for magnitude in line.places]
+        for moves in (False, True)
+    )
+    return Grid(_cell, static, requests), Grid(_cell, moved, requests)
 
 
 def moved_settings(settings: Settings) -> Settings:

@@ -8,6 +8,7 @@ import pytest
 
 from servobench.controllers.methods import METHODS
 from servobench.harness.batch.manifest import describe_batch
+from servobench.harness.batch.survey import survey
 from servobench.harness.config import defaults
 from servobench.harness.config.defaults import default_config, tuned_file
 from servobench.harness.config.registry import controller_names, find_controller
@@ -52,7 +53,7 @@ def test_what_the_user_sets_wins_and_the_manifest_tells_the_tuned_rest(tuned):
     tuned("[settings.law]\nstep_factor = 0.3\nstep_weight = 0.05\n")
     settings = Settings({"ukf_mfac": {"law": {"step_factor": 0.4}}})
     requests = [RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)]
-    manifest = describe_batch(requests, resolve_sections(requests, settings))
+    manifest = describe_batch(survey(requests), resolve_sections(requests, settings), {})
     assert manifest["configuration"]["ukf_mfac"]["law.step_factor"] == 0.4
     assert manifest["configuration"]["ukf_mfac"]["law.step_weight"] == 0.05
 

@@ -128,7 +128,7 @@ def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(f
 def test_a_part_of_several_runs_says_which_runs_are_there(folder):
     results.write_part(folder, 8, [RunResult({"run_id": f"run{index}"}, None) for index in (8, 9, 10)])
     add_part(folder, 2)
-    assert results.finished_runs(folder) == {2, 8, 9, 10}
+    assert results.finished_runs(folder) == [range(2, 3), range(8, 11)]
 
 
 def test_a_lock_leaves_nothing_behind_and_that_of_a_dead_process_does_not_count(tmp_path):

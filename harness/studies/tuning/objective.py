@@ -14,22 +14,23 @@ Overshoot has no term of its own: it lengthens the settling time, since the erro
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from servobench.harness.batch.campaign import Cell, Chunk, carry_out_chunks
+from servobench.harness.batch.blocks import Cell, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.compare import tuning_seeds
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import COMPLETED
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
 from servobench.harness.run.tasks import find_task
+from servobench.harness.run.together import side_by_side_key
 from servobench.plant.bench import can_vary_sensing
 from servobench.plant.settings import Periods, settings
 
@@ -89,9 +90,11 @@ class Trial:
     controller: str
     config: Any
 
-    def resolved(self, run: RunRequest) -> ResolvedRun:
-        """Return a run of this trial; tuned values that are in use already do not matter."""
-        return replace(resolve(replace(run, controller=self.controller), Settings()), controller=self.config)
+    def resolved(self, runs: Sequence[RunRequest]) -> list[ResolvedRun]:
+        """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
+        requests = [replace(run, controller=self.controller) for run in runs]
+        sections = resolve_sections(requests, Settings()) | {self.controller: self.config}
+        return [select(request, sections) for request in requests]
 
 
 Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
@@ -124,9 +127,13 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Worke
     Raises:
         ConfigurationError: the worker processes cannot be started.
     """
-    pairs = [(t, r) for r in range(len(runs)) for t in range(len(trials))]
-    resolved = [trials[t].resolved(runs[r]) for t, r in pairs]
-    chunks = [Chunk(index, ((Cell(run.request), run),)) for index, run in enumerate(resolved)]
-    for chunk, (result,) in carry_out_chunks(chunks, workers):
-        t, r = pairs[chunk.index]
-        yield t, r, run_cost(runs[r].task, result.row)
+    kinds: dict[Hashable, list[tuple[int, int, ResolvedRun]]] = {}
+    for t, trial in enumerate(trials):
+        for r, run in enumerate(trial.resolved(runs)):
+            kinds.setdefault(side_by_side_key(run), []).append((t, r, run))
+    order = [(kind, *each) for kind, same in kinds.items() for each in same]
+    jobs = [Job(index, Cell(run.request), run, kind) for index, (kind, _, _, run) in enumerate(order)]
+    for block, outcome in carry_out_blocks(cut(jobs, even_size(len(jobs), workers.count), chunk=1), workers):
+        for job, result in zip(block.jobs, outcome, strict=True):
+            _, t, r, _ = order[job.index]
+            yield t, r, run_cost(runs[r].task, result.row)

@@ -231,7 +231,7 @@ def advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) 
         with undisturbed():
             trials = [study.ask() for study in active]
         for trial in trials:
-            build_once(trial.resolved(runs[0]))  # networks are trained before workers need them
+            build_once(trial.resolved(runs[:1])[0])  # networks are trained before workers need them
         costs = np.zeros((len(trials), len(runs)))
         best = [study.best() for study in active]
         for trial_index, run_index, cost in evaluate(trials, runs, workers):

@@ -1,0 +1,175 @@
+"""Blocks of runs: the same rows however runs are put into blocks, and whatever becomes of the blocks."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from concurrent.futures import Future
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import judged
+from servobench.harness.batch import blocks, results
+from servobench.harness.batch.blocks import Cell, Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out
+from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.grid import Grid
+from servobench.harness.batch.survey import survey
+from servobench.harness.batch.sweep import SweepPlan, parse_variation
+from servobench.harness.batch.workers import Workers
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import RunResult
+from servobench.harness.run.request import RunRequest
+
+PLAN = SweepPlan(
+    Batch(("kinematic",), ("constant", "broyden"), ("random",), ("moderate",), range(6)),
+    (parse_variation("camera_rotation=0:40:40deg"),),
+)
+CAMPAIGN = Campaign(PLAN.cells(), Settings({"random": {"duration": 0.5}}))
+SEED_OF_A_CRASH = 2
+
+
+def times(runs: pd.DataFrame) -> pd.DataFrame:
+    return runs[["controller_time_median_us", "controller_time_p99_us", "plant_time_median_us"]]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> pd.DataFrame:
+    """The table of runs that were carried out one by one."""
+    folder = tmp_path_factory.mktemp("alone") / "out"
+    carry_out(CAMPAIGN, folder, Execution(1, block=1))
+    assert results.read_manifest(folder)["side_by_side"] == {}
+    runs = results.load_runs(folder)
+    assert times(runs).notna().all(axis=None)
+    return judged(runs)
+
+
+@pytest.mark.parametrize(("block", "workers"), [(7, 1), (1000, 1), (1000, 2)])
+def test_rows_do_not_depend_on_the_blocks_and_those_of_a_block_have_no_times(alone, tmp_path, block, workers):
+    carry_out(CAMPAIGN, tmp_path / "out", Execution(workers, block=block))
+    runs = results.load_runs(tmp_path / "out")
+    pd.testing.assert_frame_equal(judged(runs), alone, check_exact=True)
+    assert times(runs).isna().all(axis=None)
+    assert set(times(runs).dtypes) == {np.dtype(float)}
+    manifest = results.read_manifest(tmp_path / "out")
+    assert manifest["side_by_side"] == {"kinematic": ["constant", "broyden"]}
+    assert manifest["seeds"] == "0:6"
+
+
+def test_runs_that_are_missing_may_form_other_blocks(alone, tmp_path):
+    folder = tmp_path / "out"
+    carry_out(CAMPAIGN, folder, Execution(1, block=5))
+    rows = results.load_runs(folder).to_dict("records")
+    (folder / results.RUNS).unlink()
+    (folder / results.PARTS).mkdir()
+    results.write_part(folder, 3, [RunResult(row, None) for row in rows[3:8]])
+    carry_out(CAMPAIGN, folder, Execution(1, block=4, resume=True))
+    pd.testing.assert_frame_equal(judged(results.load_runs(folder)), alone, check_exact=True)
+
+
+class ProcessDied(Exception):
+    """What a future raises."""
+
+
+def dying_workers(how: Exception, sizes: list[int]) -> Workers:
+    """Return workers that lose each task which holds the run of one seed, and note how many runs tasks have."""
+
+    def submit(function, task):
+        block = blocks.pickle.loads(task)[0]
+        sizes.append(len(block.jobs))
+        future = Future()
+        if any(job.cell.request.seed == SEED_OF_A_CRASH for job in block.jobs):
+            future.set_exception(how)
+        else:
+            future.set_result(function(task))
+        return future
+
+    return Workers(submit, 2, (ProcessDied,), 8.0)
+
+
+@pytest.mark.parametrize(
+    ("how", "end"),
+    [
+        (ProcessDied(), ("crashed", "the run killed the process that carried it out")),
+        (TimeoutError(), ("timed_out", "the run took longer than 8 s")),
+    ],
+)
+def test_a_block_that_is_lost_costs_only_the_run_that_did_it(alone, tmp_path, monkeypatch, how, end):
+    sizes: list[int] = []
+    workers = contextlib.nullcontext(dying_workers(how, sizes))
+    monkeypatch.setattr("servobench.harness.batch.campaign.open_workers", lambda *_, **__: workers)
+    carry_out(CAMPAIGN, tmp_path / "out", Execution(2))
+    runs = results.load_runs(tmp_path / "out")
+    lost = runs["seed"] == SEED_OF_A_CRASH
+    assert sizes.count(6) == 4
+    assert sizes.count(1) == 24
+    assert set(zip(runs["status"][lost], runs["reason"][lost], strict=True)) == {end}
+    pd.testing.assert_frame_equal(judged(runs)[~lost], alone[~lost], check_exact=True)
+    assert times(runs)[~lost].notna().all(axis=None)
+
+
+def job(index: int, kind: object) -> Job:
+    return Job(index, Cell(RunRequest("kinematic", "constant", "random", "none", index)), None, kind)
+
+
+def test_a_block_has_consecutive_runs_of_one_kind():
+    kinds = "aaaaabbxxxxxaa"
+    jobs = [job(i, None if kind == "x" else kind) for i, kind in enumerate(kinds) if i != 4]
+    made = [([each.index for each in block.jobs], block.together) for block in cut(jobs, size=3, chunk=2)]
+    assert made == [
+        ([0, 1, 2], True), ([3], True), ([5, 6], True), ([7, 8], False), ([9, 10], False), ([11], False),
+        ([12, 13], True),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("count", "workers", "size"), [(200, 2, 100), (300, 2, 75), (1000, 1, 125), (5, 8, 1), (100_000, 2, 128), (0, 2, 0)]
+)
+def test_all_workers_get_the_same_share(count, workers, size):
+    assert even_size(count, workers, 128) == size
+
+
+def test_blocks_are_made_when_a_worker_is_about_to_need_them():
+    made: list[int] = []
+
+    def jobs():
+        for index in itertools.count():
+            made.append(index)
+            yield job(index, None)
+
+    def submit(_function, _task):
+        done = Future()
+        done.set_result([RunResult({}, None)])
+        return done
+
+    workers = Workers(submit, 3)
+    outcomes = carry_out_blocks(cut(jobs(), 1, chunk=1), workers)
+    assert [block.index for block, _ in itertools.islice(outcomes, 20)] == list(range(20))
+    assert len(made) <= 20 + workers.window
+
+
+def test_cells_of_a_plan_are_made_one_by_one():
+    made = []
+    grid = Grid(lambda *values: made.append(values) or values, range(10**6), "ab", range(10**6))
+    assert len(grid) == 2 * 10**12
+    assert grid[10**6 + 3] == (0, "b", 3)
+    assert grid[-1] == (10**6 - 1, "b", 10**6 - 1)
+    assert len(made) == 2
+    assert list(Grid(lambda *values: values, "ab", range(2))) == [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
+    with pytest.raises(IndexError):
+        grid[len(grid)]
+
+
+def test_a_survey_finds_what_the_runs_are_without_keeping_them():
+    batch = Batch(("kinematic", "fmu"), ("constant", "rls"), ("random",), ("none", "moderate"), (3, 4, 9, 5))
+    found = survey(batch.requests())
+    assert (found.count, found.seeds) == (32, [range(3, 6), range(9, 10)])
+    assert [list(each) for each in (found.plants, found.controllers, found.mismatches)] == [
+        ["kinematic", "fmu"], ["constant", "rls"], ["none", "moderate"],
+    ]  # fmt: skip
+    assert len(found.examples) == 6
+    assert found.digest == survey(list(batch.requests())).digest != survey(batch.requests()[::-1]).digest
+    with pytest.raises(ConfigurationError, match="the run kinematic-constant-random-none-3 is asked for twice"):
+        survey([*batch.requests(), batch.requests()[0]])
