@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -42,7 +43,8 @@ def reproduce(out: Path, plants: Sequence[str], robots: int, how: Execution) -> 
     tables = {}
     for study in studies(plants, robots):
         folder = out / study.name
-        carry_out(Campaign(study.cells, study.settings), folder, how.of_part(folder))
+        own = replace(how.of_part(folder), block=1 if study.timed else how.block)
+        carry_out(Campaign(study.cells, study.settings), folder, own)
         tables[study.name] = results.load_runs(folder)
     answers = sorted(
         (answer for plant in plants for answer in answer_all(tables, plant)),

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from servobench.harness.batch.campaign import Cell
+from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.settings import Settings
 
 PROPOSED: Final = "rbfnn_mfac"
-OTHERS: Final = ("rbf_pid", "ukf_mfac", "ukf_mpc")
+MPC: Final = "ukf_mpc"
+OTHERS: Final = ("rbf_pid", "ukf_mfac", MPC)
 MOVES: Final = ("exp1", "exp2", "exp3", "exp4")
 LEAVING: Final = ("exp1", "exp4")  # start or target lie outside the region in which networks are trained
 STAYING: Final = ("exp2", "exp3")
@@ -22,6 +23,8 @@ MAIN: Final = "main"
 FROZEN: Final = "frozen"  # the Jacobian network as it was trained
 NO_EPSILON: Final = "no_epsilon"  # the paper as printed: no ε in either step size
 ENTRIES: Final = "entries"  # the paper's fit of the entries of ψ
+TIMED: Final = "timed"  # few runs, each by itself: how long steps take
+TIMED_ROBOTS: Final = 5  # 20 moves and 5 circles a method
 
 READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
     FROZEN: {"estimator": {"k2": 1e-9}},
@@ -36,6 +39,7 @@ class Study(NamedTuple):
     name: str  # of its folder
     settings: Settings  # overrides of the defaults
     cells: tuple[Cell, ...]  # the runs
+    timed: bool = False  # each run goes by itself, so that its steps have times
 
 
 def studies(plants: Sequence[str], seeds: int) -> list[Study]:
@@ -51,4 +55,9 @@ def studies(plants: Sequence[str], seeds: int) -> list[Study]:
     four = (PROPOSED, *OTHERS)
     main = Study(MAIN, Settings(rendered), cells(four, MOVES, robots) + cells(four, (CIRCLE,), some))
     own = cells((PROPOSED,), (*MOVES, CIRCLE), some)
-    return [main, *(Study(name, Settings({**rendered, PROPOSED: reading}), own) for name, reading in READINGS.items())]
+    both = cells((PROPOSED, MPC), (*MOVES, CIRCLE), robots[:TIMED_ROBOTS])
+    return [
+        main,
+        Study(TIMED, Settings(rendered), both, timed=True),
+        *(Study(name, Settings({**rendered, PROPOSED: reading}), own) for name, reading in READINGS.items()),
+    ]
