@@ -41,9 +41,8 @@ if __name__ == "__main__":
             turned[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
             plant.move_camera(turned)
             _, errors = advance(seen, period, period + FUTURE)
-            print(
-                f"{period * run.period:14.1f} {np.degrees(angle):17.0f} {1e3 * errors.max():20.1f} {1e3 * errors[-1]:22.1f}"
-            )
+            when, turn, largest, last = period * run.period, np.degrees(angle), 1e3 * errors.max(), 1e3 * errors[-1]
+            print(f"{when:14.1f} {turn:17.0f} {largest:20.1f} {last:22.1f}")
             plant.restore(saved[0])
             controller.restore(saved[1])
     plant.close()
