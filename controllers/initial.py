@@ -18,7 +18,7 @@ import numpy.typing as npt
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import ControllerDiverged
-from servobench.plant.lanes import branch, transposed
+from servobench.plant.lanes import branch, pick, transposed
 from servobench.plant.settings import Count, Number, Periods, Positive, settings
 from servobench.plant.signals import BoolArray, Observation, PlantSpec
 
@@ -183,7 +183,7 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
         joint = np.minimum(state.rests, n) - 1
         moves = (state.phase < state.rest_begins) & ~done
         chosen = np.arange(n) == np.asarray(joint)[..., None]
-        last = _entry(state.rest_positions, joint)
+        last = pick(state.rest_positions, joint)
         room = ((last + config.probe_step <= self._spec.joint_upper) & chosen).any(axis=-1)
         speed = np.where(room, self._speed, -self._speed) * moves
         return state._replace(phase=state.phase + 1), np.asarray(chosen * np.asarray(speed)[..., None]), done
@@ -218,11 +218,6 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
                 f"probing moved the joints too little to measure a Jacobian: joint steps {Q.tolist()} rad"
             )
         return np.ascontiguousarray(transposed(np.linalg.solve(Q, Y)))
-
-
-def _entry(rows: FloatArray, index: IntArray) -> FloatArray:
-    """Return row `index`, (...), of rows (..., k, n): (..., n)."""
-    return np.take_along_axis(rows, np.asarray(index)[..., None, None], axis=-2)[..., 0, :]
 
 
 def _with_entry(rows: FloatArray, index: IntArray, row: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ import numpy as np
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FilterDiverged
+from servobench.plant.lanes import branch
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:
@@ -18,6 +19,11 @@ def nearest_rotation(M: FloatArray) -> FloatArray:
         left, _, right = np.linalg.svd(M)
     except np.linalg.LinAlgError as error:
         raise FilterDiverged(f"map has no nearest rotation: {M.tolist()}") from error
-    signs = np.ones(M.shape[:-1])
-    signs[..., -1] = np.copysign(1.0, np.linalg.det(left @ right))
-    return np.asarray((left * signs[..., None, :]) @ right)
+    R = left @ right
+    return branch(np.linalg.det(R) < 0.0, _reflected, R, left, right)
+
+
+def _reflected(R: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    signs = np.ones(R.shape[-1])
+    signs[-1] = -1.0
+    return np.asarray((left * signs) @ right)

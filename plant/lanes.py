@@ -10,9 +10,10 @@ are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
-from functools import wraps
+from functools import cache, wraps
 from typing import Any, TypeVar
 
 import numpy as np
@@ -107,6 +108,25 @@ def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[...,
     return decorate
 
 
+def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:
+    """Return the entries that an index of each lane names along the first axis after the leading ones.
+
+    Args:
+        array: (..., k, *).
+        index: (..., †), from 0 to k − 1.
+        axes: how many axes of `index`, †, are no leading axes.
+
+    Returns:
+        (..., †, *).
+    """
+    leading = np.ndim(index) - axes
+    if leading == 0:
+        return np.asarray(array[index])
+    lead, (length, *rest) = array.shape[:leading], array.shape[leading:]
+    first = length * np.arange(math.prod(lead)).reshape(lead + (1,) * axes)
+    return array.reshape(-1, *rest).take(first + index, axis=0)
+
+
 def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
     """Return `one` in the lanes that are chosen, (...), and `other` elsewhere; both may have further axes."""
     mask = np.asarray(chosen)
@@ -125,7 +145,15 @@ def norm(x: FloatArray) -> FloatArray:
 
 def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:
     """Return A + diag(value), (..., n, n), for A (..., n, n) and one number, (n,) or (..., n)."""
-    return np.asarray(A + np.eye(A.shape[-1]) * np.atleast_1d(value)[..., None, :])
+    rows = value if isinstance(value, float) else np.atleast_1d(value)[..., None, :]
+    return np.asarray(A + _identity(A.shape[-1]) * rows)
+
+
+@cache
+def _identity(size: int) -> FloatArray:
+    identity = np.eye(size)
+    identity.flags.writeable = False
+    return identity
 
 
 def transposed(A: npt.NDArray[Any]) -> FloatArray:

@@ -17,7 +17,7 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.broyden import projection_update
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm, where
+from servobench.plant.lanes import branch, norm
 from servobench.plant.settings import NonNegative, Positive, settings
 from servobench.plant.signals import BoolArray
 
@@ -73,11 +73,17 @@ class CfdlEstimator(Estimator[CfdlState]):
     def _correct(self, state: CfdlState, motion: Motion) -> CfdlState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
         J = projection_update(state.J, dq, dy, step_factor=config.step_factor, regularisation=config.regularisation)
-        both = J * state.J0
-        vanished = norm(J.reshape(*J.shape[:-2], -1)) < config.reset_norm
-        lost = config.reset & ((both.reshape(*both.shape[:-2], -1).sum(axis=-1) <= 0.0) | vanished)
-        return state._replace(J=where(lost, state.J0, J), resets=state.resets + lost)
+        state = state._replace(J=J)
+        if not config.reset:
+            return state
+        flat, first = J.reshape(*J.shape[:-2], -1), state.J0.reshape(*J.shape[:-2], -1)
+        lost = (np.vecdot(flat, first) <= 0.0) | (np.vecdot(flat, flat) < config.reset_norm**2)
+        return branch(lost, _restarted, state)
 
     def diagnostics(self, state: CfdlState) -> Diagnostics:
         """Return whether the last motion was used and how often Φ was reset in this run."""
         return {"estimator_updated": state.updated, "jacobian_resets": state.resets}
+
+
+def _restarted(state: CfdlState) -> CfdlState:
+    return state._replace(J=state.J0, resets=state.resets + 1.0)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch
+from servobench.plant.lanes import branch, pick
 from servobench.plant.signals import BoolArray
 
 MAX_GAP = 16  # [periods] that a motion over lost frames may span; after a longer gap the past is forgotten
@@ -65,14 +65,9 @@ class MotionHistory(NamedTuple):
         """
         last = self.rows.shape[-2] - 1
         count = last - MAX_GAP
-        begin = _rows_at(self.rows, last - np.arange(count) - np.asarray(periods)[..., None])
+        begin = pick(self.rows, last - np.arange(count) - periods[..., None], axes=1)
         passed = self.rows[..., last : last - count : -1, :] - begin
         return begin[..., :joints], passed[..., :joints], passed[..., joints:]
-
-
-def _rows_at(rows: FloatArray, index: npt.NDArray[np.int_]) -> FloatArray:
-    """Return the rows (..., k, n + m) that an index (..., k) names."""
-    return np.take_along_axis(rows, index[..., None], axis=-2)
 
 
 def _at_rest(rows: FloatArray, joint_position: FloatArray) -> FloatArray:
@@ -86,8 +81,8 @@ def _append_period(rows: FloatArray, begin: FloatArray, step: FloatArray) -> Flo
 
 
 def _append_gap(rows: FloatArray, begin: FloatArray, step: FloatArray, periods: npt.NDArray[np.int_]) -> FloatArray:
-    count, gap = rows.shape[-2], np.asarray(periods)[..., None]
+    count, gap = rows.shape[-2], periods[..., None]
     index = np.arange(count) + gap
     new = index - count + 1
     between = begin[..., None, :] + step[..., None, :] * (new / gap)[..., None]
-    return np.where((new > 0)[..., None], between, _rows_at(rows, np.minimum(index, count - 1)))
+    return np.where((new > 0)[..., None], between, pick(rows, np.minimum(index, count - 1), axes=1))

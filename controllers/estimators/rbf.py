@@ -130,9 +130,12 @@ class RbfEstimator(Estimator[RbfState]):
     def learn(self, state: RbfState, motion: Motion, epsilon: npt.ArrayLike) -> RbfState:
         """Do the same with another ε, (...), rad²."""
         config, network = self._config, self._network
-        theta = np.concatenate([state.theta, self._features.at(motion.joint_position)[..., None, :, :]], axis=-3)
-        joint_steps = np.concatenate([state.joint_steps, motion.joint_step[..., None, :]], axis=-2)
-        feature_steps = np.concatenate([state.feature_steps, motion.feature_step[..., None, :]], axis=-2)
+        theta = self._features.at(motion.joint_position)[..., None, :, :]
+        joint_steps, feature_steps = motion.joint_step[..., None, :], motion.feature_step[..., None, :]
+        if config.window > 1:
+            theta = np.concatenate([state.theta, theta], axis=-3)
+            joint_steps = np.concatenate([state.joint_steps, joint_steps], axis=-2)
+            feature_steps = np.concatenate([state.feature_steps, feature_steps], axis=-2)
         errors = feature_steps - np.matvec(network.output(state.rows, theta), joint_steps)
         filled = np.minimum(state.filled + 1, config.window)
         sizes = np.vecdot(theta, theta).take(network.layer_of, axis=-1)

@@ -23,7 +23,7 @@ from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfSt
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm
+from servobench.plant.lanes import branch, norm, pick
 from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
 
 MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
@@ -129,6 +129,7 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         self._period = knowledge.spec.period
         self._n, self._m = network.n, network.m
         self._eye = np.eye(network.m)
+        self._walk = np.concatenate([np.zeros_like(self._eye), self._eye])  # of a bank: M stays, P grows
         self._P0 = (config.initial_deviation**2 if config.align else 0.0) * self._eye
         self._candidates = 1 + (config.longest_delay if config.find_delay else 0)
 
@@ -152,7 +153,7 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
 
     def covariance(self, state: RbfAlignedState) -> FloatArray:
         """Return P of the present delay, (..., m, m)."""
-        return _of_delay(state.bank, state.delay)[..., self._m :, :]
+        return pick(state.bank, state.delay)[..., self._m :, :]
 
     def estimate(self, state: RbfAlignedState, joint_position: FloatArray) -> Estimate:
         """Return Ĵ at `joint_position` (..., n), rad, with d and σ."""
@@ -166,8 +167,8 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         """Learn map, delay and network from one motion."""
         periods = np.maximum(1, np.rint(motion.duration / self._period).astype(np.int_))
         short = periods <= MAX_GAP
-        history = branch(np.logical_not(short), MotionHistory.forget, state.history)
-        return branch(short, self._learn, state._replace(history=history), motion, periods)
+        state = branch(np.logical_not(short), _without_past, state)
+        return branch(short, self._learn, state, motion, periods)
 
     def diagnostics(self, state: RbfAlignedState) -> Diagnostics:
         """Return those of the network, and delay, rotation (rad), deviation and NIS of the map, moves, noise level."""
@@ -193,7 +194,7 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         state, lengths = state._replace(history=history), norm(x)
         if not self._config.detect_moves:
             return self._follow(state, motion, begins, steps, x, lengths)
-        reach = MIN_JUMP_RATIO * lengths.max(axis=-1) + MIN_JUMP_DEVIATIONS * state.noise.deviation
+        reach = MIN_JUMP_RATIO * np.maximum.reduce(lengths, axis=-1) + MIN_JUMP_DEVIATIONS * state.noise.deviation
         jumped = norm(dy) > reach
         state = branch(jumped, self._jump, state, dy)
         return branch(np.logical_not(jumped), self._follow, state, motion, begins, steps, x, lengths)
@@ -225,7 +226,7 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         if not config.learn:
             return state
         known = self._deviation(state) < config.confidence
-        begin, step = _of_delay(begins, state.delay), _of_delay(steps, state.delay)
+        begin, step = pick(begins, state.delay), pick(steps, state.delay)
         seen = np.vecmat(motion.feature_step, state.rotation)
         own = Motion(begin, step, seen, motion.error, motion.duration)
         epsilon = state.noise.variance / config.feature_noise**2 * config.epsilon
@@ -239,7 +240,7 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         variance = 2.0 * noise.variance[..., None] + config.model_error**2 * (lengths * lengths)
         before = self._walked(state.bank, lengths) if config.align else state.bank
         bank, nis, s = map_update(before, x, feature_step, variance)
-        surprise, expected = _of_delay(nis, state.delay) / m, _of_delay(s, state.delay)
+        surprise, expected = pick(nis, state.delay) / m, pick(s, state.delay)
         if config.find_noise:
             noise = noise.learn(surprise * expected, 2.0, expected - 2.0 * noise.variance)
         cusum, moves = np.maximum(0.0, state.cusum + np.minimum(surprise, CUSUM_CAP) - CUSUM_DRIFT), state.moves
@@ -249,23 +250,24 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
             cusum, moves = np.where(moved, 0.0, cusum), moves + moved
         scores = config.forgetting * state.scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
         best = scores.argmin(axis=-1)
-        better = _of_delay(scores, best) < _of_delay(scores, state.delay) - config.margin
+        better = pick(scores, best) < pick(scores, state.delay) - config.margin
         delay = np.where(better, best, state.delay)
         state = state._replace(
             bank=bank, scores=scores, noise=noise, delay=delay, moves=moves, nis=surprise, cusum=cusum
         )
         if not config.align:
             return state
-        now = _of_delay(bank, delay)
+        now = pick(bank, delay)
         nearest, rotation = near_rotation(now[..., :m, :], now[..., m:, :], config.rotation_deviation)
         return state._replace(map=nearest, rotation=rotation)
 
     def _walked(self, bank: FloatArray, lengths: FloatArray) -> FloatArray:
         """Return the bank with P ← P + w² ‖x_d‖ I, no larger than P₀."""
         config, m = self._config, self._m
-        P = bank[..., m:, :] + (config.walk**2 * lengths)[..., None, None] * self._eye
-        excess = P.trace(axis1=-2, axis2=-1) / (m * config.initial_deviation**2)
-        return np.concatenate([bank[..., :m, :], P / np.maximum(excess, 1.0)[..., None, None]], axis=-2)
+        walked = bank + (config.walk**2 * lengths)[..., None, None] * self._walk
+        P = walked[..., m:, :]
+        P /= np.maximum(P.trace(axis1=-2, axis2=-1) / (m * config.initial_deviation**2), 1.0)[..., None, None]
+        return np.asarray(walked)
 
     def _learn_any_map(
         self, bank: FloatArray, before: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
@@ -273,9 +275,5 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         return map_update(self._any_map(before), x, feature_step, variance)[0]
 
 
-def _of_delay(each: FloatArray, delay: npt.NDArray[np.int_]) -> FloatArray:
-    """Return the entry of a delay, (...), of what there is for each candidate, (..., D, *)."""
-    if np.ndim(delay) == 0:
-        return np.asarray(each[delay])
-    index = np.reshape(delay, delay.shape + (1,) * (each.ndim - delay.ndim))
-    return np.take_along_axis(each, index, axis=delay.ndim).squeeze(axis=delay.ndim)
+def _without_past(state: RbfAlignedState) -> RbfAlignedState:
+    return state._replace(history=state.history.forget())
