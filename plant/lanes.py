@@ -124,7 +124,7 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
         return np.asarray(array[index])
     lead, (length, *rest) = array.shape[:leading], array.shape[leading:]
     first = length * np.arange(math.prod(lead)).reshape(lead + (1,) * axes)
-    return array.reshape(-1, *rest).take(first + index, axis=0)
+    return np.asarray(array.reshape(-1, *rest).take(first + index, axis=0))
 
 
 def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:

@@ -46,8 +46,8 @@ class UkfConfig:
     """[1] prior knowledge of the distribution; 2 suits a Gaussian."""
     kappa: NonNegative = 0.0
     """[1] secondary spread."""
-    form: Literal["sigma_points", "split"] = "sigma_points"
-    """Two computations of the same numbers; "split" is several times faster."""
+    form: Literal["split", "sigma_points"] = "split"
+    """Two computations of the same numbers; "sigma_points" is the reference, several times slower."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from kit.toy import plant_spec, seen
 from servobench.controllers import nmpc_calibrated
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.methods import METHODS, compose
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
@@ -159,10 +160,11 @@ def test_only_the_calibrated_method_needs_the_truth():
 
 
 def test_the_kalman_filter_commands_what_the_unscented_one_does():
-    knowledge = robot(6, 3, 11)
+    knowledge, (unscented, kalman) = robot(6, 3, 11), (METHODS["ukf_mfac"], compose("mfac", "kalman"))
+    sigma_points = dataclasses.replace(unscented.config(), estimator=UkfConfig(form="sigma_points"))
     runs = [
-        random_run(entry.build(entry.config(), knowledge), knowledge.spec, 5, 0.5, steps=60)
-        for entry in (METHODS["ukf_mfac"], compose("mfac", "kalman"))
+        random_run(entry.build(config, knowledge), knowledge.spec, 5, 0.5, steps=60)
+        for entry, config in ((unscented, sigma_points), (kalman, kalman.config()))
     ]
     for (u, J, _), (u_kalman, J_kalman, _) in zip(*runs, strict=True):
         np.testing.assert_allclose(u, u_kalman, atol=1e-9)

@@ -27,7 +27,7 @@ LEARNING = [
     RlsEstimator(RlsConfig()),
     CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-6, reset=False)),
     KalmanEstimator(KalmanConfig()),
-    ukf_estimator(UkfConfig()),
+    ukf_estimator(UkfConfig(form="sigma_points")),
 ]
 
 
@@ -71,7 +71,7 @@ def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
         # P = 1/4, r = 2 · 1/8 = 1/4, Δq = (1, 0): S = 1/2, K = (1/2, 0), innovation 0.4 − 0.2 = 0.2
         (KalmanEstimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
         (KalmanEstimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
-        (ukf_estimator(UkfConfig(0.5, 0.0, np.sqrt(0.125))), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
+        (ukf_estimator(UkfConfig(0.5, 0.0, np.sqrt(0.125), form="sigma_points")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
     ],
 )
 def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq, expected):
