@@ -95,7 +95,7 @@ class Predictor:
             ValueError: a delay beyond what is kept of the past.
         """
         delay, J, q = state.delay * 0 + estimate.delay, estimate.jacobian, observation.joint_position
-        if (delay != delay.clip(0, MAX_DELAY)).any():
+        if (delay < 0).any() or (delay > MAX_DELAY).any():
             raise ValueError(f"delay must be from 0 to {MAX_DELAY} periods, got {estimate.delay}")
         past, response = pushed(state.past, q), state.response
         if self.bridge:

@@ -17,7 +17,7 @@ from servobench.controllers.laws.roll_out import RollOut, descent_direction, rol
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm, where
+from servobench.plant.lanes import branch, norm
 from servobench.plant.settings import Count, NonNegative, Positive, settings
 from servobench.plant.signals import BoolArray, Observation
 
@@ -47,9 +47,8 @@ class RbfnnState(NamedTuple):
 
     Attributes:
         learned: W − W(0), (..., n, p, N_h).
-        errors: e(k), e(k−1), …, (..., L_e, m), m.
+        errors: e(k), e(k−1), …, (..., L_e, m), m; NaN before the first command.
         positions: q(k−1), q(k−2), …, (..., L_c, n), rad.
-        started: (...), whether there was a command.
         predicted: e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them.
         step_size: α of the last update, (...).
         wanted: (..., n), rad, the joint step of the last command before it was limited.
@@ -58,7 +57,6 @@ class RbfnnState(NamedTuple):
     learned: FloatArray
     errors: FloatArray
     positions: FloatArray
-    started: BoolArray
     predicted: FloatArray
     step_size: FloatArray
     wanted: FloatArray
@@ -115,9 +113,8 @@ class RbfnnLaw(Law[RbfnnState]):
         network, lead, q = self._network, observation.feature.shape[:-1], observation.joint_position
         return RbfnnState(
             learned=np.zeros((*lead, *network.weights.shape)),
-            errors=np.zeros((*lead, network.error_history, network.m)),
+            errors=np.full((*lead, network.error_history, network.m), np.nan),
             positions=np.repeat(q[..., None, :], network.position_history, axis=-2),
-            started=np.full(lead, False),
             predicted=np.zeros((*lead, self._config.horizon, network.m)),
             step_size=np.zeros(lead),
             wanted=np.zeros(q.shape),
@@ -129,7 +126,7 @@ class RbfnnLaw(Law[RbfnnState]):
         """Return the new state and u, (..., n), rad/s; see `Law.command`."""
         config, jacobian, learned = self._config, estimate.jacobian, state.learned
         errors = pushed(state.errors, reference[..., 0, :] - observation.feature)
-        errors = where(state.started, errors, errors[..., :1, :])
+        errors = branch(np.isnan(errors[..., -1, 0]), _filled_by_first, errors)
         positions = state.positions
         if config.position == "measured":
             positions = pushed(positions, observation.joint_position)
@@ -144,7 +141,7 @@ class RbfnnLaw(Law[RbfnnState]):
         if config.position == "commanded":
             positions = pushed(positions, positions[..., 0, :] + step)
         alpha = np.where(observation.feature_valid, alpha, state.step_size)
-        new = RbfnnState(learned, errors, positions, np.full_like(state.started, True), ahead.errors, alpha, wanted)
+        new = RbfnnState(learned, errors, positions, ahead.errors, alpha, wanted)
         return new, step / self._period
 
     def diagnostics(self, state: RbfnnState) -> Diagnostics:
@@ -172,7 +169,7 @@ class RbfnnLaw(Law[RbfnnState]):
         further is dropped.
         """
         config = self._config
-        alpha = update_step(direction, ahead, config.k, config.epsilon) * np.asarray(valid)
+        alpha = update_step(direction, ahead, config.k, config.epsilon) * valid
         push = controller_output(direction, ahead.xi[..., 0, :], ahead.h[..., 0, :])
         renewed = ahead.wanted + alpha[..., None] * push
         if not config.anti_windup:
@@ -181,3 +178,8 @@ class RbfnnLaw(Law[RbfnnState]):
         useful = (before <= 1.0) | (largest_excess(renewed, self._step_limit) <= before)
         alpha = alpha * useful
         return alpha, ahead.wanted + alpha[..., None] * push
+
+
+def _filled_by_first(errors: FloatArray) -> FloatArray:
+    """Return errors (..., L_e, m) that are all the first one."""
+    return np.repeat(errors[..., :1, :], errors.shape[-2], axis=-2)

@@ -77,7 +77,7 @@ def roll_out(
             wanted = dq
         excess = np.maximum.reduce(np.abs(dq) * reach, axis=-1, keepdims=True, initial=1.0)
         state[..., p : p + n] = dq / excess
-        xis[..., t + 1, :] = np.matvec(A, state)
+        np.matvec(A, state, out=xis[..., t + 1, :])
     return RollOut(xis[..., 1:, :m].copy(), xis[..., :-1, :].copy(), hs, wanted)
 
 
@@ -112,10 +112,12 @@ def update_step(direction: FloatArray, ahead: RollOut, k: float, epsilon: float)
 
 def step_size(wanted: FloatArray, size: FloatArray) -> FloatArray:
     """Return wanted / size, (...), and 0 where the size is 0."""
-    return np.divide(wanted, size, where=size > 0.0, out=np.zeros_like(size))
+    quotient: FloatArray = wanted * (size > 0.0) / (size + (size == 0.0))
+    return quotient
 
 
 def sum_of_squares(array: FloatArray, axes: int) -> FloatArray:
     """Return the sum of squares over the last axes, (...)."""
     flat = array.reshape(*array.shape[:-axes], -1)
-    return np.asarray(np.vecdot(flat, flat))
+    total: FloatArray = np.vecdot(flat, flat)
+    return total
