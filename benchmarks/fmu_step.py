@@ -18,7 +18,7 @@ from fmpy.fmi2 import FMU2Slave
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.fmu_plant import FmuWorld
+from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
@@ -42,12 +42,10 @@ def fmu_world(plant: Bench) -> FmuWorld:
 def bare_calls(plant: Bench) -> Callable[[int], None]:
     """Return a step by three calls with prebuilt arguments."""
     world = fmu_world(plant)
-    library, component = world._instance._library, world._instance._component
-    write = (library.fmi2SetReal, world._command)
-    read = (library.fmi2GetReal, world._result)
-    (set_real, *inputs), (get_real, *outputs) = (
-        (function, port.references, ctypes.c_size_t(port.count), port.pointer) for function, port in (write, read)
-    )
+    instance = world._instances.lanes[0].instance
+    library, component = instance._library, instance._component
+    set_real, inputs = library.fmi2SetReal, (*world._command.variables, world._command.pointer())
+    get_real, outputs = library.fmi2GetReal, (*world._result.variables, world._result.pointer())
     do_step, now, step, yes = library.fmi2DoStep, ctypes.c_double(), ctypes.c_double(PERIOD), ctypes.c_int(1)
 
     def call(k: int) -> None:
@@ -73,7 +71,7 @@ def fmpy_calls(plant: Bench) -> Callable[[int], None]:
     slave.setupExperiment(startTime=0.0)
     slave.enterInitializationMode()
     slave.exitInitializationMode()
-    inputs, outputs = list(world._command.references), list(world._result.references)
+    inputs, outputs = list(world._command.variables[0]), list(world._result.variables[0])
     command = [0.1] * len(inputs)
 
     def call(k: int) -> None:

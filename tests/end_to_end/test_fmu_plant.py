@@ -16,8 +16,9 @@ from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.fmu_plant import FmuConfig, FmuWorld, mapped_entry
+from servobench.plant.fmu.fmu_plant import FmuConfig, mapped_entry
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
+from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command

@@ -1,0 +1,47 @@
+"""Loads the library of an FMU for this machine."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from servobench.plant.fmu.description import FmuDescription
+
+
+def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN401 - a ctypes library
+    """Load the FMU's library for this machine.
+
+    Raises:
+        ValueError: there is none, or it cannot be loaded.
+    """
+    import fmpy  # noqa: PLC0415 - see parse_description
+
+    for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
+        file = root / "binaries" / folder / f"{description.identifier}{fmpy.sharedLibraryExtension}"
+        if file.is_file():
+            try:
+                return ctypes.CDLL(str(file)) if not description.once_per_process else _load_copy(file)
+            except OSError as error:
+                raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
+    binaries = root / "binaries"
+    there = sorted(folder.name for folder in binaries.iterdir()) if binaries.is_dir() else []
+    raise ValueError(
+        f"fmu file {description.path} has no library for this machine; "
+        f"wanted {fmpy.platform_tuple}, it has: {', '.join(there) or 'none'}"
+    )
+
+
+def _load_copy(file: Path) -> ctypes.CDLL:
+    """Load a copy of a library and of what lies beside it, so that it shares no variables with another instance."""
+    with tempfile.TemporaryDirectory(prefix="servobench-", ignore_cleanup_errors=True) as folder:
+        return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
+
+
+def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library
+    """Give the library back to the system."""
+    from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
+
+    freeLibrary(library._handle)

@@ -1,0 +1,277 @@
+"""Any FMI 2 or FMI 3 co-simulation FMU as a world.
+
+An `FmuMapping` says which variables are commands, joints and features; names are looked up once, at construction. The
+FMU is stepped with its own period, which divides the control period; commands are held meanwhile.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.bench import World
+from servobench.plant.checks import FloatArray, as_array, is_finite, whole_steps
+from servobench.plant.faults import FmuError
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.description import read_description
+from servobench.plant.fmu.instance import Instance, Port
+from servobench.plant.fmu.instances import Instances, Lane
+from servobench.plant.fmu.mapping import FmuMapping, mapping_spec
+from servobench.plant.fmu.model_exchange import mapped_model
+from servobench.plant.plant import TrueModel
+from servobench.plant.robot.arm import rpy_from_rotation
+from servobench.plant.seeds import Seeds
+from servobench.plant.settings import Names
+from servobench.plant.signals import Truth
+
+
+@dataclass(frozen=True, eq=False)
+class FmuState:
+    """A saved state of an FMU's world.
+
+    Attributes:
+        fmu: of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
+            world that saved it.
+        period: number of periods since the start.
+        integrated: (..., n), rad, joint positions of an FMU that has none itself.
+    """
+
+    fmu: tuple[bytes | ctypes.c_void_p, ...]
+    period: int
+    integrated: FloatArray
+
+
+class FmuWorld(World):
+    """y, q ← fmi…GetReal after fmi…DoStep under the held command, with an instance for each run side by side."""
+
+    def __init__(self, mapping: FmuMapping, start: FloatArray | None, period: float) -> None:
+        """Extract and load the FMU and look all names up.
+
+        Args:
+            mapping: the roles of its variables; values of parameters may have leading axes.
+            start: (..., n), rad, joint positions at time 0, for an FMU with a home or without joints; None: the FMU's
+                own home, or 0. Its leading axis says how many runs there are.
+            period: control period, s.
+
+        Raises:
+            ValueError: an FMU that cannot be used, or a name or size that does not fit.
+            FmuError: the FMU refused its parameters or its initialisation.
+        """
+        self._substeps = whole_steps(period, mapping.period or period)
+        self._own_step, self._period = mapping.period or period, period
+        self._mapping = mapping
+        root = extract_fmu(mapping.file)
+        self.description = read_description(mapping.file, root)
+        self.spec = mapping_spec(mapping, self.description, period)
+        self._has_start = start is not None
+        start = np.zeros(self.spec.n) if start is None else start
+        self.lead = np.shape(start)[:-1]
+        self._start = as_array("start", start, (*self.lead, self.spec.n))
+        self._rows: Any = np.arange(*self.lead) if self.lead else ()
+        self._instances = Instances(self.description, root, self.fail)
+        try:
+            self._connect(mapping)
+            self._instances.open(prod(self.lead), self._lane)
+            self._initialise()
+            self._refuse_faults()
+        except BaseException:
+            self.close()
+            raise
+
+    def _refuse_faults(self) -> None:
+        for fault in self.faults.values():
+            raise fault
+
+    def _connect(self, mapping: FmuMapping) -> None:
+        """Make the ports; those of parameters are used outside the loop only."""
+        truth = mapping.truth
+        self._has_joints = bool(mapping.joints)
+        self._command = self._port("inputs", mapping.inputs)
+        self._result = self._port("joints and features", (*mapping.joints, *mapping.features))
+        self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
+        self._split = self._result.values.shape[-1] - self.spec.m
+        self._now = ctypes.c_double()
+        self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
+        if mapping.home is not None and self._has_start:
+            self._parameters.append(self._parameter(mapping.home, self._start))
+        self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
+        self._true = mapped_model(mapping, self.description) if truth.states else None
+        nominal = mapping.nominal
+        self._nominal = None if nominal is None else mapped_model(mapping, self.description, nominal)
+
+    def _lane(self, instance: Instance, row: int) -> Lane:
+        return Lane(
+            instance,
+            row,
+            instance.access("Set", self._command, row),
+            instance.step_call(self._now, ctypes.c_double(self._own_step)),
+            instance.access("Get", self._result, row),
+            instance.access("Get", self._truth, row),
+        )
+
+    def _port(self, role: str, names: Names) -> Port:
+        return Port(self.description.select(names, role), self.lead)
+
+    def _parameter(self, name: str, values: FloatArray) -> Port:
+        port = self._port("parameters", (name,))
+        if np.shape(values) not in ((), port.values.shape[-1:], port.values.shape):
+            raise ValueError(f"parameter {name!r} must have {port.values.shape[-1]} values, got {np.size(values)}")
+        port.values[...] = values
+        return port
+
+    def reset(self, seed: Seeds) -> FloatArray:
+        """Go back to the start; nothing here is random."""
+        if not self._at_start:
+            for lane in self._instances.lanes:
+                lane.instance.reset()
+            self._initialise()
+        return self._joints
+
+    def _initialise(self) -> None:
+        """Set the parameters of fresh instances and begin at time 0."""
+        self._instances.revive()
+        self.faults = {}
+
+        def begin(lane: Lane) -> None:
+            for port in self._parameters:
+                lane.instance.writer(port, lane.row)()
+            lane.instance.start(0.0)
+
+        self._instances.each(begin)
+        self._k = 0
+        self._joints = self._integrated = self._start
+        self._feature = np.zeros((*self.lead, self.spec.m))
+        self._measure()
+        self._at_start = True
+
+    def advance(self, joint_velocity: FloatArray) -> FloatArray:
+        """Hold a command for one period; see `World.advance`.
+
+        Raises:
+            FmuError: the FMU of a single run failed, or a result is not finite.
+        """
+        instances = self._instances
+        if not instances.live:
+            raise FmuError("the plant has been closed")
+        self._at_start = False
+        self._command.values[self._rows] = joint_velocity
+        instances.check("writing", self._command, [lane.write() for lane in instances.live])
+        for i in range(self._k * self._substeps, (self._k + 1) * self._substeps):
+            time = self._now.value = i * self._own_step
+            instances.finish([lane.step() for lane in instances.live], time, self._own_step)
+        self._k += 1
+        if not self._has_joints:
+            self._integrated = self._integrated + joint_velocity * self._period
+        self._measure()
+        return self._joints
+
+    def _measure(self) -> None:
+        """Read joints and feature; those of a lane that failed stay as they were."""
+        self._instances.check("reading", self._result, [lane.read() for lane in self._instances.live])
+        values = np.array(self._result.values[self._rows])
+        if self.faults or not is_finite(values):
+            for i in np.flatnonzero(~np.isfinite(values).all(axis=-1)).tolist():
+                self._instances.drop(i, self._not_finite(values.reshape(-1, values.shape[-1])[i]))
+            failed = list(self.faults)
+            values[failed, self._split :] = self._feature[failed]
+            if self._has_joints:
+                values[failed, : self._split] = self._joints[failed]
+        self._joints = values[..., : self._split] if self._has_joints else self._integrated
+        self._feature = values[..., self._split :]
+
+    def _not_finite(self, values: FloatArray) -> FmuError:
+        bad = [label for label, value in zip(self._result.labels, values, strict=True) if not np.isfinite(value)]
+        return FmuError(f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}")
+
+    def see(self) -> FloatArray:
+        """Return the FMU's feature as read after the last step."""
+        return self._feature
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """Set the parameters of the camera's pose; see `Plant.move_camera`.
+
+        Raises:
+            ValueError: the mapping names none.
+        """
+        if not self._camera:
+            super().move_camera(X_BC)
+        self._at_start = False
+        poses = X_BC[..., :3, 3], rpy_from_rotation(X_BC[..., :3, :3])
+        for port, values in zip(self._camera, poses, strict=True):
+            port.values[self._rows] = values
+
+        def show(lane: Lane) -> None:
+            for port in self._camera:
+                lane.instance.writer(port, lane.row)()
+
+        self._instances.each(show)
+
+    def truth(self) -> Truth:
+        """Return the FMU's own feature and, if the mapping names it or its states, the Jacobian."""
+        self._instances.check("reading", self._truth, [lane.read_truth() for lane in self._instances.live])
+        values, m, n = np.array(self._truth.values[self._rows]), self.spec.m, self.spec.n
+        jacobian = None
+        if values.shape[-1] > m:
+            jacobian = values[..., m:].reshape(*self.lead, m, n)
+        elif self._true is not None and self._has_joints:
+            jacobian = self._true.jacobian(self._joints)
+        return Truth(values[..., :m], jacobian)
+
+    def true_model(self) -> TrueModel:
+        """Return the FMU's own kinematics, by the directional derivatives of its model-exchange side.
+
+        Raises:
+            ValueError: it has no such side, or the joints and features are not states and outputs of it.
+        """
+        if self._true is None:
+            self._true = mapped_model(self._mapping, self.description)
+        return TrueModel(self._true.jacobian, self._true.symbolic)
+
+    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+        """Return the FMU's Jacobian with the mapping's nominal parameters, or None if it has none."""
+        return None if self._nominal is None else self._nominal.jacobian
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """Close the instances of all other lanes; see `Plant.keep`."""
+        self.check_lanes()
+        chosen = lanes.tolist()
+        self._instances.keep(chosen)
+        self.faults = {place: self.faults[i] for place, i in enumerate(chosen) if i in self.faults}
+        self.lead, self._rows = (len(chosen),), self._rows[lanes]
+        arrays = self._start, self._joints, self._feature, self._integrated
+        self._start, self._joints, self._feature, self._integrated = (array[lanes] for array in arrays)
+
+    def save(self) -> FmuState:
+        """Return the present state of the FMU; see `Plant.save`.
+
+        Raises:
+            ValueError: the FMU cannot save its state.
+        """
+        if not self.description.can_save:
+            raise ValueError(f"{self.description.path.name} cannot save its state (canGetAndSetFMUstate is false)")
+        saved = tuple(lane.save(as_bytes=self.description.can_serialise) for lane in self._instances.lanes)
+        return FmuState(saved, self._k, self._integrated)
+
+    def restore(self, state: FmuState) -> None:
+        """Return to a saved state; see `Plant.restore`.
+
+        Raises:
+            FmuError: the FMU does not take it.
+        """
+        self._at_start = False
+        self._instances.revive()
+        self.faults = {}
+        for lane, saved in zip(self._instances.lanes, state.fmu, strict=True):
+            lane.restore(saved)
+        self._k, self._integrated = state.period, state.integrated
+        self._measure()
+
+    def close(self) -> None:
+        """Free all instances and unload the library."""
+        self._instances.close()
