@@ -106,8 +106,9 @@ class ManyBenches(Plant):
             for lane, fault in faults.items():
                 self._ends.end(int(lanes[lane]), fault, self._k)
             stay = self._member.left()
-            self._bench.keep(stay)
-            seen = take(seen, stay)
+            if stay is not None:
+                self._bench.keep(stay)
+                seen = take(seen, stay)
         self._k += 1
         self._seen = self._spread(seen)
         return self._seen
