@@ -86,7 +86,7 @@ class NmpcCalibrated(Controller):
         self._along_plan = self._model.map(config.horizon)
         self._shares = decay_shares(config.horizon, config.rho)
         limited = math.isfinite(config.joint_acceleration_limit)
-        shape = QpShape(
+        self._shape = QpShape(
             weights=move_weights(config.horizon, 1.0, config.terminal_weight),
             move_weight=np.full(n, config.move_weight),
             constant_gain=None,
@@ -96,7 +96,7 @@ class NmpcCalibrated(Controller):
             view_rows=np.zeros((0, m)),
             varying_jacobian=True,
         )
-        self._program = QpProgram(shape, config.solver)
+        self._program = QpProgram(self._shape, config.solver)
         self._b: FloatArray = np.zeros(m)
         self._jacobian: FloatArray | None = None
         self._forget()
@@ -145,7 +145,7 @@ class NmpcCalibrated(Controller):
         return None if self._jacobian is None else self._jacobian.copy()
 
     def _shared(self) -> Iterable[object]:
-        return self._knowledge, self._model, self._along_plan, self._program
+        return self._knowledge, self._model, self._along_plan, self._shape, self._program
 
     def _forget(self) -> None:
         n, delay = self._spec.n, self._config.delay_periods
@@ -169,13 +169,7 @@ class NmpcCalibrated(Controller):
             wanted: features that the model should show along the plan, (H, m), m.
         """
         config = self._config
-        bounds = joint_bounds(
-            self._spec,
-            self._last,
-            acceleration_limit=config.joint_acceleration_limit,
-            joint_position=start,
-            view_margin=np.zeros(0),
-        )
+        bounds = joint_bounds(self._shape, self._spec, self._last, start, np.zeros(0))
         plan, change, iterations = self._plan, math.inf, 0
         while iterations < config.iterations and change > _PLAN_TOLERANCE:
             J, targets = self._linearise(start, plan, wanted)

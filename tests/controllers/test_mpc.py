@@ -60,7 +60,7 @@ def program(n=4, m=2, horizon=5, constant=False, move=1e3, change=1e3, view=Fals
         move_weight=rng.uniform(0.05, 0.2, n),
         constant_gain=40.0 if constant else None,
         largest_move=np.full(n, move),
-        largest_change=None if constant else np.full(n, change),
+        largest_change=np.full(n, change),
         limit_position=True,
         view_rows=rng.normal(size=(3, m)) if view else np.zeros((0, m)),
     )
@@ -153,6 +153,12 @@ def test_solvers_print_nothing_and_keep_nothing_of_the_solve_before(capfd):
         arguments = random_jacobian(0, 2, 4), np.ones((5, 2)), bounds
         np.testing.assert_array_equal(qp.solve(*arguments).moves, fresh.solve(*arguments).moves)
     assert capfd.readouterr() == ("", "")
+
+
+def test_shapes_are_equal_if_all_their_entries_are():
+    (_, one), (_, same), (_, other) = program(), program(), program(seed=1)
+    assert len({one, same, other, replace(one, view_rows=np.zeros((0, 3)))}) == 3
+    assert one != "a shape"
 
 
 def gradient(config, J, e, ahead, plan):

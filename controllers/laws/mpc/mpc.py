@@ -167,7 +167,7 @@ class MpcLaw(Law[MpcState]):
             move_weight=self._Q,
             constant_gain=gain if constant else None,
             largest_move=spec.joint_velocity_limit * spec.period,
-            largest_change=change if math.isfinite(config.joint_acceleration_limit) and not constant else None,
+            largest_change=change if math.isfinite(config.joint_acceleration_limit) else None,
             limit_position=config.limit_position,
             view_rows=view_rows(config.view_tangent, spec.m),
         )
@@ -205,14 +205,9 @@ class MpcLaw(Law[MpcState]):
         feature, error, ahead = self._look_ahead(state.sent, J, observation, reference)
         targets = self._program_targets(error, ahead)
         moves, travel = self._unlimited.minimise(J, targets)
-        bounds = joint_bounds(
-            self._spec,
-            state.last,
-            acceleration_limit=self._config.joint_acceleration_limit,
-            joint_position=observation.joint_position,
-            # A ball that is out of view already may not get further out.
-            view_margin=np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0),
-        )
+        # A ball that is out of view already may not get further out.
+        margin = np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0)
+        bounds = joint_bounds(self._shape, self._spec, state.last, observation.joint_position, margin)
         zero = np.zeros(feature.shape[:-1])
         plan = Plan(moves, zero + 1.0, zero, zero)
         plan = branch(exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds)

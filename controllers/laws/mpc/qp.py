@@ -53,7 +53,7 @@ class QpShape:
         move_weight: diagonal of Q, (n,).
         constant_gain: a of eq. 46 in constant-move mode, None for H free moves.
         largest_move: (n,), rad.
-        largest_change: (n,), rad, largest change from one move to the next; None for no limit.
+        largest_change: (n,), rad, largest change from one move to the next, and of the first; None for no limit.
         limit_position: whether the joint positions are limited.
         view_rows: V, (v, m); no rows = no limit on the view.
         varying_jacobian: whether every period has a Jacobian of its own; for free moves only.
