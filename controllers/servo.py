@@ -131,6 +131,7 @@ class Servo:
         return state._replace(
             estimator=self.estimator.start(self.initial.jacobian(state.initial)),
             law=self.law.start(observation),
+            predictor=None if self.predictor is None else self.predictor.start(observation),
             ready=np.full(observation.feature.shape[:-1], True),
         )
 

@@ -52,9 +52,10 @@ class Broken(Law):
         return {}
 
 
-def servo(estimator, law=None, predictor=None):
+def servo(estimator, law=None, predictor=None, **initial):
     law = MfacLaw(MfacConfig(), KNOWLEDGE) if law is None else law
-    return ServoController(Servo(estimator, law, initial_jacobian(InitialConfig(), KNOWLEDGE), KNOWLEDGE, predictor))
+    provider = initial_jacobian(InitialConfig(**initial), KNOWLEDGE)
+    return ServoController(Servo(estimator, law, provider, KNOWLEDGE, predictor))
 
 
 def test_a_motion_spans_the_gap_that_lost_frames_leave():
@@ -134,6 +135,24 @@ def test_a_predictor_stands_before_the_law_and_gets_the_command():
     shifted = np.array([[0.3, 0.2], [0.6, 0.4]])
     np.testing.assert_array_equal(u, law.command(law.start(first), Estimate(J0), doubled, shifted)[1])
     np.testing.assert_array_equal(controller.state.predictor, [u * 0.05])
+
+
+def test_the_predictor_starts_where_the_probing_ends():
+    probing = {"source": "probe", "probe_step": 0.01, "settle_periods": 1, "average_periods": 1}
+    controller, q, reference = (
+        servo(ConstantEstimator(), predictor=Predictor(), **probing),
+        np.zeros(3),
+        np.zeros((2, 2)),
+    )
+    controller.reset(seen(q, J0 @ q), 0)
+    for k in range(40):
+        u = controller.step(seen(q, J0 @ q, k=k), reference).joint_velocity
+        if not controller.diagnostics()["probing"]:
+            break
+        q = q + 0.05 * u
+    assert k > 6
+    assert q.all()
+    np.testing.assert_array_equal(controller.state.predictor.past, np.tile(q, (16, 1)))
 
 
 def test_a_second_predict_stage_is_refused():
