@@ -28,11 +28,6 @@ def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
     return transposed(branch(np.logical_not(ordinary), _decompose, inverse, J, damping))
 
 
-def damped_inverse_by_svd(J: FloatArray, damping: float) -> FloatArray:
-    """Return the same from singular values, which is accurate for any J and takes longer."""
-    return transposed(_decompose(J, J, damping))
-
-
 def _solve_normal_equations(J: FloatArray, square: FloatArray, damping: float) -> FloatArray:
     """Return (JJᵀ + δ²I)⁻¹ J, (..., m, n), for square = JJᵀ."""
     damped = square + damping**2 * np.eye(J.shape[-2])
