@@ -136,7 +136,8 @@ class RbfnnLaw(Law[RbfnnState]):
         ahead = roll_out(self._network, weights, jacobian, (errors, positions), steps, self._step_limit)
         direction = descent_direction(jacobian, ahead)
         alpha, wanted = self._update(direction, ahead, observation.feature_valid)
-        learned = learned + alpha[..., None, None, None] * direction
+        direction *= alpha[..., None, None, None]
+        learned = np.add(learned, direction, out=direction)  # weights are large: no array more than is needed
         step = scale_to_limit(wanted, self._step_limit)
         if config.position == "commanded":
             positions = pushed(positions, positions[..., 0, :] + step)
