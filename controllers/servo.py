@@ -23,6 +23,22 @@ from servobench.plant.lanes import branch, norm
 from servobench.plant.signals import BoolArray, Command, Observation
 
 
+class Seen(NamedTuple):
+    """What was seen with the last valid feature.
+
+    Attributes:
+        time: (...) [s]; NaN before.
+        joint_position: (..., n) [rad].
+        feature: (..., m).
+        jacobian: Ĵ, (..., m, n), which predicts the next motion; NaN before.
+    """
+
+    time: FloatArray
+    joint_position: FloatArray
+    feature: FloatArray
+    jacobian: FloatArray
+
+
 class ServoState(NamedTuple):
     """The state of a composed controller.
 
@@ -33,10 +49,7 @@ class ServoState(NamedTuple):
         predictor: of the predict stage; None without one.
         ready: (...), whether the initial Jacobian is known.
         jacobian: (..., m, n), the one of the last step; NaN before.
-        time: (...) [s] of the last valid feature; NaN before.
-        joint_position: (..., n) [rad] then.
-        feature: (..., m), the last valid feature.
-        predicting: (..., m, n), the Jacobian then, which predicts the next motion.
+        seen: with the last valid feature.
         unexplained: (...), ‖Δy − ĴΔq‖ of the last motion, with Ĵ from before its update; NaN before.
     """
 
@@ -46,10 +59,7 @@ class ServoState(NamedTuple):
     predictor: Any
     ready: BoolArray
     jacobian: FloatArray
-    time: FloatArray
-    joint_position: FloatArray
-    feature: FloatArray
-    predicting: FloatArray
+    seen: Seen
     unexplained: FloatArray
 
 
@@ -102,10 +112,7 @@ class Servo:
             predictor=None if self.predictor is None else self.predictor.start(observation),
             ready=np.full(lead, known),
             jacobian=unknown,
-            time=np.full(lead, np.nan),
-            joint_position=observation.joint_position,
-            feature=observation.feature,
-            predicting=unknown,
+            seen=Seen(np.full(lead, np.nan), observation.joint_position, observation.feature, unknown),
             unexplained=np.full(lead, np.nan),
         )
 
@@ -139,9 +146,10 @@ class Servo:
         self, both: tuple[ServoState, FloatArray], observation: Observation, reference: FloatArray
     ) -> tuple[ServoState, FloatArray]:
         state, _ = both
-        learns = observation.feature_valid & (state.time < observation.time)
-        state = branch(learns, self._learn, state, observation, reference[..., 0, :])
-        estimate = self.estimator.estimate(state.estimator, observation.joint_position)
+        learned = state.estimator, state.unexplained
+        learns = observation.feature_valid & (state.seen.time < observation.time)
+        estimator, unexplained = branch(learns, self._learn, learned, state.seen, observation, reference[..., 0, :])
+        estimate = self.estimator.estimate(estimator, observation.joint_position)
         J = estimate.jacobian
         if not is_finite(J):
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
@@ -157,27 +165,23 @@ class Servo:
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
             )
-        state = state._replace(law=law, predictor=predictor, jacobian=J)
-        return branch(observation.feature_valid, self._remember, state, observation), u
+        time = np.full(observation.feature.shape[:-1], observation.time)
+        now = Seen(time, observation.joint_position, observation.feature, J)
+        seen = branch(observation.feature_valid, _newer, state.seen, now)
+        return ServoState(estimator, law, state.initial, predictor, state.ready, J, seen, unexplained), u
 
-    def _learn(self, state: ServoState, observation: Observation, desired: FloatArray) -> ServoState:
+    def _learn(
+        self, learned: tuple[Any, FloatArray], seen: Seen, observation: Observation, desired: FloatArray
+    ) -> tuple[Any, FloatArray]:
         motion = Motion(
-            joint_position=state.joint_position,
-            joint_step=observation.joint_position - state.joint_position,
-            feature_step=observation.feature - state.feature,
+            joint_position=seen.joint_position,
+            joint_step=observation.joint_position - seen.joint_position,
+            feature_step=observation.feature - seen.feature,
             error=desired - observation.feature,
-            duration=observation.time - state.time,
+            duration=observation.time - seen.time,
         )
-        unexplained = norm(motion.feature_step - np.matvec(state.predicting, motion.joint_step))
-        return state._replace(estimator=self.estimator.update(state.estimator, motion), unexplained=unexplained)
-
-    def _remember(self, state: ServoState, observation: Observation) -> ServoState:
-        return state._replace(
-            time=np.full(observation.feature.shape[:-1], observation.time),
-            joint_position=observation.joint_position,
-            feature=observation.feature,
-            predicting=state.jacobian,
-        )
+        unexplained = norm(motion.feature_step - np.matvec(seen.jacobian, motion.joint_step))
+        return self.estimator.update(learned[0], motion), unexplained
 
     def diagnostics(self, state: ServoState) -> Diagnostics:
         """Return those of estimator and law, with `probing` and `jacobian_prediction_error`.
@@ -189,6 +193,10 @@ class Servo:
         if not np.any(state.ready):
             return own
         return {**own, **self.estimator.diagnostics(state.estimator), **self.law.diagnostics(state.law)}
+
+
+def _newer(seen: Seen, now: Seen) -> Seen:
+    return now
 
 
 @final

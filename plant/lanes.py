@@ -46,15 +46,17 @@ def take(tree: Tree, lanes: Lanes) -> Tree:
     return taken
 
 
-def put(tree: Tree, lanes: Lanes, part: Tree) -> Tree:
-    """Return a copy of a tree in which the lanes that an index names are those of `part`."""
+def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
+    """Return a tree in which the lanes that an index names are those of `part`; they were those of `before`."""
 
-    def replaced(array: FloatArray, values: FloatArray) -> FloatArray:
+    def replaced(array: FloatArray, values: FloatArray, old: FloatArray) -> FloatArray:
+        if values is old:
+            return array
         new = array.copy()
         new[lanes] = values
         return new
 
-    changed: Tree = _map(replaced, tree, part)
+    changed: Tree = _map(replaced, tree, part, before)
     return changed
 
 
@@ -82,7 +84,8 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
     if count == mask.size:
         return function(tree, *arguments)
     lanes = np.nonzero(mask)
-    return put(tree, lanes, function(take(tree, lanes), *(take(each, lanes) for each in arguments)))
+    before = take(tree, lanes)
+    return put(tree, lanes, function(before, *(take(each, lanes) for each in arguments)), before)
 
 
 def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
