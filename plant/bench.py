@@ -82,15 +82,6 @@ class World(Abilities):
             raise fault
         self.faults = {lane: fault, **self.faults}
 
-    def check_lanes(self) -> None:
-        """Check that there are runs side by side.
-
-        Raises:
-            ValueError: it is a single run.
-        """
-        if not self.lead:
-            raise ValueError("the plant carries out one run only, so none can be dropped")
-
     @abstractmethod
     def reset(self, seed: Any) -> FloatArray:  # noqa: ANN401 - narrowed by worlds that carry out one run only
         """Go back to the start, at rest, and draw all randomness from `seed`.
@@ -271,6 +262,8 @@ class Bench(Plant):
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """See `Plant.keep`."""
+        if not self.world.lead:
+            super().keep(lanes)
         self.world.keep(lanes)
         self._size_masks()
         self._noise.keep(lanes)

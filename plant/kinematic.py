@@ -140,7 +140,6 @@ class KinematicWorld(World):
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """See `Plant.keep`."""
-        self.check_lanes()
         self.lead, self._first = (len(lanes),), take(self._first, lanes)
         self.restore(take(self.save(), lanes))
 

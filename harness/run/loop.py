@@ -10,10 +10,9 @@ reference(t) ------------.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -22,9 +21,7 @@ from servobench.harness.run.log import StepLog
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FeatureLost
 from servobench.plant.plant import Plant
-from servobench.plant.seeds import named_seed
-
-Seeds: TypeAlias = int | Sequence[int]
+from servobench.plant.seeds import Seeds, named_seed
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,15 +128,14 @@ class FmuWorld(World):
     def reset(self, seed: Seeds) -> FloatArray:
         """Go back to the start; nothing here is random."""
         if not self._at_start:
-            for lane in self._instances.lanes:
-                lane.instance.reset()
+            self._instances.revive()
+            self.faults = {}
+            self._instances.each(lambda lane: lane.instance.reset())
             self._initialise()
         return self._joints
 
     def _initialise(self) -> None:
         """Set the parameters of fresh instances and begin at time 0."""
-        self._instances.revive()
-        self.faults = {}
 
         def begin(lane: Lane) -> None:
             for port in self._parameters:
@@ -239,7 +238,6 @@ class FmuWorld(World):
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
         """Close the instances of all other lanes; see `Plant.keep`."""
-        self.check_lanes()
         chosen = lanes.tolist()
         self._instances.keep(chosen)
         self.faults = {place: self.faults[i] for place, i in enumerate(chosen) if i in self.faults}

@@ -80,20 +80,6 @@ def test_jacobian_equals_central_differences(arm):
         np.testing.assert_allclose(model.jacobian(q), numeric, atol=1e-9)
 
 
-def test_leading_axes_give_the_same_as_a_loop():
-    model = HandEyeModel(odd_arm(), nominal_ur5().X_BC)
-    q = poses(12).reshape(3, 4, 6)
-    for name, function in (
-        ("frames", model.arm.frames),
-        ("ball", model.arm.ball_position),
-        ("feature", model.feature),
-        ("jacobian", model.jacobian),
-    ):
-        together = function(q)
-        for index in np.ndindex(3, 4):
-            np.testing.assert_allclose(together[index], function(q[index]), atol=1e-15, err_msg=name)
-
-
 def test_rotations_are_rotations_in_the_urdf_order():
     rpy = np.random.default_rng(0).uniform(-np.pi, np.pi, (10, 3))
     for (roll, pitch, yaw), R in zip(rpy, rotation_from_rpy(rpy), strict=True):

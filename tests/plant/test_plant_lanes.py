@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from itertools import product
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ import pytest
 from kit.plants import configure, mismatched
 from servobench.harness.config.registry import find_plant
 from servobench.plant import lanes
+from servobench.plant.faults import PlantDiverged
+from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import TrueJacobian
-from servobench.plant.robot.ur5 import HOME
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
 SEEDS = (11, 4, 7)
@@ -68,11 +71,11 @@ def test_an_arm_has_the_same_bits_alone_and_among_others():
         return (model.arm.frames(q), points, model.jacobian(q), TrueJacobian(model)(q), model.to_base(points))
 
     together, permuted = everything(stacked, q), everything(lanes.take(stacked, order), q[:, order])
-    for lane in range(3):
-        alone = everything(lanes.take(stacked, lane), q[:, lane])
+    for k, (place, lane) in product(range(20), enumerate(order)):
+        alone = everything(lanes.take(stacked, lane), q[k, lane])
         for many, other, one in zip(together, permuted, alone, strict=True):
-            np.testing.assert_array_equal(many[:, lane], one)
-            np.testing.assert_array_equal(other[:, order.tolist().index(lane)], one)
+            np.testing.assert_array_equal(many[k, lane], one)
+            np.testing.assert_array_equal(other[k, place], one)
 
 
 def test_a_lane_has_the_same_bits_alone_in_another_order_and_after_others_were_dropped(build):
@@ -113,3 +116,24 @@ def test_a_state_of_any_period_has_many_futures(build, chosen):
 def test_a_single_run_has_no_lanes_to_drop(build):
     with pytest.raises(ValueError, match="one run only"):
         build(0).keep(np.array([0]))
+
+
+@pytest.mark.parametrize("lane", [None, 1])
+def test_joints_that_leave_the_finite_numbers_end_their_run_only(lane):
+    model = nominal_ur5() if lane is None else lanes.stack([nominal_ur5()] * 3)
+    world = KinematicWorld(KinematicConfig(), PlantSetup(model, STARTS[0] if lane is None else STARTS, 0.05))
+    q = world.reset(SEEDS)
+    v = np.zeros(q.shape)
+    v[lane] = np.inf
+    world.restore(world.save()._replace(v=v))
+    if lane is None:
+        with pytest.raises(PlantDiverged, match="joint positions are not finite"):
+            world.advance(np.zeros(6))
+        return
+    for _ in range(2):
+        np.testing.assert_array_equal(world.advance(np.zeros((3, 6))), STARTS)
+        assert [(place, fault.status) for place, fault in world.faults.items()] == [(1, "plant_diverged")]
+        assert np.isfinite(world.truth().feature).all()
+    world.keep(np.array([0, 2]))
+    assert not world.faults
+    np.testing.assert_array_equal(world.advance(np.zeros((2, 6))), STARTS[[0, 2]])
