@@ -40,7 +40,7 @@ def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(tm
     start = {variable.name: variable.start for variable in read_information(path).variables}
     run = build_experiment(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings())
     exported = np.array(start["joint_offset"].split(), dtype=float)
-    np.testing.assert_allclose(exported, run.sample.joint_offset, rtol=1e-12)
+    np.testing.assert_allclose(exported, run.drawn.sample.joint_offset, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
