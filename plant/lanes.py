@@ -161,4 +161,4 @@ def _identity(size: int) -> FloatArray:
 
 def transposed(A: npt.NDArray[Any]) -> FloatArray:
     """Return Aᵀ, (..., n, m), for A (..., m, n)."""
-    return np.swapaxes(A, -1, -2)
+    return A.mT

@@ -50,11 +50,11 @@ class MotionHistory(NamedTuple):
             periods: that it took, (...), from 1 to `MAX_GAP`.
         """
         rows = branch(self.empty, _at_rest, self.rows, joint_position)
-        begin = np.concatenate([joint_position, rows[..., -1, joint_position.shape[-1] :]], axis=-1)
-        step = np.concatenate([joint_step, predicted], axis=-1)
-        long = periods > 1
-        appended = branch(np.logical_not(long), _append_period, rows, begin, step)
-        return MotionHistory(branch(long, _append_gap, appended, begin, step, periods), np.full(np.shape(long), False))
+        long, before = periods > 1, rows[..., -1, joint_position.shape[-1] :]
+        end = np.concatenate([joint_position + joint_step, before + predicted], axis=-1)
+        appended = branch(np.logical_not(long), _append_period, rows, end)
+        appended = branch(long, _append_gap, appended, joint_position, joint_step, predicted, periods)
+        return MotionHistory(appended, self.empty & False)
 
     def motions(self, periods: npt.NDArray[np.int_], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return, for each candidate delay, the motion over `periods`, (...), that ended so many periods ago.
@@ -76,12 +76,20 @@ def _at_rest(rows: FloatArray, joint_position: FloatArray) -> FloatArray:
     return np.concatenate([still, np.zeros((*rows.shape[:-1], rows.shape[-1] - n))], axis=-1)
 
 
-def _append_period(rows: FloatArray, begin: FloatArray, step: FloatArray) -> FloatArray:
-    return np.concatenate([rows[..., 1:, :], (begin + step)[..., None, :]], axis=-2)
+def _append_period(rows: FloatArray, end: FloatArray) -> FloatArray:
+    return np.concatenate([rows[..., 1:, :], end[..., None, :]], axis=-2)
 
 
-def _append_gap(rows: FloatArray, begin: FloatArray, step: FloatArray, periods: npt.NDArray[np.int_]) -> FloatArray:
+def _append_gap(
+    rows: FloatArray,
+    joint_position: FloatArray,
+    joint_step: FloatArray,
+    predicted: FloatArray,
+    periods: npt.NDArray[np.int_],
+) -> FloatArray:
     count, gap = rows.shape[-2], periods[..., None]
+    begin = np.concatenate([joint_position, rows[..., -1, joint_position.shape[-1] :]], axis=-1)
+    step = np.concatenate([joint_step, predicted], axis=-1)
     index = np.arange(count) + gap
     new = index - count + 1
     between = begin[..., None, :] + step[..., None, :] * (new / gap)[..., None]
