@@ -129,8 +129,8 @@ class LearnedCorrection:
         C = self._projected(state, pinv, np.concatenate([error, joint_position], axis=-1))
         seen = C[..., -1, :]
         wanted = wanted + np.vecmat(np.matvec(C[..., :-1, :], seen), jacobian)
-        excess = np.maximum(largest_excess(wanted, self.limit), 1.0)
-        ahead = error - np.matvec(jacobian, wanted) / excess[..., None]
+        excess = largest_excess(wanted, self.limit)
+        ahead = error - np.matvec(jacobian, wanted) / np.maximum(excess, 1.0)[..., None]
         pull = np.vecmat(ahead, jacobian)
         others = np.vecdot(seen, seen)  # ‖G‖² without what Ĵᵀe adds
         alpha = step_size(self.k * np.vecdot(ahead, ahead), self.epsilon + np.vecdot(pull, pull) * others)

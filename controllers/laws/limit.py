@@ -23,7 +23,8 @@ REMAINDER_TOLERANCE = 1e-6  # [1] of the step that may be left undone
 
 def largest_excess(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:
     """Return the largest |u_i| / limit_i, (...), of joint velocities (..., n); above 1 some joint exceeds its limit."""
-    return np.asarray(np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1))
+    excess: FloatArray = np.maximum.reduce(np.abs(joint_velocity) / limit, axis=-1)
+    return excess
 
 
 def scale_to_limit(joint_velocity: FloatArray, limit: FloatArray) -> FloatArray:

@@ -147,13 +147,14 @@ def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:
         lead: (...), periods, at least 0.
         rows: how many instants are wanted, at most 1 + preview.
     """
-    last = reference.shape[-2] - 1
-    if last == 0 or not np.any(lead):
-        return reference[..., :rows, :]
-    whole = np.floor(lead)
-    index = whole.astype(np.int_)[..., None] + np.arange(rows + 1)
-    inside = np.minimum(index, last)
-    beyond = (index - inside)[..., None] * (reference[..., -1:, :] - reference[..., -2:-1, :])
-    found = np.take_along_axis(reference, inside[..., None], axis=-2) + beyond
-    before = found[..., :-1, :]
-    return np.asarray(before + (lead - whole)[..., None, None] * (found[..., 1:, :] - before))
+    now = reference[..., :rows, :]
+    return branch(lead > 0.0, _interpolated, now, reference, lead) if reference.shape[-2] > 1 else now
+
+
+def _interpolated(now: FloatArray, reference: FloatArray, lead: FloatArray) -> FloatArray:
+    """Return y_0 + Σ_j s_j (y_{j+1} − y_j), (..., rows, m), with s_j the share of segment j that has passed."""
+    segments = reference.shape[-2] - 1
+    passed = lead[..., None, None] + (np.arange(now.shape[-2])[:, None] - np.arange(segments))
+    passed[..., :-1] = np.minimum(passed[..., :-1], 1.0)  # the last segment goes on
+    steps = reference[..., 1:, :] - reference[..., :-1, :]
+    return np.asarray(reference[..., :1, :] + np.maximum(passed, 0.0) @ steps)
