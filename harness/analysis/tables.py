@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
 from itertools import combinations
 from typing import Any, Final
 
@@ -31,6 +32,9 @@ Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 SWEPT: Final = ("noise_factor", "latency_periods")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
 SWEEP_COLUMNS: Final = (*CONDITIONS, "task", "controller", "status", "settling_time_s")  # what `sweep_tables` reads
+SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "controller"]
+COSTS: Final = ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
+                "jacobian_error_mean")  # fmt: skip
 TAIL: Final = 0.95
 MAX_REASON: Final = 60  # characters of a reason that are shown in a table
 SUMMARY_LEGEND: Final = (
@@ -61,20 +65,29 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
         yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
 
 
-def sweep_tables(runs: pd.DataFrame) -> Tables:
-    """Yield what a sweep ends with: for each plant and task the share of settled runs, a row for each condition."""
+def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
+    """Yield what a sweep ends with: for each plant and task the share of settled runs, a row for each condition.
+
+    Args:
+        parts: pieces of the table of runs; only numbers of runs are kept of each.
+    """
+    counts = pd.concat([_count_settled(part) for part in parts]).groupby(level=SWEEP_KEYS, sort=False).sum()
+    for (plant, task), place in counts.groupby(level=["plant", "task"], sort=False):
+        own = place.droplevel(["plant", "task"])
+        share, count = (numbers.unstack(sort=False) for numbers in (100.0 * own["sum"] / own["size"], own["size"]))
+        table = share.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
+        table["runs"] = count.max(axis=1).map("{:.0f}".format)
+        yield f"{task} on {plant}: settled, %", table.rename_axis(columns=None).reset_index()
+
+
+def _count_settled(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return how many runs there are in each condition, `size`, and how many of them settled, `sum`."""
     runs = runs.assign(
         settled=settling_times(runs).notna(),
         noise=runs["noise_factor"].map("{:g}".format),
         latency=[MISSING if pd.isna(value) else f"{value:g}" for value in runs["latency_periods"]],
     )
-    for (plant, task), place in runs.groupby(["plant", "task"], sort=False):
-        by = ["mismatch", "noise", "latency"]
-        grouped = place.groupby([*by, "controller"], sort=False)["settled"]
-        share, count = (100.0 * grouped.mean()).unstack(sort=False), grouped.size().unstack(sort=False)
-        table = share.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
-        table["runs"] = count.max(axis=1).map("{:.0f}".format)
-        yield f"{task} on {plant}: settled, %", table.rename_axis(columns=None).reset_index()
+    return runs.groupby(SWEEP_KEYS, sort=False)["settled"].agg(["sum", "size"])
 
 
 def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
@@ -182,12 +195,11 @@ def tracking_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each plant and controller what a step costs and how much the joints are used."""
+    """Return for each plant and controller what a step costs, as far as known, and how much the joints are used."""
     rows = []
     for (plant, controller), group in runs.groupby(["plant", "controller"], sort=False):
         row: dict[str, Any] = {"plant": plant, "controller": controller}
-        for name in ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
-                     "jacobian_error_mean"):  # fmt: skip
+        for name in filter(partial(_is_informative, runs), COSTS):
             heading, factor, digits = _shown(name, runs)
             row[heading] = _rounded(factor * column_of(group, name).median(), digits)
         rows.append(row)
@@ -211,7 +223,7 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     names = (*CONDITIONS, "task", "controller", "seed", "status")
     table = runs[[name for name in names if _is_informative(runs, name)]].copy()
     for name in MEASURES:
-        if name in runs:
+        if _is_informative(runs, name):
             heading, factor, digits = _shown(name, runs)
             table[heading] = (factor * runs[name].astype(float)).round(digits)
     if "reason" in runs and (runs["reason"].fillna("") != "").any():
@@ -228,8 +240,8 @@ def _groups(runs: pd.DataFrame, *more: str) -> list[tuple[dict[str, Any], pd.Dat
 
 
 def _is_informative(runs: pd.DataFrame, name: str) -> bool:
-    """Return whether there is such a column and, where only a sweep varies it, more than one value in it."""
-    return name in runs and (name not in SWEPT or runs[name].nunique() > 1)
+    """Return whether there is such a column with a value and, where only a sweep varies it, more than one."""
+    return name in runs and runs[name].nunique() > (name in SWEPT)
 
 
 def _shown(name: str, runs: pd.DataFrame) -> tuple[str, float, int]:

@@ -154,36 +154,38 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
 
 
 class _Jobs:
-    """Makes the jobs of a campaign; runs that differ in seed and mismatch only share their settings."""
+    """Makes the jobs of a campaign; runs that differ in seed only share their settings."""
 
     def __init__(self, campaign: Campaign, sections: dict[str, Any], *, together: bool) -> None:
         self._cells, self._sections = campaign.cells, sections
         self._together = together and not campaign.steps
-        self._resolved: dict[tuple[object, ...], ResolvedRun] = {}
+        self._known: dict[tuple[object, ...], tuple[tuple[Any, ...], Hashable | None]] = {}
 
     def at(self, indices: Iterable[int]) -> Iterator[Job]:
         """Yield the jobs of some cells."""
         for index in indices:
             cell = self._cells[index]
-            run = self._resolve(cell.request)
-            yield Job(index, cell, run, None if cell.picture else self._kind(run))
+            run, kind = self._resolve(cell.request)
+            yield Job(index, cell, run, None if cell.picture else kind)
 
     def side_by_side(self, examples: Iterable[RunRequest]) -> dict[str, list[str]]:
         """Return by plant the controllers whose runs advance together."""
         found: dict[str, dict[str, None]] = {}
         for request in examples:
-            if self._kind(self._resolve(request)) is not None:
+            if self._resolve(request)[1] is not None:
                 found.setdefault(request.plant, {})[request.controller] = None
         return {plant: list(controllers) for plant, controllers in found.items()}
 
-    def _resolve(self, request: RunRequest) -> ResolvedRun:
-        known = request.plant, request.controller, request.task, request.noise_factor, request.latency_periods
-        if known not in self._resolved:
-            self._resolved[known] = select(request, self._sections)
-        return replace(self._resolved[known], request=request)
-
-    def _kind(self, run: ResolvedRun) -> Hashable | None:
-        return side_by_side_key(run) if self._together else None
+    def _resolve(self, request: RunRequest) -> tuple[ResolvedRun, Hashable | None]:
+        """Return a run with its settings, and its kind if it may advance with others."""
+        names = request.plant, request.controller, request.task
+        known = *names, request.mismatch, request.noise_factor, request.latency_periods
+        if known not in self._known:
+            first = select(request, self._sections)
+            settings = first.run, first.plant, first.controller, first.task
+            self._known[known] = settings, side_by_side_key(first) if self._together else None
+        settings, kind = self._known[known]
+        return ResolvedRun(request, *settings), kind
 
 
 def _carry_out_missing(campaign: Campaign, jobs: _Jobs, folder: Path, place: Workers, how: Execution) -> None:

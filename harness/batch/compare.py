@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from servobench.harness.batch.grid import Grid
 from servobench.harness.config.settings import ConfigurationError
@@ -30,8 +30,12 @@ class Batch:
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
+        return Grid(_request, *self.axes())
+
+    def axes(self) -> tuple[Sequence[Any], ...]:
+        """Return plants, tasks, mismatches, controllers and seeds."""
         mismatches = [read_mismatch(text) for text in self.mismatches]
-        return Grid(_request, self.plants, self.tasks, mismatches, self.controllers, self.seeds)
+        return self.plants, self.tasks, mismatches, self.controllers, self.seeds
 
 
 def _request(plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:

@@ -36,7 +36,7 @@ RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 MANIFEST = "manifest.json"
 LOCK = ".lock"
-ROW_GROUP: Final = 4096  # [rows] of a table that are in memory at a time while parts are put together
+ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
 
 
 @contextlib.contextmanager
@@ -196,18 +196,22 @@ def collect(folder: Path) -> int:
     return count
 
 
-def load_runs(folder: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
+def load_runs(folder: Path) -> pd.DataFrame:
     """Return the table of runs of a results folder, also of one whose batch was killed.
-
-    Args:
-        folder: the folder.
-        columns: names of the columns to read, as far as there are such; None for all.
 
     Raises:
         ConfigurationError: not a results folder, or one of another schema.
     """
     check_folder(folder)
-    return _load(folder, RUNS, columns=columns)
+    return _load(folder, RUNS)
+
+
+def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
+    """Yield the table of runs of a finished batch, at most `ROW_GROUP` rows at a time and those of `columns` it has."""
+    with pq.ParquetFile(folder / RUNS) as file:
+        known = [name for name in columns if name in file.schema_arrow.names]
+        for group in range(file.num_row_groups):
+            yield file.read_row_group(group, known, use_threads=False).to_pandas()
 
 
 def load_steps(folder: Path, run_ids: list[str] | None = None) -> pd.DataFrame:
@@ -277,16 +281,12 @@ def _part_files(folder: Path, kind: str) -> list[Path]:
     return [path for path in files if path.is_file()]
 
 
-def _load(
-    folder: Path, kind: str, only: ds.Expression | None = None, columns: Sequence[str] | None = None
-) -> pd.DataFrame:
+def _load(folder: Path, kind: str, only: ds.Expression | None = None) -> pd.DataFrame:
     paths = [folder / kind] if (folder / kind).is_file() else _part_files(folder, kind)
     if not paths:
         return pd.DataFrame()
-    schema = _common_schema(paths)
-    wanted = [name for name in schema.names if columns is None or name in columns]
-    data = ds.dataset([str(path) for path in paths], schema)
-    table: pd.DataFrame = data.to_table(filter=only, columns=wanted).to_pandas()
+    data = ds.dataset([str(path) for path in paths], _common_schema(paths))
+    table: pd.DataFrame = data.to_table(filter=only).to_pandas()
     return table
 
 

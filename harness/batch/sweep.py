@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, TypeAlias
 
@@ -29,7 +29,7 @@ class SweepPlan:
     def cells(self) -> Grid[Cell]:
         """Return the runs, seeds varying fastest."""
         places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
-        return Grid(_cell, places or [Place()], self.noise_factors, self.latencies, self.batch.requests())
+        return Grid(_cell, places or [Place()], self.noise_factors, self.latencies, *self.batch.axes())
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,9 @@ class Place:
         number, unit = (math.nan, "") if self.magnitude is None else (self.magnitude.number, self.magnitude.unit)
         return {"axis": self.axis, "magnitude": number, "unit": unit}
 
-    def vary(self, request: RunRequest) -> RunRequest:
-        """Return a run with the axis put on top of its mismatch."""
-        if self.magnitude is None:
-            return request
-        return replace(request, mismatch=_with_axis(request.mismatch, self.axis, self.magnitude))
+    def vary(self, mismatch: Mismatch) -> Mismatch:
+        """Return a mismatch with the axis put on top of it."""
+        return mismatch if self.magnitude is None else _with_axis(mismatch, self.axis, self.magnitude)
 
 
 @lru_cache
@@ -73,5 +71,6 @@ def parse_variation(text: str) -> Variation:
         raise ConfigurationError(f"--vary: {error}") from error
 
 
-def _cell(place: Place, noise: float, latency: int | None, request: RunRequest) -> Cell:
-    return Cell(replace(place.vary(request), noise_factor=noise, latency_periods=latency), place.columns)
+def _cell(place: Place, noise: float, latency: int | None, *names: Any) -> Cell:  # noqa: ANN401 - as `Batch.axes`
+    plant, task, mismatch, controller, seed = names
+    return Cell(RunRequest(plant, controller, task, place.vary(mismatch), seed, noise, latency), place.columns)

@@ -59,7 +59,7 @@ def sweep(
     campaign = Campaign(plan.cells(), read_settings(config, set_ or []))
     with watching(console, out) as observer:
         carry_out(campaign, out, Execution(workers, scheduler, run_timeout, resume, observer))
-    print_tables(sweep_tables(results.load_runs(out, SWEEP_COLUMNS)), SWEEP_LEGEND)
+    print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), SWEEP_LEGEND)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 
 

@@ -54,7 +54,7 @@ class Line:
 def _cell(place: Place, request: RunRequest) -> Cell:
     """Return a run at one place of its axis."""
     if place.magnitude is None or place.axis not in (LATENCY, NOISE):
-        return Cell(place.vary(request), place.columns)
+        return Cell(replace(request, mismatch=place.vary(request.mismatch)), place.columns)
     number = place.magnitude.number
     varied = {"latency_periods": int(number)} if place.axis == LATENCY else {"noise_factor": number}
     return Cell(replace(request, **varied), place.columns)
