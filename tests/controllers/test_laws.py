@@ -9,11 +9,14 @@ from servobench.controllers.parts import LAWS
 from servobench.plant.signals import trusted_observation
 
 LANES, PERIODS = 3, 60
+TIGHT = {"joint_acceleration_limit": 6.0, "view_tangent": (0.5, 0.4)}
 SETTINGS = [
     ("pid", {"integral_gain": 0.5, "derivative_gain": 0.1, "feedforward": True}),
     ("pid", {"damping": 0.0}),
     ("mfac", {"feedforward": True}),
     ("mpc", {}),
+    ("mpc", {**TIGHT, "horizon": 8, "delay_periods": 2, "fallback": "closed_form"}),
+    ("mpc", {**TIGHT, "mode": "constant", "terminal_weight": 1.0, "use_preview": False}),
     ("rbfnn", {}),
     ("rbfnn", {"row_space_only": False, "position": "commanded", "anti_windup": False, "preview": False}),
     ("rbfnn_bridged", {}),

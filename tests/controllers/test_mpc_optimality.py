@@ -1,0 +1,107 @@
+"""Test of the predictive law against the problem as its docstrings state it, apart from all code that solves it."""
+
+import numpy as np
+import pytest
+from scipy.optimize import nnls
+
+from kit.toy import plant_spec
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
+from servobench.plant.signals import trusted_observation
+
+LANES, N, M = 6, 4, 3
+LIMITS = {
+    "speed": {"limit_position": False},
+    "acceleration": {"joint_acceleration_limit": 6.0, "limit_position": False},
+    "position": {},
+    "view": {"view_tangent": (0.3, 0.25), "limit_position": False},
+    "all": {"joint_acceleration_limit": 12.0, "view_tangent": (0.3, 0.25), "alpha": 0.9, "terminal_weight": 0.5},
+}
+
+
+def gradient(config, J, e, ahead, plan):
+    """The gradient of the criterion in the docstring of `MpcLaw`, term by term; the integral by quadrature."""
+    H, beta, Q = config.horizon, np.exp(-config.rho), config.move_weight
+    knots = np.concatenate([np.zeros((1, len(e))), ahead])
+
+    def pull(tau, travel):
+        target = [np.interp(tau, np.arange(H + 1), column) for column in knots.T] + (1.0 - beta**tau) * e
+        return J.T @ (J @ travel - target)
+
+    found = Q * plan
+    if config.mode == "moves":
+        for tau in range(1, H + 1):
+            weight = config.alpha**tau + config.terminal_weight * (tau == H)
+            found[:tau] += weight * pull(tau, plan[:tau].sum(axis=0))
+        return found
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    for start in range(H):
+        for x, weight in zip(start + 0.5 * (nodes + 1.0), 0.5 * weights, strict=True):
+            found[0] += weight * x * config.alpha**x * pull(x, x * plan[0])
+    found[0] += config.terminal_weight * H * pull(H, H * plan[0])
+    return found
+
+
+def half_spaces(config, spec, J, last, q, y, moves):
+    """The limits in the docstring of `qp` as A x ≤ b, row by row."""
+    A, b, most = [], [], spec.joint_velocity_limit * spec.period
+    change = config.joint_acceleration_limit * spec.period**2
+    stretch = 1.0 if config.mode == "moves" else config.horizon  # the one constant step is made H times
+
+    def add(t, direction, bound, before=slice(0)):
+        row = np.zeros((moves, spec.n))
+        row[t], row[before] = direction, -direction
+        A.append(row.ravel())
+        b.append(bound)
+
+    for t in range(moves):
+        until, before = slice(t + 1), [t - 1] if t else slice(0)
+        for joint, axis in enumerate(np.eye(spec.n)):
+            for sign, limit in ((1.0, spec.joint_upper), (-1.0, -spec.joint_lower)):
+                add([t], sign * axis, most[joint])
+                add([t], sign * axis, change + (0.0 if t else sign * last[joint]), before)
+                add(until, sign * stretch * axis, max(limit[joint] - sign * q[joint], 0.0))
+        for h, v in [config.view_tangent] if config.view_tangent else []:
+            for row in np.array([[1.0, 0.0, h], [-1.0, 0.0, h], [0.0, 1.0, v], [0.0, -1.0, v]]):
+                add(until, -stretch * row @ J, max(row @ y, 0.0))
+    A, b = np.array(A), np.array(b)
+    return A[np.isfinite(b)], b[np.isfinite(b)]
+
+
+def random_lanes(rng, scale):
+    """Return an observation of an arm near its position limits, references and Jacobians."""
+    q, y = rng.uniform(-0.28, 0.28, (LANES, N)), rng.normal(scale=0.25, size=(LANES, M)) + [0.0, 0.0, 1.0]
+    way = rng.normal(scale=0.1 * scale, size=(LANES, 21, M)).cumsum(axis=1)
+    reference = y[:, None] + scale * rng.normal(size=(LANES, 1, M)) + way
+    look = trusted_observation(0.0, q, y, np.full(LANES, True), np.full((LANES, M), True))
+    return look, reference, rng.normal(scale=0.4, size=(LANES, M, N))
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+@pytest.mark.parametrize("limits", LIMITS)
+@pytest.mark.parametrize("scale", [1e-3, 0.05, 1.0])
+def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_documented(mode, limits, scale):
+    spec = plant_spec(N, M, reach=0.3 if limits in {"position", "all"} else 6.0)
+    config = MpcConfig(mode=mode, horizon=6, delay_periods=2, rho=0.4, **LIMITS[limits])
+    law, rng = MpcLaw(config, RobotKnowledge(spec, 20)), np.random.default_rng(7)
+    observation, reference, J = random_lanes(rng, scale)
+    state, solved, active = law.start(observation), 0, 0
+    for _ in range(4):
+        before = state
+        state, _ = law.command(before, Estimate(J), observation, reference)
+        y = observation.feature + np.array([J[i] @ before.sent[i].sum(axis=0) for i in range(LANES)])
+        for i in np.flatnonzero(state.plan.success):
+            rows, plan = reference[i, 2:9], state.plan.moves[i]
+            down = gradient(config, J[i], rows[0] - y[i], rows[1:] - rows[0], plan).ravel()
+            A, b = half_spaces(config, spec, J[i], before.last[i], observation.joint_position[i], y[i], len(plan))
+            slack = b - A @ plan.ravel()
+            assert slack.min() > -1e-8
+            touched = A[slack < 1e-8]
+            residual = nnls(touched.T, -down)[1] if len(touched) else np.linalg.norm(down)
+            assert residual < 1e-7 * max(1.0, np.abs(down).max())
+            solved += 1
+            active += state.plan.active_limits[i] > 0
+        observation, reference, J = random_lanes(rng, scale)
+    assert solved > 12
+    assert active == 0 if scale == 1e-3 and limits == "speed" else active > 0 or scale < 1.0
