@@ -11,7 +11,8 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import JacobianNetwork, LatestFeatures
+from servobench.controllers.networks.latest import LatestFeatures
+from servobench.controllers.networks.rbf import JacobianNetwork
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import norm
 from servobench.plant.settings import Count, NonNegative, Positive, settings

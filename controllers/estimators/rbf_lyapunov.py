@@ -10,7 +10,7 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.rbf import started_rows
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import LatestFeatures
+from servobench.controllers.networks.latest import LatestFeatures
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import norm
 from servobench.plant.settings import Positive, settings
