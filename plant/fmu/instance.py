@@ -206,13 +206,19 @@ class Instance(ABC):
 
     def reader(self, port: Port) -> Call:
         """Return a function that reads the port's variables into its buffer and checks the status."""
-        read = self.access("Get", port)
-        return lambda: self.check(f"reading {port.summary}", read())
+        return self._checked("reading", port, self.access("Get", port))
 
     def writer(self, port: Port, row: int = 0) -> Call:
         """Return a function that writes a row of the port's buffer into its variables and checks the status."""
-        write = self.access("Set", port, row)
-        return lambda: self.check(f"writing {port.summary}", write())
+        return self._checked("writing", port, self.access("Set", port, row))
+
+    def _checked(self, verb: str, port: Port, call: RawCall) -> Call:
+        def checked() -> None:
+            status = call()
+            if status:
+                self.check(f"{verb} {port.summary}", status)
+
+        return checked
 
     def derivative(self, unknowns: Port, knowns: Port) -> None:
         """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
