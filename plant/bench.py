@@ -208,7 +208,7 @@ class Bench(Plant):
         return self._observation(joints, *self._frames.popleft())
 
     def _observation(self, joints: FloatArray, feature: FloatArray, arrives: BoolArray) -> Observation:
-        """Return what is seen at the present period and hold it for frames that do not arrive."""
+        """Return what is seen at the present period; the feature is held for frames that do not arrive."""
         time, valid = self._k * self._period, self._all_valid
         if arrives is not self._all_arrive:
             feature, valid = where(arrives, feature, self._held), np.logical_and(valid, arrives[..., None])
@@ -226,7 +226,7 @@ class Bench(Plant):
         return feature
 
     def _sent(self) -> Frame:
-        """Return the frame that is exposed now, with those lanes marked in which it is lost on its way."""
+        """Return the frame that is exposed now and whether it will arrive."""
         feature, arrives, probability = self._expose(), self._all_arrive, self._sensing.drop_probability
         if probability > 0.0:
             lost = self._losses.next() < probability
@@ -286,7 +286,9 @@ class Bench(Plant):
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
         shape = (*self.world.lead, 4, 4)
-        self.world.move_camera(X_BC if X_BC.shape == shape else np.broadcast_to(X_BC, shape))
+        if X_BC.shape not in (shape, (4, 4)):
+            raise ValueError(f"X_BC must have shape {shape}, got {X_BC.shape}")
+        self.world.move_camera(np.broadcast_to(X_BC, shape))
 
     def close(self) -> None:
         """See `Plant.close`."""

@@ -113,9 +113,15 @@ def test_a_state_of_any_period_has_many_futures(build, chosen):
         build(np.array([0, 2])).restore(state)
 
 
-def test_a_single_run_has_no_lanes_to_drop(build):
+def test_what_does_not_fit_the_number_of_runs_is_refused(build):
     with pytest.raises(ValueError, match="one run only"):
         build(0).keep(np.array([0]))
+    with pytest.raises(ValueError, match=r"seed must have shape \(\), got \(3,\)"):
+        build(0).reset(SEEDS)
+    with pytest.raises(ValueError, match=r"X_BC must have shape \(3, 4, 4\), got \(2, 4, 4\)"):
+        build(np.arange(3)).move_camera(MOVED[:2])
+    with pytest.raises(ValueError, match=r"joint_velocity must have shape \(3, 6\), got \(6,\)"):
+        build(np.arange(3)).step(Command(np.zeros(6)))
 
 
 @pytest.mark.parametrize("lane", [None, 1])
