@@ -27,7 +27,7 @@ Lanes = Any  # an index of the leading axes
 
 def _map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  # noqa: ANN401 - any tree
     """Return the tree with `function` applied to its arrays, and to those at the same place of the other trees."""
-    if isinstance(tree, np.ndarray):
+    if isinstance(tree, (np.ndarray, np.generic)):  # numpy makes numbers of arrays without axes
         return function(tree, *others)
     if isinstance(tree, tuple):
         entries = [_map(function, *each) for each in zip(tree, *others, strict=True)]

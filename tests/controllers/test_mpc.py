@@ -13,6 +13,7 @@ from servobench.controllers.laws.mpc.closed_form import UnlimitedPlan, horizon_i
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
 from servobench.plant.faults import SolverFailed
+from servobench.plant.lanes import stack
 
 
 def make_spec(n=6, m=3, **limits):
@@ -234,6 +235,17 @@ def test_without_a_solution_the_arm_holds_and_it_is_counted(mode):
     assert math.isnan(diagnostics["active_limits"])
     assert law.command(Estimate(J), observation, reference).any()  # at rest it may go on
     assert law.diagnostics()["fallbacks"] == 1
+
+
+def test_states_of_single_runs_can_be_stacked():
+    fell_back, J, observation, reference = infeasible("hold")
+    fell_back.command(Estimate(J), observation, reference)
+    goes_on = Commanding(fell_back.law, observation)
+    goes_on.command(Estimate(J), observation, hold(observation.feature))
+    both = goes_on.law.diagnostics(stack([goes_on.state, fell_back.state]))
+    for name, value in both.items():
+        np.testing.assert_array_equal(value, [goes_on.diagnostics()[name], fell_back.diagnostics()[name]])
+    assert both["fallbacks"].tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("mode", ["moves", "constant"])

@@ -208,8 +208,8 @@ class MpcLaw(Law[MpcState]):
         # A ball that is out of view already may not get further out.
         margin = np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0)
         bounds = joint_bounds(self._shape, self._spec, state.last, observation.joint_position, margin)
-        zero = np.zeros(feature.shape[:-1])
-        plan = Plan(moves, zero + 1.0, zero, zero)
+        lead = feature.shape[:-1]
+        plan = Plan(moves, success=np.ones(lead), iterations=np.zeros(lead), active_limits=np.zeros(lead))
         plan = branch(exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds)
         limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan.moves[..., 0, :] / self._spec.period, -limit, limit)
