@@ -146,7 +146,7 @@ class RbfnnLaw(Law[RbfnnState]):
         return new, step / self._period
 
     def diagnostics(self, state: RbfnnState) -> Diagnostics:
-        """Return criterion I_c (m²), step size α, predicted error ‖e(k+T)‖ (m), norms of weights, saturation."""
+        """Return I_c = ½ Σ ‖e(k+t)‖² (eq. 15, m²), step size α, ‖e(k+T)‖ (m), norms of weights, saturation."""
         return {
             "criterion": 0.5 * sum_of_squares(state.predicted, 2),
             "step_size": state.step_size,

@@ -168,7 +168,7 @@ class JacobianNetwork:
         return every.reshape(*lead, count, -1).take(self._places, axis=-1)  # each layer was multiplied by each column
 
     def gradient(self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray) -> FloatArray:
-        """Return Σ_t e_t Δq_{i,t} θ_i(q_t)ᵀ (eq. 32) by rows of the Jacobian, (..., m, n, L): −½ ∂/∂W Σ_t ‖e_t‖².
+        """Return Σ_t e_t Δq_{i,t} θ_i(q_t)ᵀ by rows of the Jacobian, (..., m, n, L): −½ ∂/∂W Σ_t ‖e_t‖² (eqs. 31, 32).
 
         Args:
             errors: e_t = Δy_t − Ĵ(q_t) Δq_t, (..., T, m), m.
