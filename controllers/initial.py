@@ -89,7 +89,7 @@ class KnownJacobian(InitialJacobian[KnownState]):
         Raises:
             ValueError: the model is that of another robot.
         """
-        jacobian = np.array(self._model(observation.joint_position), dtype=np.float64)
+        jacobian = np.array(self._model(observation.joint_position), dtype=np.float64, order="C")
         if jacobian.shape[-2:] != self._shape:
             raise ValueError(f"nominal_jacobian must return shape {self._shape}, got {jacobian.shape}")
         return KnownState(jacobian)

@@ -67,6 +67,16 @@ def test_lost_frames_prolong_probing_and_do_no_harm():
     np.testing.assert_allclose(J, nominal_ur5().jacobian(START), atol=0.006)
 
 
+def test_the_matrix_of_a_model_is_stored_by_rows_whatever_the_layout_that_the_model_returns():
+    """Products of another layout have other bits, and in some lanes only a copy would change the layout."""
+    J = np.asfortranarray(np.arange(8.0).reshape(2, 4))
+    knowledge = RobotKnowledge(plant_spec(4, 2), 0, nominal_jacobian=lambda q: J)
+    provider = initial_jacobian(InitialConfig(), knowledge)
+    found = provider.jacobian(provider.start(Observation(0.0, np.zeros(4), np.zeros(2))))
+    np.testing.assert_array_equal(found, J)
+    assert found.flags.c_contiguous
+
+
 def test_a_probing_move_turns_away_from_a_joint_limit():
     provider = initial_jacobian(InitialConfig("probe", average_periods=1), RobotKnowledge(spec(), 0))
     at = Observation(0.0, np.array([0.99, 0.0]), np.zeros(1))
