@@ -71,7 +71,8 @@ def overshoot(feature: FloatArray, target: FloatArray) -> FloatArray:
 
 def path_length(points: FloatArray) -> FloatArray:
     """Return the length, (...), of the path through `points`, (..., m, k) [their unit]."""
-    return norm(np.ascontiguousarray(transposed(np.diff(points, axis=-1)))).sum(axis=-1)
+    steps = np.ascontiguousarray(transposed(np.diff(points, axis=-1)))
+    return np.asarray(norm(steps).sum(axis=-1))
 
 
 def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, FloatArray]:
