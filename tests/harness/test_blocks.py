@@ -69,6 +69,17 @@ def test_runs_that_are_missing_may_form_other_blocks(alone, tmp_path):
     pd.testing.assert_frame_equal(judged(results.load_runs(folder)), alone, check_exact=True)
 
 
+def test_where_runs_cannot_advance_together_each_is_carried_out_by_itself(alone, tmp_path, monkeypatch):
+    def leave(_runs, *, keep):
+        raise SystemExit(keep)
+
+    monkeypatch.setattr("servobench.harness.run.episode.carry_out_together", leave)
+    carry_out(CAMPAIGN, tmp_path / "out", Execution(1))
+    runs = results.load_runs(tmp_path / "out")
+    pd.testing.assert_frame_equal(judged(runs), alone, check_exact=True)
+    assert times(runs).notna().all(axis=None)
+
+
 class ProcessDied(Exception):
     """What a future raises."""
 
