@@ -26,8 +26,6 @@ from servobench.plant.checks import FloatArray, as_array, as_vector
 
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
-TURN_SIGNS = np.array([1.0, -1.0])  # of the sine in the two columns that a turn about z mixes
-SWAPPED_COLUMNS = np.array([1, 0, 2, 3])  # of a pose: each column's partner in a turn about z
 YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a vector: the partners in a cross product
 
 
@@ -116,18 +114,17 @@ class SerialArm:
             (..., n+1, 4, 4), m: entry i is the frame after joint i+1, the last one is the flange.
         """
         theta = self.joint_angle(joint_position)
-        angle = (theta if theta.ndim == 1 else np.moveaxis(theta, -1, 0))[..., None, None]
+        lead, fixed = theta.shape[:-1], self._fixed
+        if fixed.ndim < 3 + len(lead):
+            fixed = fixed.reshape(self.n + 1, *(1,) * (3 + len(lead) - fixed.ndim), *fixed.shape[1:])
+        angle = (theta if theta.ndim == 1 else np.moveaxis(theta, -1, 0))[..., None]
         # A turn about z makes x c + y s and y c - x s of columns 0 and 1, and leaves the others as they are.
-        own, swapped = np.empty((*angle.shape[:-2], 4, 4)), np.zeros((*angle.shape[:-2], 4, 4))
-        own[..., :2], own[..., 2:] = np.cos(angle), 1.0
-        swapped[..., :2] = np.sin(angle) * TURN_SIGNS
-        poses = np.empty((self.n + 1, *theta.shape[:-1], 4, 4))
-        pose: FloatArray = self._fixed[0]
-        for turned, c, s, fixed in zip(poses, own, swapped, self._fixed[1:], strict=False):
-            np.multiply(pose, c, out=turned)
-            np.add(turned, pose.take(SWAPPED_COLUMNS, axis=-1) * s, out=turned)
-            pose = turned @ fixed
-        poses[self.n] = pose
+        c, s, x, y = np.cos(angle), np.sin(angle), fixed[:-1, ..., 0], fixed[:-1, ..., 1]
+        turned, poses = np.empty((self.n, *lead, 4, 4)), np.empty((self.n + 1, *lead, 4, 4))
+        turned[..., 0], turned[..., 1], turned[..., 2:] = x * c + y * s, y * c - x * s, fixed[:-1, ..., 2:]
+        poses[0] = turned[0]
+        for before, own, pose in zip(poses, (*turned[1:], fixed[-1]), poses[1:], strict=False):
+            np.matmul(before, own, out=pose)
         return poses if theta.ndim == 1 else np.moveaxis(poses, 0, -3)
 
     def ball_position(self, joint_position: npt.ArrayLike) -> FloatArray:
