@@ -48,7 +48,8 @@ class NoiseLevel(NamedTuple):
     @property
     def deviation(self) -> FloatArray:
         """σ, (...), m."""
-        return np.asarray(np.sqrt(self.variance))
+        deviation: FloatArray = np.sqrt(self.variance)
+        return deviation
 
     def learn(self, square: FloatArray, multiple: float, other: FloatArray) -> NoiseLevel:
         """Return the state after an innovation; one of exactly 0 is that of the same frame and holds no information.

@@ -2,7 +2,8 @@
 
 Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. What is to happen in some lanes
 only goes through `branch`, so that no part writes a mask. A state is a tree of arrays: named tuples, tuples and
-dataclasses, of which every array has the leading axes; whatever else is in them is shared by all lanes.
+dataclasses, of which every array has the leading axes; whatever else is in them is shared by all lanes. A number of a
+single run is a scalar of numpy, which costs a tenth of an array without axes: `array[()]` makes the one of the other.
 
 A lane has the same bits whatever its neighbours are, as long as no leading axis becomes an axis of a matrix: products
 are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over the last, contiguous axes.
@@ -75,9 +76,9 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
         tree: what may change.
         arguments: further trees that the function needs.
     """
-    if np.ndim(chosen) == 0:
-        return function(tree, *arguments) if chosen else tree
     mask = np.asarray(chosen)
+    if mask.ndim == 0:
+        return function(tree, *arguments) if chosen else tree
     count = np.count_nonzero(mask)
     if count == 0:
         return tree
@@ -124,7 +125,8 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
     """
     leading = np.ndim(index) - axes
     if leading == 0:
-        return np.asarray(array[index])
+        entry: npt.NDArray[Any] = array[index]
+        return entry
     lead, (length, *rest) = array.shape[:leading], array.shape[leading:]
     first = length * np.arange(math.prod(lead)).reshape(lead + (1,) * axes)
     return np.asarray(array.reshape(-1, *rest).take(first + index, axis=0))
@@ -143,7 +145,8 @@ def outer(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def norm(x: FloatArray) -> FloatArray:
     """Return ‖x‖, (...), for x (..., n)."""
-    return np.asarray(np.sqrt(np.vecdot(x, x)))
+    length: FloatArray = np.sqrt(np.vecdot(x, x))
+    return length
 
 
 def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:

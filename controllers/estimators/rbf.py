@@ -46,7 +46,7 @@ def window_step(
     size = sizes.reshape(flat)
     total = np.vecdot((joint_steps * joint_steps).reshape(flat), size)
     total = total + epsilon * np.add.reduce(size, axis=-1) / (count * sizes.shape[-1])
-    return np.asarray(k2 / np.where(total > 0.0, total, np.inf))
+    return np.where(total > 0.0, k2 / np.where(total > 0.0, total, 1.0), 0.0)[()]
 
 
 def started_rows(network: JacobianNetwork, jacobian: FloatArray) -> FloatArray:

@@ -176,7 +176,7 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         return {
             **self._network.diagnostics(state.network),
             "delay": state.delay,
-            "map_rotation": np.arccos(np.clip(1.0 - 0.25 * np.vecdot(turned, turned), -1.0, 1.0)),
+            "map_rotation": np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0)),
             "map_deviation": self._deviation(state),
             "map_surprise": state.nis,
             "camera_moves": state.moves,
@@ -184,7 +184,8 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         }
 
     def _deviation(self, state: RbfAlignedState) -> FloatArray:
-        return np.asarray(np.sqrt(self.covariance(state).trace(axis1=-2, axis2=-1) / self._m))
+        deviation: FloatArray = np.sqrt(self.covariance(state).trace(axis1=-2, axis2=-1) / self._m)
+        return deviation
 
     def _learn(self, state: RbfAlignedState, motion: Motion, periods: npt.NDArray[np.int_]) -> RbfAlignedState:
         q, dq, dy = motion.joint_position, motion.joint_step, motion.feature_step
@@ -247,11 +248,11 @@ class RbfAlignedEstimator(Estimator[RbfAlignedState]):
         if config.detect_moves:
             moved = cusum > config.gate
             bank = branch(moved, self._learn_any_map, bank, before, x, feature_step, variance)
-            cusum, moves = np.where(moved, 0.0, cusum), moves + moved
+            cusum, moves = cusum * ~moved, moves + moved
         scores = config.forgetting * state.scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
         best = scores.argmin(axis=-1)
         better = pick(scores, best) < pick(scores, state.delay) - config.margin
-        delay = np.where(better, best, state.delay)
+        delay = np.where(better, best, state.delay)[()]
         state = state._replace(
             bank=bank, scores=scores, noise=noise, delay=delay, moves=moves, nis=surprise, cusum=cusum
         )

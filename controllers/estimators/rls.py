@@ -114,4 +114,5 @@ class RlsEstimator(Estimator[RlsState]):
 
 
 def _mean_diagonal(P: FloatArray) -> FloatArray:
-    return np.asarray(P.trace(axis1=-2, axis2=-1) / P.shape[-1])
+    mean: FloatArray = P.trace(axis1=-2, axis2=-1) / P.shape[-1]
+    return mean

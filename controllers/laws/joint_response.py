@@ -80,7 +80,8 @@ def _learned(state: JointResponse, joint_step: FloatArray) -> JointResponse:
     A, b = state.A + commands @ transposed(commands), state.b + np.matvec(commands, joint_step)
     kept = np.minimum(1.0, MAX_EXCITATION / A.trace(axis1=-2, axis2=-1))[..., None]
     A, b = kept[..., None] * A, kept * b
-    return with_response(state._replace(A=A, b=b), np.linalg.solve(A, b[..., None])[..., 0].clip(0.0, MAX_RESPONSE))
+    response = np.linalg.solve(A, b[..., None])[..., 0]
+    return with_response(state._replace(A=A, b=b), np.minimum(np.maximum(response, 0.0), MAX_RESPONSE))
 
 
 def with_response(state: JointResponse, response: FloatArray) -> JointResponse:

@@ -97,14 +97,15 @@ def redistribute(
         state = _Shared(dq, 1.0 - 1.0 / excess, free, jacobian, wanted, down, up)
         while (unfinished := _is_unfinished(state)).any():
             state = branch(unfinished, take_over, state)
-        return np.clip(state.joint_step, -limit, limit)
+        return np.minimum(np.maximum(state.joint_step, -limit), limit)
 
     return branch(largest_excess(joint_step, limit) > 1.0, shared, joint_step, jacobian, *further)
 
 
 def _is_unfinished(state: _Shared) -> BoolArray:
     enough = np.add.reduce(state.free, axis=-1) >= state.jacobian.shape[-2]
-    return np.asarray((state.left > REMAINDER_TOLERANCE) & enough)
+    unfinished: BoolArray = (state.left > REMAINDER_TOLERANCE) & enough
+    return unfinished
 
 
 def _take_over(state: _Shared, limit: FloatArray, damping: float) -> _Shared:

@@ -141,7 +141,7 @@ class RbfnnLaw(Law[RbfnnState]):
         step = scale_to_limit(wanted, self._step_limit)
         if config.position == "commanded":
             positions = pushed(positions, positions[..., 0, :] + step)
-        alpha = np.where(observation.feature_valid, alpha, state.step_size)
+        alpha = np.where(observation.feature_valid, alpha, state.step_size)[()]
         new = RbfnnState(learned, errors, positions, ahead.errors, alpha, wanted)
         return new, step / self._period
 

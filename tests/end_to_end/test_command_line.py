@@ -41,7 +41,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_pat
     assert steps["time_s"].tolist() == [k * 0.05 for k in range(60)]
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["configuration"]["exp2"]["duration"] == 3
-    assert manifest["seeds"] == [3]
+    assert manifest["seeds"] == "3"
     assert manifest["packages"]["numpy"]
     figures = {path.stem for path in (out / "figures").glob("*.png")}
     assert figures == {path.stem for path in (out / "figures").glob("*.pdf")}
