@@ -19,6 +19,7 @@ from servobench.harness.batch import results
 from servobench.harness.batch.blocks import BLOCK, CHUNK, Cell, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.grid import Grid
+from servobench.harness.batch.lock import locked
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Workers, open_workers
@@ -109,7 +110,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
             open_workers(
                 how.workers, how.scheduler, how.run_timeout, plants=runs.plants, controllers=runs.controllers
             ) as place,
-            results.locked(folder, new=not how.resume),
+            locked(folder, new=not how.resume),
         ):
             if how.resume:
                 check_same_campaign(folder, manifest, how.observer)

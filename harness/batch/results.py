@@ -7,7 +7,6 @@ process was killed, `load_runs` and `load_steps` read the parts, and `collect` p
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import os
@@ -22,6 +21,7 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
+from servobench.harness.batch.lock import check_empty
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.files import write_atomically
 
@@ -35,53 +35,7 @@ PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 MANIFEST = "manifest.json"
-LOCK = ".lock"
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
-
-
-@contextlib.contextmanager
-def locked(folder: Path, *, new: bool = False) -> Iterator[None]:
-    """Keep other processes from writing the same folder; the lock of a process that died does not count.
-
-    Args:
-        folder: made if needed.
-        new: refuse a folder with anything in it.
-
-    Raises:
-        ConfigurationError: another process writes the folder, it has something in it, or it cannot be made.
-    """
-    if new:
-        _check_empty(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / LOCK).open("a")
-    except OSError as error:
-        raise ConfigurationError(f"results folder {folder} cannot be made: {error.strerror}") from error
-    with file:
-        if not _lock(file.fileno()):
-            raise ConfigurationError(f"results folder {folder} is being written by another process")
-        try:
-            yield
-        finally:
-            (folder / LOCK).unlink(missing_ok=True)
-
-
-def _lock(descriptor: int) -> bool:
-    """Lock an open file as long as it is open; return whether that was possible."""
-    try:
-        import fcntl  # noqa: PLC0415 - not on Windows
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return os.fstat(descriptor).st_nlink > 0  # another process held this file and has removed it since
-
-
-def _check_empty(folder: Path) -> None:
-    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
-        raise ConfigurationError(f"results folder {folder} exists already; name another one with --out")
 
 
 def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
@@ -90,7 +44,7 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
     Raises:
         ConfigurationError: the folder has something in it, or cannot be made.
     """
-    _check_empty(folder)
+    check_empty(folder)
     try:
         (folder / PARTS).mkdir(parents=True)
         write_manifest(folder, manifest)

@@ -100,7 +100,7 @@ def tune(
     ),
 ) -> None:
     """Search for the best settings of each method, with the same budget on the same training plants."""
-    from servobench.harness.batch.results import locked
+    from servobench.harness.batch.lock import locked
     from servobench.harness.batch.workers import open_workers
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.studies.tuning.objective import TuningSet

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from servobench.harness.batch import results
+from servobench.harness.batch.lock import LOCK, locked
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import RunResult
 from servobench.plant.files import write_atomically
@@ -133,11 +134,11 @@ def test_a_part_of_several_runs_says_which_runs_are_there(folder):
 
 def test_a_lock_leaves_nothing_behind_and_that_of_a_dead_process_does_not_count(tmp_path):
     out = tmp_path / "out"
-    with results.locked(out):
-        assert (out / results.LOCK).is_file()
+    with locked(out):
+        assert (out / LOCK).is_file()
     assert list(out.iterdir()) == []
-    (out / results.LOCK).touch()  # what a process that was killed leaves behind
-    with results.locked(out, new=True):
+    (out / LOCK).touch()  # what a process that was killed leaves behind
+    with locked(out, new=True):
         results.create_folder(out, {})
 
 

@@ -26,7 +26,7 @@ from optuna.samplers import TPESampler
 from optuna.storages.journal import JournalFileBackend, JournalStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from servobench.harness.batch.results import LOCK
+from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.defaults import apply_settings
 from servobench.harness.config.settings import ConfigurationError, flatten
