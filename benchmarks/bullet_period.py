@@ -1,27 +1,64 @@
-"""What a period of the `bullet` plant costs over the render and physics calls it cannot do without.
+"""What a period of the `bullet` plant costs over the render and physics calls it needs, and over a plain loop.
 
-Both are measured in the same run, in turns: a whole `Bench.step`, and the same number of motor and physics steps
-plus one `getCameraImage` of the same camera in a world like it.
-Run it from an installed checkout: `python benchmarks/bullet_period.py`.
+All are measured in the same run, in turns: a whole `Bench.step`; the same number of motor and physics steps plus one
+`getCameraImage` of the same camera in a world like it; and a loop as environments of Gymnasium are often written, with
+a call for each motor, all outputs of the renderer and the mean of the red points as the feature.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
+import pybullet
 
+from measuring import asked_to_be_quick, table
 from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, build_bullet
 from servobench.plant.bullet.scene import Scene
-from servobench.plant.checks import whole_steps
+from servobench.plant.checks import FloatArray, whole_steps
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot import ur5
+from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.ur5 import nominal_ur5
 from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
+PERIOD = 0.05  # [s]
+
+
+class PlainEnvironment:
+    """A step in the manner of Gymnasium in a scene of its own."""
+
+    def __init__(self, scene: Scene, config: BulletConfig, X_BC: FloatArray) -> None:
+        """Take the scene and the camera's pose."""
+        self._arm, self._client, camera = scene._arm, scene._client, config.camera()
+        self._size = camera.width, camera.height
+        self._matrices = [matrix.T.ravel().tolist() for matrix in (view_matrix(X_BC), camera.projection_matrix())]
+
+    def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, object]]:
+        """Return observation, reward, terminated, truncated and info after an action, (6,) rad/s."""
+        for _ in range(whole_steps(PERIOD, PHYSICS_STEP)):
+            for joint, speed in enumerate(action):
+                pybullet.setJointMotorControl2(
+                    self._arm, joint, pybullet.VELOCITY_CONTROL, targetVelocity=speed, force=ur5.MAX_TORQUE[joint],
+                    physicsClientId=self._client,
+                )  # fmt: skip
+            pybullet.stepSimulation(physicsClientId=self._client)
+        width, height, rgba, depth, _ = pybullet.getCameraImage(
+            *self._size, *self._matrices, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self._client
+        )
+        picture = np.reshape(rgba, (height, width, 4)).astype(np.float64) / 255.0
+        red = (picture[..., 0] > 0.5) & (picture[..., 1] < 0.3) & (picture[..., 2] < 0.3)
+        rows, columns = np.nonzero(red)
+        near = np.reshape(depth, (height, width))[red]
+        feature = np.array([columns.mean(), rows.mean(), near.mean()]) if len(rows) else np.zeros(3)
+        states = [
+            pybullet.getJointState(self._arm, joint, physicsClientId=self._client) for joint in range(len(action))
+        ]
+        joints = np.array([state[0] for state in states])
+        return {"joints": joints, "feature": feature}, -float(np.linalg.norm(feature)), False, False, {}
 
 
 def milliseconds(call: Callable[[], object]) -> float:
@@ -31,37 +68,42 @@ def milliseconds(call: Callable[[], object]) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-def measure(config: BulletConfig, period: float, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times, ms, (repeats,) of whole periods and of bare ones."""
+def measure(config: BulletConfig, repeats: int) -> FloatArray:
+    """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
     model = nominal_ur5()
-    plant = build_bullet(config, PlantSetup(model, HOME, period))
-    scene = Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=False)
-    camera = config.camera()
+    plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
+    scenes = [Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=False) for _ in range(2)]
+    camera, environment = config.camera(), PlainEnvironment(scenes[1], config, model.X_BC)
     plant.reset(0)
-    scene.place(HOME)
-    steps = whole_steps(period, PHYSICS_STEP)
-    whole, bare = np.empty(repeats), np.empty(repeats)
+    for scene in scenes:
+        scene.place(HOME)
+    steps, times = whole_steps(PERIOD, PHYSICS_STEP), np.empty((3, repeats))
+
+    def bare(targets: list[list[float]]) -> None:
+        scenes[0].advance(targets)
+        scenes[0].render(camera, model.X_BC)
+
     for k in range(repeats):
         speed = 0.2 * np.sin(0.3 * k) * np.ones(6)
-        targets = [speed.tolist()] * steps
-        command = Command(speed)
-        bare[k] = milliseconds(lambda targets=targets: (scene.advance(targets), scene.render(camera, model.X_BC)))
-        whole[k] = milliseconds(lambda command=command: plant.step(command))
+        targets, command = [speed.tolist()] * steps, Command(speed)
+        times[0, k] = milliseconds(partial(bare, targets))
+        times[1, k] = milliseconds(partial(plant.step, command))
+        times[2, k] = milliseconds(partial(environment.step, speed))
     plant.close()
-    scene.close()
-    return whole, bare
+    for scene in scenes:
+        scene.close()
+    return times
 
 
 def main() -> None:
-    """Print medians and their ratio, with and without table and floor."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=300)
-    parser.add_argument("--period", type=float, default=0.05, help="s")
-    options = parser.parse_args()
-    for name, config in (("default", BulletConfig()), ("without scenery", BulletConfig(scenery=False))):
-        whole, bare = measure(config, options.period, options.repeats)
-        ratio = np.median(whole) / np.median(bare)
-        print(f"{name:16s} whole {np.median(whole):6.2f} ms   bare {np.median(bare):6.2f} ms   ratio {ratio:.3f}")
+    """Print medians and ratios, with and without table and floor."""
+    repeats = 3 if asked_to_be_quick(__doc__) else 200
+    rows = []
+    for name, config in (("with scenery", BulletConfig()), ("without scenery", BulletConfig(scenery=False))):
+        medians = np.median(measure(config, repeats), axis=1)
+        for kind, value in zip(("bare calls", "`Bench.step`", "Gymnasium-style loop"), medians, strict=True):
+            rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
+    print(table(["period of `bullet`", "a period", "× bare calls"], rows))
 
 
 if __name__ == "__main__":

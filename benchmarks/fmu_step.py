@@ -3,6 +3,7 @@
 bare      set, doStep and get by ctypes with arguments that were built once: the floor
 plant     Bench.step, without noise and delay
 fmpy      setReal, doStep and getReal of fmpy's FMU2Slave, with lists
+block     Bench.step of many runs side by side, for each of them
 """
 
 from __future__ import annotations
@@ -15,23 +16,29 @@ from typing import cast
 import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
+from measuring import asked_to_be_quick, table
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench import Bench, SensingConfig
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.world import FmuWorld
+from servobench.plant.lanes import stack
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
 CALLS = 200
-ROUNDS = 400
+BLOCK = 128
 PERIOD = 0.05
+BARE = "bare calls by ctypes: set, step, get"
 
 
-def open_plant() -> Bench:
-    """Return the exported UR5 without anything around it."""
+def open_plant(runs: int = 0) -> Bench:
+    """Return the exported UR5 without anything around it; with `runs`, so many side by side."""
     config = Ur5FmuConfig(command_delay_periods=0, sensing=SensingConfig(0.0))
-    return build_ur5(config, PlantSetup(nominal_ur5(), np.array(HOME), PERIOD))
+    model, start = nominal_ur5(), np.array(HOME)
+    if runs:
+        model, start = stack([model] * runs), np.tile(start, (runs, 1))
+    return build_ur5(config, PlantSetup(model, start, PERIOD))
 
 
 def fmu_world(plant: Bench) -> FmuWorld:
@@ -84,8 +91,9 @@ def fmpy_calls(plant: Bench) -> Callable[[int], None]:
 
 def plant_steps(plant: Bench) -> Callable[[int], None]:
     """Return a step of the plant."""
-    command = Command(np.full(plant.spec.n, 0.1))
-    plant.reset(0)
+    lead = plant.world.lead
+    command = Command(np.full((*lead, plant.spec.n), 0.1))
+    plant.reset(range(*lead) if lead else 0)
 
     def call(_: int) -> None:
         plant.step(command)
@@ -95,18 +103,28 @@ def plant_steps(plant: Bench) -> Callable[[int], None]:
 
 def main() -> None:
     """Measure in turns, so that a disturbance meets all alike, and print the best round of each and ratios."""
-    plants = [open_plant() for _ in range(3)]
-    calls = {"bare": bare_calls(plants[0]), "plant": plant_steps(plants[1]), "fmpy": fmpy_calls(plants[2])}
+    rounds = 2 if asked_to_be_quick(__doc__) else 300
+    plants = [*(open_plant() for _ in range(3)), open_plant(BLOCK)]
+    bare, whole, fmpy, block = (
+        BARE,
+        "`Bench.step`, one run",
+        "fmpy's `FMU2Slave`",
+        f"`Bench.step`, {BLOCK} runs side by side",
+    )
+    calls = {bare: bare_calls(plants[0]), whole: plant_steps(plants[1]), fmpy: fmpy_calls(plants[2]),
+             block: plant_steps(plants[3])}  # fmt: skip
+    shares = {name: BLOCK if name == block else 1 for name in calls}
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for round_ in range(ROUNDS):
+    for round_ in range(rounds):
         for name, call in calls.items():
+            count = CALLS // shares[name]
             started = time.perf_counter()
-            for k in range(round_ * CALLS, (round_ + 1) * CALLS):
+            for k in range(round_ * count, (round_ + 1) * count):
                 call(k)
-            times[name].append((time.perf_counter() - started) / CALLS)
+            times[name].append((time.perf_counter() - started) / count / shares[name])
     best = {name: min(values) * 1e6 for name, values in times.items()}
-    for name, value in best.items():
-        print(f"{name:6} {value:6.2f} µs   {value / best['bare']:5.2f} × bare")
+    print(table(["step of the FMU of the UR5", "a step", "× bare calls"],
+                [[name, f"{value:.2f} µs", f"{value / best[bare]:.2f}"] for name, value in best.items()]))  # fmt: skip
     for plant in plants:
         plant.close()
 

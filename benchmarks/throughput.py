@@ -1,11 +1,10 @@
-"""What a sweep costs: processor time of the whole command a control period, start-up apart, against older checkouts.
+"""What a control period costs in a sweep and in a run by itself, against older checkouts, and a large sweep as a whole.
 
     python benchmarks/throughput.py                                   # this checkout
-    python benchmarks/throughput.py --against /path/to/0.1.0 /path/to/commit-before
+    python benchmarks/throughput.py --against 0.1.0=/path/to/0.1.0 before=/path/to/commit-before
 
-Every checkout carries out the same sweep in turn, in an environment of its own where it has one in `.venv`, so that
-other load on the machine falls on all. A sweep of `--few` robots is subtracted from one of `--robots`: what is left is
-the cost of a run, its building, judging and writing included. Version 0.1.0 works, too.
+Every checkout does the same in turn, in an environment of its own where it has one in `.venv`. A small sweep is
+subtracted from a large one: what is left is a run with its building, judging and writing. Version 0.1.0 works, too.
 """
 
 from __future__ import annotations
@@ -13,59 +12,91 @@ from __future__ import annotations
 import argparse
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
-METHODS = ("ukf_mfac", "ukf_mpc", "rbf_pid", "rbfnn_mfac", "rbfnn_mfac_plus")
-PERIODS = 200  # of a run of the task random
-FIRST_SEED = 40_000
+from measuring import FIRST_SEED, METHODS, PERIODS, microseconds, table
+
+HERE = Path(__file__).resolve().parents[1]
+ALONE = """
+import sys, time
+try:
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.run.episode import run_experiment
+    from servobench.harness.run.request import RunRequest
+except ImportError:
+    from harness.configuration import Settings
+    from harness.experiment import RunRequest
+    from harness.run import run_experiment
+for seed in range(int(sys.argv[3]) + 1):
+    began = began if seed > 1 else time.process_time()
+    run_experiment(RunRequest(sys.argv[1], sys.argv[2], "random", "moderate", seed), Settings())
+print(time.process_time() - began)
+"""
 
 
-def processor_time(checkout: Path, plant: str, method: str, robots: int) -> float:
-    """Return the processor time [s] of one sweep with all its processes."""
-    own = checkout / ".venv" / "bin" / "python"
-    packages = checkout / ".package"
-    module = "servobench" if packages.is_dir() else "harness.command_line"
+def call(checkout: Path, *arguments: str) -> str:
+    """Return what a call of Python in a checkout prints."""
+    own, packages = checkout / ".venv" / "bin" / "python", checkout / ".package"
     environment = {**os.environ, "PYTHONPATH": str(packages if packages.is_dir() else checkout), "OMP_NUM_THREADS": "1"}
+    command = [str(own if own.exists() and checkout != HERE else sys.executable), *arguments]
+    return subprocess.run(command, env=environment, cwd=checkout, capture_output=True, text=True, check=True).stdout
+
+
+def sweep(checkout: Path, plant: str, methods: str, robots: int, workers: int = 1) -> tuple[float, float]:
+    """Return the processor time with all processes, and the wall-clock time, of a sweep [s]."""
+    module = "servobench" if (checkout / ".package").is_dir() else "harness.command_line"
     with tempfile.TemporaryDirectory() as scratch:
-        command = [
-            *(str(own if own.exists() else sys.executable), "-m", module, "sweep", "--plants", plant),
-            *("--controllers", method, "--seeds", f"{FIRST_SEED}:{FIRST_SEED + robots}", "--out", f"{scratch}/sweep"),
-        ]
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run(command, env=environment, cwd=checkout, capture_output=True, check=True)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        names = "-m", module, "sweep", "--plants", plant, "--controllers", methods, "--workers", str(workers)
+        before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        call(checkout, *names, "--seeds", f"{FIRST_SEED}:{FIRST_SEED + robots}", "--out", f"{scratch}/sweep")
+        ended, after = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, ended - began
+
+
+def period_in_sweep(checkout: Path, plant: str, method: str, few: int, many: int) -> float:
+    """Return the processor time of a period in a sweep [s]."""
+    times = [sweep(checkout, plant, method, count)[0] for count in (few, many)]
+    return (times[1] - times[0]) / (many - few) / PERIODS
+
+
+def period_alone(checkout: Path, plant: str, method: str, runs: int) -> float:
+    """Return the processor time of a period of a run by itself [s]."""
+    return float(call(checkout, "-c", ALONE, plant, method, str(runs)).split()[-1]) / runs / PERIODS
 
 
 def main() -> None:
-    """Print a table: microseconds a period and ratios of the other checkouts to this one."""
+    """Print a table of times and ratios, and the time of the whole."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--against", type=Path, nargs="*", default=[], help="older checkouts")
-    parser.add_argument("--plants", nargs="*", default=["kinematic", "fmu"])
-    parser.add_argument("--methods", nargs="*", default=list(METHODS))
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--robots", type=int, default=400, help="of this checkout; older ones get a tenth")
-    parser.add_argument("--few", type=int, default=8)
+    parser.add_argument("--against", nargs="*", default=[], metavar="NAME=PATH", help="older checkouts")
+    parser.add_argument("--rounds", type=int, default=2, help="of this checkout; the best one counts")
+    parser.add_argument("--quick", action="store_true", help="a few runs only, to test the page")
     options = parser.parse_args()
-    here = Path(__file__).resolve().parents[1]
-    checkouts = [here, *(path.resolve() for path in options.against)]
-    print("| plant | method | this [µs a period] |" + "".join(f" {path.name} [µs] | ratio |" for path in checkouts[1:]))
-    print("|---|---|---|" + "---|---|" * len(checkouts[1:]))
-    for plant in options.plants:
-        for method in options.methods:
-            costs = [[] for _ in checkouts]
-            for _ in range(options.rounds):
-                for own, checkout in zip(costs, checkouts, strict=True):
-                    robots = options.robots if checkout == here else max(options.few + 10, options.robots // 10)
-                    many, few = (processor_time(checkout, plant, method, count) for count in (robots, options.few))
-                    own.append(1e6 * (many - few) / (robots - options.few) / PERIODS)
-            first, *others = map(statistics.median, costs)
-            cells = "".join(f" {other:.0f} | {other / first:.1f} |" for other in others)
-            print(f"| {plant} | `{method}` | {first:.1f} |{cells}", flush=True)
+    others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in options.against)}
+    plants, methods = ["kinematic", "fmu"], list(METHODS)
+    counts, old_counts, alone, rounds, whole = (128, 1280), (4, 44), 15, options.rounds, 1000
+    if options.quick:
+        plants, methods, counts, old_counts, alone, rounds, whole = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1, 10
+    rows, totals = [], []
+    for plant in plants:
+        for method in methods:
+            now = min(period_in_sweep(HERE, plant, method, *counts) for _ in range(rounds))
+            single = min(period_alone(HERE, plant, method, alone) for _ in range(rounds))
+            cells = [f"{1e6 * now:.1f} µs", f"{microseconds(single)} µs"]
+            for checkout in others.values():
+                cells.append(f"**{period_in_sweep(checkout, plant, method, *old_counts) / now:.1f}**")
+                cells.append(f"{period_alone(checkout, plant, method, alone) / single:.2f}")
+            rows.append([plant, f"`{method}`", *cells])
+        used, wall = sweep(HERE, plant, ",".join(methods), whole, 2)
+        periods = whole * len(methods) * PERIODS
+        totals.append([plant, f"**{wall:.1f} s**", f"{used:.1f} s", f"{1e6 * used / periods:.1f} µs"])
+    names = [f"{name} / now, {kind}" for name in others for kind in ("in a sweep", "alone")]
+    print(table(["plant", "method", "now, in a sweep", "now, alone", *names], rows))
+    print(f"{whole} robots × {len(methods)} methods × {PERIODS} periods = {periods:,} periods on two workers:\n")
+    print(table(["plant", "wall-clock time", "processor time of all processes", "a period"], totals))
 
 
 if __name__ == "__main__":

@@ -9,13 +9,15 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from measuring import asked_to_be_quick, table
 from servobench.controllers.estimators.kalman import split_update
 from servobench.controllers.estimators.ukf import sigma_weights, unscented_update
 
-M, N, MOTIONS, ROUNDS, FACTOR = 3, 6, 200, 7, 8.0
+M, N, MOTIONS, FACTOR, BLOCK = 3, 6, 200, 8.0, 128
 SIZE = M * N
 P0, q, r = 1e-2 * np.eye(SIZE), 4e-4, 2e-6
 Q, R = q * np.eye(SIZE), r * np.eye(M)
@@ -46,9 +48,17 @@ def split(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     return J.ravel()
 
 
+def split_block(data: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Do the same for many runs side by side and return vec(J) of the first."""
+    J, P = np.zeros((BLOCK, M, N)), np.tile(P0[:N, :N], (BLOCK, 1, 1))
+    for dq, dy in data:
+        J, P = split_update(J, P, np.tile(dq, (BLOCK, 1)), np.tile(dy, (BLOCK, 1)), q=q, r=r)
+    return np.asarray(J[0]).ravel()
+
+
 def filterpy_filter(data: list[tuple[np.ndarray, np.ndarray]], *, redraw: bool) -> np.ndarray:
     """Run filterpy's filter and return vec(J)."""
-    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter  # noqa: PLC0415 - reported when missing
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
     points = MerweScaledSigmaPoints(SIZE, alpha=1.0, beta=2.0, kappa=0.0)
     ukf = UnscentedKalmanFilter(SIZE, M, 1.0, hx=lambda x, dq: x.reshape(M, N) @ dq, fx=lambda x, dt: x, points=points)
@@ -61,10 +71,10 @@ def filterpy_filter(data: list[tuple[np.ndarray, np.ndarray]], *, redraw: bool) 
     return np.asarray(ukf.x)
 
 
-def best_time(run: Callable[[], np.ndarray]) -> float:
+def best_time(run: Callable[[], np.ndarray], rounds: int) -> float:
     """Return the shortest time of an update over some rounds, s."""
     times = []
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         begin = time.perf_counter()
         run()
         times.append(time.perf_counter() - begin)
@@ -73,19 +83,23 @@ def best_time(run: Callable[[], np.ndarray]) -> float:
 
 def main() -> None:
     """Compare results and times; exit with 1 when a result differs or the ratio is missed."""
+    rounds = 1 if asked_to_be_quick(__doc__) else 7
     try:
-        import filterpy  # noqa: F401, PLC0415 - only to see whether it is there
+        import filterpy  # noqa: F401 - only to see whether it is there
     except ImportError as error:
-        print(f"ukf_update: skipped: `pip install filterpy` into this environment to compare ({error})")
+        print(f"The comparison with filterpy is left out: {error}; `pip install filterpy` into this environment.\n")
         return
     data = motions()
     reference = filterpy_filter(data, redraw=True)
-    worst = max(float(np.abs(result - reference).max()) for result in (sigma_points(data), split(data)))
-    theirs = best_time(lambda: filterpy_filter(data, redraw=False))
-    ours, fast = best_time(lambda: sigma_points(data)), best_time(lambda: split(data))
-    print(f"largest difference of an entry of J after {MOTIONS} motions: {worst:.1e} m/rad")
-    print(f"filterpy {1e6 * theirs:.0f} us, sigma points {1e6 * ours:.0f} us, split {1e6 * fast:.0f} us an update")
-    print(f"sigma points {theirs / ours:.1f} times faster (wanted {FACTOR:.0f}), split {theirs / fast:.1f} times")
+    own = {"sigma points": sigma_points, "split form": split}
+    worst = max(float(np.abs(run(data) - reference).max()) for run in (*own.values(), split_block))
+    times = {"filterpy": best_time(lambda: filterpy_filter(data, redraw=False), rounds)}
+    times |= {name: best_time(partial(run, data), rounds) for name, run in own.items()}
+    times[f"split form, {BLOCK} runs side by side"] = best_time(lambda: split_block(data), rounds) / BLOCK
+    rows = [[name, f"{1e6 * each:.1f} µs", f"{times['filterpy'] / each:.1f}"] for name, each in times.items()]
+    print(table(["unscented update of a 3 × 6 Jacobian", "an update", "filterpy / this"], rows))
+    print(f"Largest difference of an entry of J after {MOTIONS} motions: {worst:.1e} m/rad.\n")
+    theirs, ours = times["filterpy"], times["sigma points"]
     if worst > 1e-9 or theirs / ours < FACTOR:
         sys.exit("ukf_update: missed")
 

@@ -1,0 +1,81 @@
+"""How a sweep grows on a Dask cluster: measured on one and two workers of this machine, estimated beyond.
+
+The estimate has one bottleneck: the parent hands out blocks and writes rows on one processor, whose time a run is
+measured here, as is that of the scheduler. Workers are taken to be as fast as here and to have full blocks.
+"""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any, NamedTuple
+
+from measuring import FIRST_SEED, METHODS, PERIODS, asked_to_be_quick, table
+
+CORES = (1, 2, 16, 128, 1000)
+
+
+class Cost(NamedTuple):
+    """What a sweep took [s]."""
+
+    wall: float
+    parent: float
+    scheduler: float
+
+
+def sweep(cluster: Any, robots: int) -> Cost:  # noqa: ANN401 - of Dask
+    """Return what a sweep over all methods takes; the scheduler lives in this process."""
+    with tempfile.TemporaryDirectory() as scratch:
+        names = "sweep", "--controllers", ",".join(METHODS), "--scheduler", cluster.scheduler_address
+        seeds = "--seeds", f"{FIRST_SEED}:{FIRST_SEED + robots}", "--out", f"{scratch}/sweep"
+        before, used, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.process_time(), time.perf_counter()
+        subprocess.run([sys.executable, "-m", "servobench", *names, *seeds], capture_output=True, check=True)
+        wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    parent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Cost(wall, parent, time.process_time() - used)
+
+
+def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
+    """Return what start-up takes, of a sweep with warm workers, and what each further run takes."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
+        sweep(cluster, 2 * workers)  # imports
+        small, large = (sweep(cluster, count) for count in (few, many))
+    runs = (many - few) * len(METHODS)
+    each = Cost(*((a - b) / runs for a, b in zip(large, small, strict=True)))
+    start = Cost(*(a - few * len(METHODS) * b for a, b in zip(small, each, strict=True)))
+    return start, each
+
+
+def main() -> None:
+    """Print what was measured and the estimate."""
+    few, many = (2, 4) if asked_to_be_quick(__doc__) else (256, 1024)
+    measured = {workers: measure(workers, few, many) for workers in (1, 2)}
+    rows = [
+        [workers, f"{start.wall:.1f} s", *(f"{1e3 * value:.2f} ms" for value in each)]
+        for workers, (start, each) in measured.items()
+    ]
+    print(table(["workers", "start-up", "wall-clock time a run", "parent's processor time a run", "scheduler's"], rows))
+    start, one = measured[1]
+    serial = max(max(each.parent, each.scheduler) for _, each in measured.values())
+    gain = one.wall / measured[2][1].wall
+    print(
+        f"Two workers are {gain:.2f} times as fast as one. The busiest single process beside the workers needs "
+        f"{1e3 * serial:.2f} ms a run, {serial / one.wall:.1%} of the run itself: by that alone more than about "
+        f"{one.wall / serial:.0f} workers gain nothing.\n"
+    )
+    runs, rows = 200_000 * len(METHODS), []
+    for cores in CORES:
+        seconds = start.wall + runs * max(one.wall / cores, serial)
+        known = f"{start.wall + runs * measured[cores][1].wall:.0f} s" if cores in measured else ""
+        rows.append([cores, f"{seconds:.0f} s", known, f"{runs * PERIODS / seconds / 1e6:.2f}"])
+    print(f"Estimate for {runs:,} runs, {runs * PERIODS / 1e6:,.0f} million periods over the {len(METHODS)} methods:\n")
+    print(table(["cores", "estimate", "by the measured rate", "million periods a second"], rows))
+
+
+if __name__ == "__main__":
+    main()

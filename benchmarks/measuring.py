@@ -1,0 +1,71 @@
+"""What several benchmarks share: the methods, processor time, tables in Markdown, fitted exponents and pictures."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from matplotlib.figure import Figure
+
+METHODS = ("ukf_mfac", "ukf_mpc", "rbf_pid", "rbfnn_mfac", "rbfnn_mfac_plus")
+PERIODS = 200  # of a run of the task random
+FIRST_SEED = 40_000
+WIDTH, DOTS_PER_INCH = 7.5, 110
+
+
+def asked_to_be_quick(description: str | None) -> bool:
+    """Return whether `--quick` was given, for a test of the page."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--quick", action="store_true", help="test the page, not the speed")
+    return bool(parser.parse_args().quick)
+
+
+def resolved_runs(plant: str, method: str, count: int, duration: float | None = None) -> list[Any]:
+    """Return runs with moderate mismatch, and with another duration [s] if one is given."""
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.run.request import RunRequest
+    from servobench.harness.run.resolved import resolve
+
+    settings, mismatch = Settings({"random": {"duration": duration}} if duration else {}), cast(Any, "moderate")
+    return [resolve(RunRequest(plant, method, "random", mismatch, FIRST_SEED + i), settings) for i in range(count)]
+
+
+def processor_time(call: Callable[[], object], calls: int, rounds: int = 3) -> float:
+    """Return the processor time of a call [s]: the best mean of some rounds, after one call that does not count."""
+    call()
+    times = []
+    for _ in range(rounds):
+        began = time.process_time()
+        for _ in range(calls):
+            call()
+        times.append((time.process_time() - began) / calls)
+    return min(times)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
+
+
+def microseconds(seconds: float) -> str:
+    """Return a time in µs with three significant digits."""
+    value = 1e6 * seconds
+    return f"{value:.{max(0, 2 - math.floor(math.log10(value)))}f}"
+
+
+def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """Return p of the least-squares fit cost = a sizeᵖ."""
+    return float(np.polyfit(np.log(sizes), np.log(costs), 1)[0])
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Write a picture as PNG and print the line that shows it on the page."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=DOTS_PER_INCH)
+    print(f"![{path.stem.replace('_', ' ')}](pictures/{path.name})\n")
