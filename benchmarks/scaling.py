@@ -105,20 +105,20 @@ def plan(lead: Lead, horizon: int, reach: float) -> Callable[[], object]:
 
 
 def loop(lead: Lead, n: int, method: str) -> Callable[[], object]:
-    """Return a period of a whole controller with a linear robot of n joints."""
+    """Return a period of a whole controller with a linear robot of n joints, which moves to and fro."""
     rng, entry, k = np.random.default_rng(0), find_controller(method), 0
     J = rng.normal(scale=0.4, size=(FEATURES, n))
     nominal = lambda q: np.broadcast_to(J, (*q.shape[:-1], *J.shape))  # noqa: E731
     controller: Any = entry.build(default_config(entry), RobotKnowledge(linear_spec(n), PREVIEW, nominal))
     q, noise = rng.normal(size=(*lead, n)), 1e-3 * rng.normal(size=(16, *lead, FEATURES))
-    goal = np.matvec(J, q + 0.3 * rng.normal(size=q.shape))
-    reference = np.repeat(goal[..., None, :], PREVIEW + 1, axis=-2)
+    goals = [np.matvec(J, q + 0.3 * rng.normal(size=q.shape)) for _ in range(2)]
+    references = [np.repeat(goal[..., None, :], PREVIEW + 1, axis=-2) for goal in goals]
     state = controller.servo.start(seen(0, q, np.matvec(J, q)))
 
     def step() -> None:
         nonlocal state, q, k
         k += 1
-        state, u = controller.servo.step(state, seen(k, q, np.matvec(J, q) + noise[k % 16]), reference)
+        state, u = controller.servo.step(state, seen(k, q, np.matvec(J, q) + noise[k % 16]), references[k // 10 % 2])
         q = q + PERIOD * u
 
     return step
@@ -137,14 +137,16 @@ def draw(panels: dict[str, tuple[str, Curves]], path: Path) -> None:
     """Draw a panel for each size."""
     with style.figure_style():
         figure = Figure(figsize=(WIDTH, 6.4), layout="constrained")
-        for axes, (title, (size, curves)) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
+        for axes, (title, (unit, curves)) in zip(figure.subplots(2, 2).flat, panels.items(), strict=True):
             styles = style.method_styles(label.split("`")[1] for label in curves)
             for label, (sizes, costs) in curves.items():
                 look = styles[label.split("`")[1]].line_arguments(8) | {"linestyle": ":" if "one run" in label else "-"}
                 if "limits active" in label:
                     look |= {"color": style.VERMILION}
                 axes.loglog(sizes, [1e6 * cost for cost in costs], **look, label=label.replace("`", ""))
-            axes.set(title=title, xlabel=size, ylabel="µs a run and period")
+            axes.set_xticks(sizes, map(str, sizes))
+            axes.minorticks_off()
+            axes.set(title=title, xlabel=unit, ylabel="µs a run and period")
             axes.legend(fontsize=6.5)
         write_picture(figure, path)
 

@@ -77,7 +77,7 @@ def main() -> None:
     options = parser.parse_args()
     others = {name: Path(path).resolve() for name, _, path in (each.partition("=") for each in options.against)}
     plants, methods = ["kinematic", "fmu"], list(METHODS)
-    counts, old_counts, alone, rounds, whole = (128, 1280), (4, 44), 15, options.rounds, 1000
+    counts, old_counts, alone, rounds, whole = (128, 1280), (4, 84), 15, options.rounds, 1000
     if options.quick:
         plants, methods, counts, old_counts, alone, rounds, whole = plants[:1], methods[:1], (2, 10), (2, 4), 1, 1, 10
     rows, totals = [], []
