@@ -110,10 +110,10 @@ class Servo:
             law=self.law.start(observation),
             initial=initial,
             predictor=None if self.predictor is None else self.predictor.start(observation),
-            ready=np.full(lead, known),
+            ready=np.full(lead, known)[()],
             jacobian=unknown,
-            seen=Seen(np.full(lead, np.nan), observation.joint_position, observation.feature, unknown),
-            unexplained=np.full(lead, np.nan),
+            seen=Seen(np.full(lead, np.nan)[()], observation.joint_position, observation.feature, unknown),
+            unexplained=np.full(lead, np.nan)[()],
         )
 
     def step(self, state: ServoState, observation: Observation, reference: FloatArray) -> tuple[ServoState, FloatArray]:
@@ -165,7 +165,8 @@ class Servo:
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
             )
-        time = np.full(observation.feature.shape[:-1], observation.time)
+        lead = observation.feature.shape[:-1]
+        time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
         now = Seen(time, observation.joint_position, observation.feature, J)
         seen = branch(observation.feature_valid, _newer, state.seen, now)
         return ServoState(estimator, law, state.initial, predictor, state.ready, J, seen, unexplained), u
