@@ -6,6 +6,7 @@ measured here, as is that of the scheduler. Workers are taken to be as fast as h
 
 from __future__ import annotations
 
+import os
 import resource
 import subprocess
 import sys
@@ -16,6 +17,8 @@ from typing import Any, NamedTuple
 from measuring import FIRST_SEED, METHODS, PERIODS, asked_to_be_quick, table
 
 CORES = (1, 2, 16, 128, 1000)
+# Dask has its workers return freed memory at once; arrays of a block would be mapped anew in every period.
+MEMORY = {"MALLOC_TRIM_THRESHOLD_": "1000000000", "MALLOC_MMAP_THRESHOLD_": "1000000000"}
 
 
 class Cost(NamedTuple):
@@ -42,6 +45,7 @@ def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
     """Return what start-up takes, of a sweep with warm workers, and what each further run takes."""
     from distributed import LocalCluster
 
+    os.environ.update(MEMORY)
     with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
         sweep(cluster, 2 * workers)  # imports
         small, large = (sweep(cluster, count) for count in (few, many))
@@ -53,7 +57,7 @@ def measure(workers: int, few: int, many: int) -> tuple[Cost, Cost]:
 
 def main() -> None:
     """Print what was measured and the estimate."""
-    few, many = (2, 4) if asked_to_be_quick(__doc__) else (256, 1024)
+    few, many = (2, 4) if asked_to_be_quick(__doc__) else (128, 512)
     measured = {workers: measure(workers, few, many) for workers in (1, 2)}
     rows = [
         [workers, f"{start.wall:.1f} s", *(f"{1e3 * value:.2f} ms" for value in each)]

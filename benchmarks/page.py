@@ -61,7 +61,8 @@ The exponent p is that of the fit cost = a sizeᵖ; −1 for runs side by side w
 Dotted lines are single runs, the others blocks of 128. Joints and horizon are measured on a linear robot y = J q."""),
     Section("Towards 1,000 cores", ("growth",), """\
 Measured with a Dask scheduler and one or two workers on this machine, whose processors they share with the scheduler
-and the parent. **Everything beyond two workers is an estimate**: what the workers can do, as fast as here and with full
+and the parent; the workers keep freed memory ([experiments](experiments.md#sweeps)).
+**Everything beyond two workers is an estimate**: what the workers can do, as fast as here and with full
 blocks of 128 runs, or what the busiest single process beside them can, if that is less. It leaves out the network
 between machines and workers that differ in speed."""),
     Section("One formula for one run and for many", ("shared_functions",), """\
