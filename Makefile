@@ -37,7 +37,7 @@ format: $(VENV)/ready
 docs: $(VENV)/ready
 	$(BIN)/python docs/generated_tables.py
 
-# Draw the README's pictures anew from committed seeds: the map takes six minutes on two processors, more where they are slow.
+# Draw the README's pictures anew from committed seeds: the comparison on rendered images takes most of the minutes.
 figures: $(VENV)/ready
 	$(BIN)/python docs/readme_pictures.py docs/pictures
 

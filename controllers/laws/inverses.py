@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, transposed
+from servobench.plant.lanes import branch, plus_diagonal, transposed
 
 MAX_DAMPED_RATIO = 1e9  # [1] of ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
 MIN_SINGULAR_RATIO = 1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors
@@ -25,13 +25,12 @@ def damped_inverse(J: FloatArray, damping: float) -> FloatArray:
     square = J @ transposed(J)
     ordinary = square.trace(axis1=-2, axis2=-1) < MAX_DAMPED_RATIO * damping**2
     inverse = branch(ordinary, _solve_normal_equations, J, square, damping)
-    return transposed(branch(np.logical_not(ordinary), _decompose, inverse, J, damping))
+    return transposed(branch(~ordinary, _decompose, inverse, J, damping))
 
 
 def _solve_normal_equations(J: FloatArray, square: FloatArray, damping: float) -> FloatArray:
     """Return (JJᵀ + δ²I)⁻¹ J, (..., m, n), for square = JJᵀ."""
-    damped = square + damping**2 * np.eye(J.shape[-2])
-    return np.asarray(np.linalg.solve(damped, J), dtype=np.float64)
+    return np.asarray(np.linalg.solve(plus_diagonal(square, damping**2), J), dtype=np.float64)
 
 
 def _decompose(_: FloatArray, J: FloatArray, damping: float) -> FloatArray:

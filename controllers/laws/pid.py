@@ -111,7 +111,7 @@ class PidLaw(Law[PidState]):
     def _learn(self, state: PidState, e: FloatArray) -> PidState:
         """Integrate and differentiate the error of a valid feature."""
         state = branch(state.started, self._differentiate, state, e)
-        return state._replace(integral=state.integral + self._dt * e, last_error=e, started=np.full(e.shape[:-1], True))
+        return state._replace(integral=state.integral + self._dt * e, last_error=e, started=state.started | True)
 
     def _differentiate(self, state: PidState, e: FloatArray) -> PidState:
         tau = self._config.derivative_filter

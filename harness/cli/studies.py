@@ -55,7 +55,7 @@ def robustness(
 def claims(
     out: options.FolderOption,
     plants: options.NamesOption = "kinematic,fmu",
-    seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 100,
+    seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 500,
     workers: options.WorkersOption = None,
     scheduler: options.SchedulerOption = None,
     run_timeout: options.TimeoutOption = None,
