@@ -4,9 +4,9 @@
     python docs/failure_rates.py results/rates docs/pictures    # prints the table, draws three pictures
 
 A run fails if it ends early or has not settled at its end. What it may depend on is compared between failed and other
-runs: the drawn camera angle and link scales, the distance from start to target, and the largest condition number of the
-true Jacobian on the way. The rank statistic is the chance that a failed run has the larger value, 0.5 if it says
-nothing.
+runs: the angle by which the camera was turned, the distance from start to target, the largest condition number of the
+true Jacobian on the way, and the error in the last second. The rank statistic is the chance that a failed run has the
+larger value, 0.5 if it says nothing.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ from servobench.harness.run.resolved import resolve_sections, select
 
 CAUSES = {
     "camera_angle": "camera turned by [deg]",
-    "condition": "largest condition number",
     "distance": "start to target [m]",
-    "links": "largest error of a link [%]",
+    "jacobian_condition_max": "largest condition number",
+    "steady_state_error": "error in the last second [m]",
 }
-BINS = 12
-MIN_RUNS = 50  # in a bin that is drawn
+SHARES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # of runs, where bins of causes end
 
 
 def main(folder: Path, pictures: Path) -> None:
@@ -46,8 +45,8 @@ def main(folder: Path, pictures: Path) -> None:
     print("\n".join([*rate_table(runs), "", *cause_table(runs)]))  # noqa: T201 - the output of the command
     pictures.mkdir(parents=True, exist_ok=True)
     for name, figure in (
-        ("failures_by_camera", by_cause(runs, "camera_angle")),
-        ("failures_by_condition", by_cause(runs, "condition")),
+        ("final_errors", exceedance(runs)),
+        ("failures_by_condition", by_cause(runs, "jacobian_condition_max")),
         ("failures_by_target", by_target(runs)),
     ):
         figure.savefig(pictures / f"{name}.png", dpi=110)
@@ -56,7 +55,7 @@ def main(folder: Path, pictures: Path) -> None:
 def judged(runs: pd.DataFrame) -> pd.DataFrame:
     """Return the runs with whether they failed, and with what that may depend on."""
     drawn = robots(runs.drop_duplicates("seed"))
-    runs = runs.assign(failed=settling_times(runs).isna(), condition=runs["jacobian_condition_max"])
+    runs = runs.assign(failed=settling_times(runs).isna())
     return runs.merge(drawn, on="seed")
 
 
@@ -70,12 +69,10 @@ def robots(runs: pd.DataFrame) -> pd.DataFrame:
     for request, text in zip(requests, runs["mismatch_values"], strict=True):
         drawn, values = draw(select(request, sections)), json.loads(text)
         target = drawn.scenario.reference.at(0.0)
-        x, y, z = drawn.true.to_base(target)
+        x, y, _ = drawn.true.to_base(target)
         distance = np.linalg.norm(drawn.true.feature(drawn.scenario.start) - target)
-        links = 100.0 * np.abs(np.array(values["link_scale"]) - 1.0).max()
-        angle = np.degrees(abs(values["camera_angle"]))
-        rows.append((request.seed, angle, distance, links, x, y, z))
-    return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance", "links", "x", "y", "z"])
+        rows.append((request.seed, np.degrees(abs(values["camera_angle"])), distance, x, y))
+    return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance", "x", "y"])
 
 
 def rate_table(runs: pd.DataFrame) -> Iterator[str]:
@@ -113,23 +110,37 @@ def cause_table(runs: pd.DataFrame) -> Iterator[str]:
         yield f"| `{method}` | {' | '.join(cells)} |"
 
 
+def exceedance(runs: pd.DataFrame) -> Figure:
+    """Draw which share of the runs has a larger error in the last second."""
+    with figure_style():
+        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+        axes = figure.subplots()
+        for method, style in method_styles(runs["controller"].unique()).items():
+            errors = 1e3 * np.sort(runs.loc[runs["controller"] == method, "steady_state_error"].to_numpy())
+            shares = 1.0 - np.arange(len(errors)) / len(errors)
+            axes.plot(errors, shares, label=method, color=style.colour, linestyle=style.line, linewidth=1.4)
+        axes.axvline(5.0, color="black", linewidth=0.8)
+        axes.set(xlabel="error in the last second [mm]", ylabel="share of runs above", xscale="log", yscale="log")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+        return figure
+
+
 def by_cause(runs: pd.DataFrame, cause: str) -> Figure:
-    """Draw the failure rate over a cause, in bins of equal numbers of runs."""
+    """Draw the failure rate over a cause with its 95 % interval, in bins that get finer where few runs are."""
     with figure_style():
         figure = Figure(figsize=(6.4, 3.6), layout="constrained")
         axes = figure.subplots()
         for method, style in method_styles(runs["controller"].unique()).items():
             own = runs[runs["controller"] == method]
-            bins = own.groupby(pd.qcut(own[cause], BINS, duplicates="drop"), observed=True)
-            rates = [
-                (part[cause].median(), success_rate(int(part["failed"].sum()), len(part)))
-                for _, part in bins
-                if len(part) >= MIN_RUNS
-            ]
-            x, y = np.array([place for place, _ in rates]), np.array([rate.value for _, rate in rates])
-            axes.plot(x, np.where(y > 0.0, y, np.nan), label=method, **style.line_arguments(len(x)))
-            axes.fill_between(x, [r.low for _, r in rates], [r.high for _, r in rates], color=style.colour, alpha=0.15)
-        axes.set(xlabel=CAUSES[cause], ylabel="failure rate", yscale="log", ylim=(0.3 / len(runs), 1.0))
+            bins = own.groupby(pd.qcut(own[cause], SHARES, duplicates="drop"), observed=True)
+            places = [(part[cause].median(), success_rate(int(part["failed"].sum()), len(part))) for _, part in bins]
+            seen = [(place, rate) for place, rate in places if rate.value > 0.0]
+            x, y = np.array([place for place, _ in seen]), np.array([rate.value for _, rate in seen])
+            reach = [y - [rate.low for _, rate in seen], [rate.high for _, rate in seen] - y] if seen else None
+            look = {"color": style.colour, "linestyle": style.line, "marker": style.marker, "markersize": 4.5}
+            label = method if seen else f"{method}: none"
+            axes.errorbar(x, y, yerr=reach, label=label, linewidth=1.4, capsize=2.0, **look)
+        axes.set(xlabel=CAUSES[cause], ylabel="failure rate", xscale="log", yscale="log")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return figure
 
@@ -138,7 +149,7 @@ def by_target(runs: pd.DataFrame) -> Figure:
     """Draw where the targets of failed runs lie, seen from above, in the base frame."""
     methods = list(runs["controller"].unique())
     with figure_style():
-        figure = Figure(figsize=(2.3 * len(methods), 2.8), layout="constrained")
+        figure = Figure(figsize=(2.3 * len(methods), 3.3), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(methods), sharex=True, sharey=True))
         everywhere = runs.drop_duplicates("seed")
         for axes, (method, style) in zip(panels, method_styles(methods).items(), strict=True):
