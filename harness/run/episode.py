@@ -93,24 +93,23 @@ def carry_out(
 def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None) -> list[RunResult]:
     """Carry out runs of one `side_by_side_key` that advance together; the rows are those of `carry_out`, without times.
 
-    Where they cannot be built together, because something is wrong with one of them, they are carried out one by one.
-
     Args:
         runs: at least one.
         keep: results folder in which trained networks are kept beside the runs.
+
+    Raises:
+        Exception: they cannot be built together, because something is wrong with one of them; each has to be carried
+            out by itself, and its row says what it is.
     """
+    many = build_together(runs, keep=keep)
+    ends = Ends(len(runs))
+    log = ManyLogs(many.bench.spec, many.loop.periods, ends)
     try:
-        many = build_together(runs, keep=keep)
-        ends = Ends(len(runs))
-        log = ManyLogs(many.bench.spec, many.loop.periods, ends)
-        try:
-            with _careful(), contextlib.suppress(AllEnded):
-                plant, controller = ManyBenches(many.bench, ends), ManyServos(many.servo, ends)
-                run_loop(plant, controller, many.desired, many.loop, [run.request.seed for run in runs], log)
-        finally:
-            many.bench.close()
-    except Exception:  # noqa: BLE001 - whatever it is, it is found again in the row of the run that it concerns
-        return [carry_out(run, steps=False, keep=keep) for run in runs]
+        with _careful(), contextlib.suppress(AllEnded):
+            plant, controller = ManyBenches(many.bench, ends), ManyServos(many.servo, ends)
+            run_loop(plant, controller, many.desired, many.loop, [run.request.seed for run in runs], log)
+    finally:
+        many.bench.close()
     return _judge_together(runs, many, ends, log.steps())
 
 

@@ -99,7 +99,9 @@ class ManyBenches(Plant):
     def step(self, command: Command) -> Observation:
         """See `Plant.step`; a run whose plant fails ends."""
         self._leave()
-        seen = self._bench.step(Command(take(command.joint_velocity, self._running())))
+        if len(self._ends.running) < self._ends.count:
+            command = Command(take(command.joint_velocity, self._ends.running))
+        seen = self._bench.step(command)
         faults = self._bench.faults
         if faults:
             lanes = self._ends.running
@@ -126,14 +128,11 @@ class ManyBenches(Plant):
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
         self._leave()
-        self._bench.move_camera(X_BC[self._running()])
+        self._bench.move_camera(X_BC[self._ends.running])
 
     def close(self) -> None:
         """See `Plant.close`."""
         self._bench.close()
-
-    def _running(self) -> Any:  # noqa: ANN401 - an index
-        return slice(None) if len(self._ends.running) == self._ends.count else self._ends.running
 
     def _leave(self) -> None:
         stay = self._member.left()
@@ -161,29 +160,30 @@ class ManyServos(Controller):
         self._jacobian = self._state.jacobian
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
-        """See `Controller.step`; a run whose controller fails ends."""
+        """See `Controller.step`; a run whose controller fails ends.
+
+        Raises:
+            Exception: a step failed, and repeated with fewer lanes it does not.
+        """
         stay = self._member.left()
         if stay is not None:
             self._state = take(self._state, stay)
-        given = observation, reference
-        if len(self._ends.running) < self._ends.count:
-            given = take(given, self._ends.running)
+        given, lanes = (observation, reference), self._ends.running
+        if len(lanes) < self._ends.count:
+            given = take(given, lanes)
         try:
             self._state, u = self._servo.step(self._state, *given)
-        except Exception:  # noqa: BLE001 - whatever a part raises ends the runs that it concerns
-            self._end_failing(*given)
-            self._state, u = self._servo.step(self._state, *take(given, self._stay))
+        except Exception:
+            failing = failing_lanes(self._servo, self._state, given, np.arange(len(lanes)))
+            if not failing:
+                raise
+            for lane, fault in failing:
+                self._ends.end(int(lanes[lane]), fault, self._k)
+            return self.step(observation, reference)
         self._k += 1
         self._u = self._ends.spread(u, self._u)
         self._jacobian = self._ends.spread(self._state.jacobian, self._jacobian)
         return Command(self._u)
-
-    def _end_failing(self, *given: Any) -> None:  # noqa: ANN401 - what a step is given
-        lanes = self._ends.running
-        for lane, fault in failing_lanes(self._servo, self._state, given, np.arange(len(lanes))):
-            self._ends.end(int(lanes[lane]), fault, self._k)
-        self._stay = self._member.left()
-        self._state = take(self._state, self._stay)
 
     def estimated_jacobian(self) -> FloatArray:
         """See `Controller.estimated_jacobian`."""

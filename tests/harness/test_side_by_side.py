@@ -38,29 +38,25 @@ def one_by_one(resolved):
     return rows(carry_out(run, steps=False) for run in resolved)
 
 
-def same(one, other):
-    np.testing.assert_equal(one, other)
-
-
 @pytest.mark.parametrize("controller", [name for name in METHODS if METHODS[name].side_by_side])
 def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     together = runs(controller, ROUGH, mismatch="severe+camera_move=60deg")
     assert side_by_side_key(together[0]) is not None
     alone = one_by_one(together)
-    same(rows(carry_out_together(together)), alone)
-    same(rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]])
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+    np.testing.assert_equal(rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]])
 
 
 def test_probing_runs_go_side_by_side():
     together = runs("mfac+rls", {**ROUGH, **PROBED})
-    same(rows(carry_out_together(together)), one_by_one(together))
+    np.testing.assert_equal(rows(carry_out_together(together)), one_by_one(together))
 
 
 def test_runs_that_lose_the_feature_leave_the_others_alone():
     together = runs("ukf_mfac", lossy(0.7, 9))
     alone = one_by_one(together)
     assert {row["status"] for row in alone} == {"completed", "feature_lost"}
-    same(rows(carry_out_together(together)), alone)
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
 
 
 @pytest.mark.parametrize("kind", [FilterDiverged, FloatingPointError, np.linalg.LinAlgError, KeyError])
@@ -77,14 +73,14 @@ def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkey
     monkeypatch.setattr(MfacLaw, "command", fragile)
     alone = one_by_one(together)
     assert {"completed"} < {row["status"] for row in alone}
-    same(rows(carry_out_together(together)), alone)
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
 
 
 def test_a_block_of_which_every_run_ends_early_has_all_its_rows():
     together = runs("ukf_mfac", lossy(0.99, 3))
     alone = one_by_one(together)
     assert {row["status"] for row in alone} == {"feature_lost"}
-    same(rows(carry_out_together(together)), alone)
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
 
 
 def test_times_of_runs_side_by_side_are_unknown():
@@ -117,5 +113,5 @@ def test_a_run_branches_into_futures_that_continue_with_the_same_bits(plant, con
     for _ in range(2):
         world.restore(saved[0])
         method.restore(saved[1])
-        same(advance(at, 15, 40).feature, wanted)
+        np.testing.assert_equal(advance(at, 15, 40).feature, wanted)
     world.close()
