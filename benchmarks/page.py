@@ -2,7 +2,7 @@
 
     make benchmark                                                   # a quarter of an hour on two quiet processors
     python benchmarks/page.py --against 0.1.0=/path/to/a/checkout    # with a further older version beside this one
-    python benchmarks/page.py --quick --out /tmp/page                # tests the page, not the speed
+    python benchmarks/page.py --quick --out page                     # tests the page, not the speed
 
 The commit before runs advanced side by side is taken from the history of this checkout, if it is there. An older
 checkout that needs other libraries has its environment in `.venv`.

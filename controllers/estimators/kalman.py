@@ -192,8 +192,3 @@ class KalmanEstimator(Estimator[KalmanState]):
         """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
         deviation = np.sqrt(state.P.trace(axis1=-2, axis2=-1) / state.P.shape[-1])
         return {"estimator_updated": state.updated, "jacobian_deviation": deviation}
-
-
-def covariance_of(state: KalmanState) -> FloatArray:
-    """Return the covariance of vec(J) by rows, (mn, mn), (m/rad)², of one run."""
-    return np.asarray(np.kron(np.eye(state.J.size // len(state.P)), state.P), dtype=np.float64)

@@ -13,7 +13,6 @@ from servobench.controllers.estimators.fixed import ConstantEstimator, TrueConfi
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     KalmanEstimator,
-    covariance_of,
     kalman_update,
     measurement_matrix,
     split_update,
@@ -29,6 +28,11 @@ LEARNING = [
     KalmanEstimator(KalmanConfig()),
     ukf_estimator(UkfConfig(form="sigma_points")),
 ]
+
+
+def covariance_of(state):
+    """Return the covariance of vec(J) by rows, (mn, mn)."""
+    return np.kron(np.eye(state.J.size // len(state.P)), state.P)
 
 
 def random_motions(n, m, count, seed=3):
