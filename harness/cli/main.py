@@ -8,7 +8,7 @@ import typer
 
 from servobench.harness.cli import runs, show, studies
 from servobench.harness.cli.fmu import fmu_app
-from servobench.harness.cli.options import INTERRUPTED
+from servobench.harness.cli.options import INTERRUPTED, grouped
 from servobench.harness.cli.sweep import sweep
 
 INPUT_ERROR = 2  # exit code
@@ -35,7 +35,7 @@ for command in (
     runs.train,
     runs.collect,
 ):
-    app.command()(command)
+    app.command()(grouped(command))
 app.add_typer(fmu_app, name="fmu")
 
 

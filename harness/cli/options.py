@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
+
+if TYPE_CHECKING:
+    from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.config.settings import Settings
 
 INTERRUPTED = 130  # exit code after Ctrl-C
 
@@ -23,6 +30,73 @@ NamesOption = Annotated[str, typer.Option(help="Comma-separated names, or 'all'.
 SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.")]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a command carries runs out."""
+
+    workers: WorkersOption = None
+    scheduler: SchedulerOption = None
+    run_timeout: TimeoutOption = None
+
+
+@dataclass(frozen=True)
+class Running(Place):
+    """How a command carries runs out that can be resumed."""
+
+    resume: ResumeOption = False
+
+    def execution(self, observer: Observer | None = None) -> Execution:
+        """Return it as the driver takes it."""
+        from servobench.harness.batch.campaign import Execution, Observer
+
+        return Execution(self.workers, self.scheduler, self.run_timeout, self.resume, observer or Observer())
+
+
+@dataclass(frozen=True)
+class Overrides:
+    """Settings that a user gives."""
+
+    set_: SetOption = None
+    config: ConfigOption = None
+
+    def settings(self, *further: str) -> Settings:
+        """Return them, with `further` assignments on top."""
+        from servobench.harness.config.settings import read_settings
+
+        return read_settings(self.config, [*(self.set_ or []), *further])
+
+
+PLACE, RUNNING, OVERRIDES = Place(), Running(), Overrides()  # defaults of parameters
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that has, for each parameter that is a dataclass, the fields of this class as options."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    parameters = []
+    for name, parameter in signature(command).parameters.items():
+        if name in groups:
+            own = get_type_hints(groups[name], include_extras=True)
+            options: list[tuple[str, Any, Any]] = [
+                (each.name, each.default, own[each.name]) for each in fields(groups[name])
+            ]
+        else:
+            options = [(name, parameter.default, hints[name])]
+        parameters += [Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=hint)
+                       for key, default, hint in options]  # fmt: skip
+
+    @wraps(command)
+    def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
+        for name, group in groups.items():
+            values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
+        command(**values)
+
+    vars(call).update(
+        __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
+    )
+    return call
 
 
 def split_words(text: str) -> tuple[str, ...]:

@@ -33,8 +33,7 @@ def run(
         "moderate"
     ),
     seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
-    set_: options.SetOption = None,
-    config: options.ConfigOption = None,
+    overrides: options.Overrides = options.OVERRIDES,
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
@@ -42,16 +41,13 @@ def run(
     """Carry out one run."""
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.settings import ConfigurationError, read_settings
+    from servobench.harness.config.settings import ConfigurationError
 
-    assignments = list(set_ or [])
-    if view:
-        if plant != "bullet":
-            raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
-        assignments.append("bullet.view=true")
+    if view and plant != "bullet":
+        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = f"{controller}+{estimator}" if estimator else controller
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
-    campaign = comparison(batch, read_settings(config, assignments))
+    campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     _carry_out(campaign, out, Execution(workers=1), with_report=with_report)
 
 
@@ -61,19 +57,15 @@ def compare(
     tasks: options.NamesOption = "exp1,exp2,exp3,exp4,circle",
     mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
     seeds: options.SeedsOption = "1",
-    workers: options.WorkersOption = None,
-    scheduler: options.SchedulerOption = None,
-    run_timeout: options.TimeoutOption = None,
-    resume: options.ResumeOption = False,
-    set_: options.SetOption = None,
-    config: options.ConfigOption = None,
+    running: options.Running = options.RUNNING,
+    overrides: options.Overrides = options.OVERRIDES,
     out: OutOption = None,
     with_report: ReportOption = True,
 ) -> None:
     """Run every combination and compare the controllers."""
-    from servobench.harness.batch.campaign import Execution, comparison
+    from servobench.harness.batch.campaign import comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.settings import ConfigurationError, read_settings
+    from servobench.harness.config.settings import ConfigurationError
 
     batch = Batch(
         options.split_plants(plants),
@@ -82,27 +74,25 @@ def compare(
         options.split_words(mismatch),
         parse_seeds(seeds),
     )
-    if resume and out is None:
+    if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
-    campaign = comparison(batch, read_settings(config, set_ or []))
-    _carry_out(campaign, out, Execution(workers, scheduler, run_timeout, resume), with_report=with_report)
+    campaign = comparison(batch, overrides.settings())
+    _carry_out(campaign, out, running.execution(), with_report=with_report)
 
 
 def train(
     controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
-    set_: options.SetOption = None,
-    config: options.ConfigOption = None,
+    overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Train the networks of a controller on the nominal model, unless they are kept already; print their errors."""
     from rich.table import Table
 
     from servobench.harness.cli.progress import run_progress
-    from servobench.harness.config.settings import read_settings
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import cache_folder
     from servobench.harness.run.resolved import known_sections
 
-    settings = read_settings(config, set_ or [])
+    settings = overrides.settings()
     settings.check_sections([*known_sections(), controller])
     with run_progress(console) as progress:
         bar = progress.add_task("training", total=1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,26 +30,19 @@ def robustness(
     plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
     controllers: options.NamesOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
-    workers: options.WorkersOption = None,
-    scheduler: options.SchedulerOption = None,
-    run_timeout: options.TimeoutOption = None,
-    resume: options.ResumeOption = False,
-    set_: options.SetOption = None,
-    config: options.ConfigOption = None,
+    running: options.Running = options.RUNNING,
+    overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Draw the robustness map: success and settling time along seven axes, each varied by itself."""
-    from servobench.harness.batch.campaign import Execution
     from servobench.harness.batch.compare import parse_seeds
     from servobench.harness.cli.progress import watching
-    from servobench.harness.config.settings import read_settings
     from servobench.harness.studies.robustness import make_map
 
-    settings = read_settings(config, set_ or [])
+    settings = overrides.settings()
     names = options.split_controllers(controllers)
     where = options.split_plants(plant, "plant")[0]
     with watching(console, out) as observer:
-        how = Execution(workers, scheduler, run_timeout, resume, observer)
-        files = make_map(out, where, names, parse_seeds(seeds), settings, how)
+        files = make_map(out, where, names, parse_seeds(seeds), settings, running.execution(observer))
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 
@@ -56,14 +50,10 @@ def claims(
     out: options.FolderOption,
     plants: options.NamesOption = "kinematic,fmu",
     seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 500,
-    workers: options.WorkersOption = None,
-    scheduler: options.SchedulerOption = None,
-    run_timeout: options.TimeoutOption = None,
-    resume: options.ResumeOption = False,
+    running: options.Running = options.RUNNING,
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
-    from servobench.harness.batch.campaign import Execution
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
     from servobench.harness.studies.claims.table import ANSWERS, differences, read_answers
@@ -71,7 +61,7 @@ def claims(
     names = options.split_plants(plants)
     wanted = None if check is None else read_answers(check)
     with watching(console, out) as observer:
-        answers = reproduce(out, names, seeds, Execution(workers, scheduler, run_timeout, resume, observer))
+        answers = reproduce(out, names, seeds, running.execution(observer))
     for answer in answers:
         console.print(
             f"[bold]{answer.title} on {answer.plant}: {answer.verdict}[/bold]", soft_wrap=True, highlight=False
@@ -90,9 +80,7 @@ def tune(
     trials: Annotated[int, typer.Option(help="Trials of each method, that of the defaults included.")] = 100,
     seeds: Annotated[int, typer.Option(help="Moves of a trial on each plant; half as many circles are added.")] = 8,
     plants: options.NamesOption = "kinematic",
-    workers: options.WorkersOption = None,
-    scheduler: options.SchedulerOption = None,
-    run_timeout: options.TimeoutOption = None,
+    place: options.Place = options.PLACE,
     offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
     study_seed: Annotated[int, typer.Option(help="Seed of the sampler.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
@@ -113,8 +101,8 @@ def tune(
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     check_study_folder(out)
-    place = open_workers(workers, scheduler, run_timeout, plants=plan.runs.plants, controllers=names)
-    with place as opened, locked(out):
+    opening = open_workers(*astuple(place), plants=plan.runs.plants, controllers=names)
+    with opening as opened, locked(out):
         studies = open_studies(out, plan)
         interrupted = not _advance(studies, plan, opened)
     console.print(_tuned_table(write_outcomes(out, studies)))

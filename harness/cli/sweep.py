@@ -28,21 +28,16 @@ def sweep(
         str, typer.Option(help="Comma-separated camera latencies [periods]; default: the plant's.")
     ] = "",
     seeds: options.SeedsOption = "10",
-    workers: options.WorkersOption = None,
-    scheduler: options.SchedulerOption = None,
-    run_timeout: options.TimeoutOption = None,
-    resume: options.ResumeOption = False,
-    set_: options.SetOption = None,
-    config: options.ConfigOption = None,
+    running: options.Running = options.RUNNING,
+    overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, SWEEP_LEGEND, sweep_tables
     from servobench.harness.batch import results
-    from servobench.harness.batch.campaign import Campaign, Execution, carry_out
+    from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.batch.sweep import SweepPlan, parse_variation
     from servobench.harness.cli.progress import watching
-    from servobench.harness.config.settings import read_settings
 
     plan = SweepPlan(
         Batch(
@@ -56,9 +51,9 @@ def sweep(
         tuple(_numbers("noise", noise, float)),
         tuple(_numbers("latency", latency, int)) if latency.strip() else (None,),
     )
-    campaign = Campaign(plan.cells(), read_settings(config, set_ or []))
+    campaign = Campaign(plan.cells(), overrides.settings())
     with watching(console, out) as observer:
-        carry_out(campaign, out, Execution(workers, scheduler, run_timeout, resume, observer))
+        carry_out(campaign, out, running.execution(observer))
     print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), SWEEP_LEGEND)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 
