@@ -165,6 +165,7 @@ class Servo:
             raise ControllerDiverged(
                 f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
             )
+        law = self.law.noted(law, u)
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
         now = Seen(time, observation.joint_position, observation.feature, J)

@@ -44,11 +44,22 @@ class Law(ABC, Generic[State]):
             reference: (..., 1 + preview, m): row 0 is now, the rest are the next control instants.
 
         Returns:
-            The state, and (..., n), rad/s, within the joint-speed limits.
+            The state, and the wanted joint velocity (..., n), rad/s. It is within the joint-speed limits where the law
+            owns the stage "limit"; the stages that follow may change it, see `noted`.
 
         Raises:
             RunFault: it cannot go on in at least one lane.
         """
+
+    def noted(self, state: State, joint_velocity: FloatArray) -> State:
+        """Return the state after a velocity left the chain; a law that remembers its commands overrides this.
+
+        Args:
+            state: after the command of this period.
+            joint_velocity: what is sent to the robot, after all stages, (..., n), rad/s.
+        """
+        del joint_velocity
+        return state
 
     @abstractmethod
     def diagnostics(self, state: State) -> Diagnostics:

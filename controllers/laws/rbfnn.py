@@ -139,11 +139,16 @@ class RbfnnLaw(Law[RbfnnState]):
         direction *= alpha[..., None, None, None]
         learned = np.add(learned, direction, out=direction)  # weights are large: no array more than is needed
         step = scale_to_limit(wanted, self._step_limit)
-        if config.position == "commanded":
-            positions = pushed(positions, positions[..., 0, :] + step)
         alpha = np.where(observation.feature_valid, alpha, state.step_size)[()]
         new = RbfnnState(learned, errors, positions, ahead.errors, alpha, wanted)
         return new, step / self._period
+
+    def noted(self, state: RbfnnState, joint_velocity: FloatArray) -> RbfnnState:
+        """Return the state with the step that is sent among the commanded positions; see `Law.noted`."""
+        if self._config.position == "measured":
+            return state
+        newest = state.positions[..., 0, :] + joint_velocity * self._period
+        return state._replace(positions=pushed(state.positions, newest))
 
     def diagnostics(self, state: RbfnnState) -> Diagnostics:
         """Return I_c = ½ Σ ‖e(k+t)‖² (eq. 15, m²), step size α, ‖e(k+T)‖ (m), norms of weights, saturation."""

@@ -89,7 +89,8 @@ def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_
     state, solved, active = law.start(observation), 0, 0
     for _ in range(4):
         before = state
-        state, _ = law.command(before, Estimate(J), observation, reference)
+        state, velocity = law.command(before, Estimate(J), observation, reference)
+        state = law.noted(state, velocity)
         y = observation.feature + np.array([J[i] @ before.sent[i].sum(axis=0) for i in range(LANES)])
         for i in np.flatnonzero(state.plan.success):
             rows, plan = reference[i, 2:9], state.plan.moves[i]

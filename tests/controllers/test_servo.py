@@ -159,3 +159,13 @@ def test_a_second_predict_stage_is_refused():
     law = MpcLaw(MpcConfig(use_preview=False), KNOWLEDGE)
     with pytest.raises(ValueError, match="predictor must be None for MpcLaw, which predicts itself"):
         servo(ConstantEstimator(), law, Predictor())
+
+
+def test_the_law_notes_what_is_sent():
+    law = MpcLaw(MpcConfig(use_preview=False, horizon=1), KNOWLEDGE)
+    controller = servo(Recorder(), law)
+    first = seen(np.zeros(3), np.zeros(2))
+    controller.reset(first, 0)
+    sent = controller.step(first, np.full((2, 2), 0.3)).joint_velocity
+    assert np.abs(sent).max() > 0.0
+    np.testing.assert_allclose(controller.save().law.last, sent * KNOWLEDGE.spec.period, rtol=1e-12)

@@ -87,7 +87,8 @@ class Commanding:
         self.law, self.state = law, law.start(observation)
 
     def command(self, estimate, observation, reference):
-        self.state, u = self.law.command(self.state, estimate, observation, reference)
+        state, u = self.law.command(self.state, estimate, observation, reference)
+        self.state = self.law.noted(state, u)
         return u
 
     def diagnostics(self):

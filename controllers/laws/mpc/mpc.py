@@ -213,10 +213,14 @@ class MpcLaw(Law[MpcState]):
         plan = branch(exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds)
         limit = self._spec.joint_velocity_limit
         velocity = np.clip(plan.moves[..., 0, :] / self._spec.period, -limit, limit)
-        last = velocity * self._spec.period
-        sent = np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :]
         fallbacks = np.asarray(state.fallbacks + (1.0 - plan.success))
-        return MpcState(sent, last, fallbacks, J, targets, error + ahead[..., -1, :], plan), velocity
+        final = error + ahead[..., -1, :]
+        return MpcState(state.sent, state.last, fallbacks, J, targets, final, plan), velocity
+
+    def noted(self, state: MpcState, joint_velocity: FloatArray) -> MpcState:
+        """Return the state with the step that is sent; see `Law.noted`."""
+        last = joint_velocity * self._spec.period
+        return state._replace(sent=np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :], last=last)
 
     def _look_ahead(
         self, sent: FloatArray, J: FloatArray, observation: Observation, reference: FloatArray
