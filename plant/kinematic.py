@@ -10,7 +10,6 @@ Delay, noise, latency and lost frames are those of `servobench.plant.bench`.
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -58,13 +57,8 @@ def discretise_lag(lag: float, period: float) -> tuple[FloatArray, FloatArray]:
     """
     if lag == 0.0:
         return np.array([[1.0, 0.0], [0.0, 0.0]]), np.array([period, 1.0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import control  # noqa: PLC0415 - costs a second, so it is imported where it is used
-
-    continuous = control.ss([[0.0, 1.0], [0.0, -1.0 / lag]], [[0.0], [1.0 / lag]], np.eye(2), np.zeros((2, 1)))
-    discrete = control.sample_system(continuous, period, method="zoh")
-    return np.asarray(discrete.A), np.asarray(discrete.B)[:, 0]
+    gone = -math.expm1(-period / lag)  # share of a step in the velocity that is reached after a period
+    return np.array([[1.0, lag * gone], [0.0, 1.0 - gone]]), np.array([period - lag * gone, gone])
 
 
 class KinematicState(NamedTuple):

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from kit.plants import configure
 from servobench.plant.bench import Bench
@@ -21,10 +22,16 @@ def make(period: float = 0.05, **settings) -> Bench:
     return plant
 
 
-def test_the_lag_is_discretised_exactly():
-    A, B = discretise_lag(0.07, 0.05)
-    solution = solve_ivp(lambda _, x: [x[1], (0.8 - x[1]) / 0.07], (1.0, 1.05), [0.3, -0.2], rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(A @ [0.3, -0.2] + B * 0.8, solution.y[:, -1], atol=1e-11)
+@pytest.mark.parametrize("lag", [0.002, 0.07, 5.0])
+def test_the_lag_is_discretised_exactly(lag):
+    A, B = discretise_lag(lag, 0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import control
+    continuous = control.ss([[0.0, 1.0], [0.0, -1.0 / lag]], [[0.0], [1.0 / lag]], np.eye(2), np.zeros((2, 1)))
+    discrete = control.sample_system(continuous, 0.05, method="zoh")
+    np.testing.assert_allclose(A, discrete.A, atol=1e-14)
+    np.testing.assert_allclose(B, discrete.B[:, 0], atol=1e-14)
 
 
 def test_two_half_periods_are_one_period():
