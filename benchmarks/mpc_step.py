@@ -25,9 +25,10 @@ from servobench.plant.signals import Observation, trusted_observation
 
 PROBLEMS, BLOCK, FACTOR, AGREEMENT = 60, 128, 10.0, 5e-4  # IPOPT stops some 1e-4 rad short: its barrier
 CONFIG = MpcConfig()
-SHARES = decay_shares(CONFIG.horizon, CONFIG.rho)
+BLOCK_TIME = CONFIG.horizon_time / CONFIG.moves  # [s] a period of the problem
+SHARES = decay_shares(CONFIG.moves, CONFIG.decay * BLOCK_TIME)
 MODEL = nominal_ur5()
-SPEC = hand_eye_spec(MODEL, 0.05, 1.0, 2 * np.pi)
+SPEC = hand_eye_spec(MODEL, BLOCK_TIME, 1.0, 2 * np.pi)
 START = np.array([2.8, -1.4, 2.3, 2.2, -1.2, -0.2])
 
 
@@ -35,7 +36,7 @@ def problems() -> list[tuple[FloatArray, Observation, FloatArray]]:
     """Return Jacobian, observation and reference of the instants along a random walk of the joints, target ahead."""
     rng = np.random.default_rng(0)
     walk = START + np.cumsum(rng.normal(scale=0.01, size=(PROBLEMS, SPEC.n)), axis=0)
-    drift = np.outer(np.arange(CONFIG.horizon + 1), [0.004, -0.003, 0.002])
+    drift = np.outer(np.arange(CONFIG.moves + 1), [0.004, -0.003, 0.002])
     rows = []
     for k, q in enumerate(walk):
         y = MODEL.feature(q)
@@ -64,7 +65,7 @@ class DoMpc:
         model.set_rhs("q", q + dq)
         model.setup()
         self._mpc = do_mpc.controller.MPC(model)
-        self._mpc.settings.n_horizon = CONFIG.horizon
+        self._mpc.settings.n_horizon = CONFIG.moves
         self._mpc.settings.t_step = SPEC.period
         self._mpc.settings.supress_ipopt_output()
         miss = target - shift
@@ -83,9 +84,9 @@ class DoMpc:
         """Return the first joint step, (n,), rad."""
         error = reference[0] - observation.feature
         targets = decay_targets(error, reference[1:] - reference[0], SHARES)
-        self._template["_tvp", :, "J"] = [J] * (CONFIG.horizon + 1)
+        self._template["_tvp", :, "J"] = [J] * (CONFIG.moves + 1)
         self._template["_tvp", :, "target"] = [np.zeros(SPEC.m), *targets]
-        self._template["_tvp", :, "weight"] = [0.0] + [1.0] * CONFIG.horizon
+        self._template["_tvp", :, "weight"] = [0.0] + [1.0] * CONFIG.moves
         state: Any = np.concatenate([np.zeros(SPEC.m), observation.joint_position])[:, None]
         if not self._started:
             self._mpc.x0 = state
@@ -120,7 +121,7 @@ def main() -> None:
     except ImportError as error:
         print(f"The comparison with do-mpc is left out: {error}; `pip install do-mpc` into this environment.\n")
         return
-    law = MpcLaw(CONFIG, RobotKnowledge(SPEC, CONFIG.horizon))
+    law = MpcLaw(CONFIG, RobotKnowledge(SPEC, CONFIG.moves))
     state = law.start(problems()[0][1])
     times: tuple[list[float], list[float]] = ([], [])
     difference = 0.0

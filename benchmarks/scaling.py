@@ -97,7 +97,8 @@ def plan(lead: Lead, horizon: int, reach: float) -> Callable[[], object]:
     """Return a predictive command for six joints and an error of `reach` [m] on each axis."""
     rng, n = np.random.default_rng(0), 6
     J, zero = rng.normal(scale=0.4, size=(*lead, FEATURES, n)), np.zeros((*lead, FEATURES))
-    law = MpcLaw(MpcConfig(horizon=horizon), RobotKnowledge(linear_spec(n), horizon))
+    spec = linear_spec(n)
+    law = MpcLaw(MpcConfig(horizon_time=horizon * spec.period, moves=horizon), RobotKnowledge(spec, horizon))
     observation = seen(0, np.zeros((*lead, n)), zero)
     reference = np.repeat(zero[..., None, :] + reach, horizon + 1, axis=-2)
     state = law.start(observation)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Iterable
-from typing import Any, Final, Literal, final
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Final, Literal, final
 
 import casadi
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
+from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets, move_weights
 from servobench.controllers.laws.mpc.limits import joint_bounds
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver
+from servobench.controllers.laws.preview import check_preview, sampled
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import SolverFailed
-from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, Share, settings
+from servobench.plant.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.signals import Command, Observation
 
 _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
@@ -26,20 +27,29 @@ _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the ite
 class NmpcCalibratedConfig:
     """Settings of `nmpc_calibrated`; "tuned" = on simulated UR5s with joint lag and a command delay of one period."""
 
-    horizon: Count = 8
-    """[periods] H; with the delay within the default preview of 10."""
-    delay_periods: Periods = 2
-    """[periods] until a command moves the joints: one of transport, one of lag; bridged."""
-    rho: Positive = 1.0
-    """[1/period] ρ; the error should decay as exp(−ρ τ); tuned."""
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "horizon": "horizon_time, in seconds",
+        "delay_periods": "delay, in seconds",
+        "rho": "decay, per second",
+        "disturbance_gain": "disturbance_rate, per second",
+    }
+
+    horizon_time: Positive = 0.4
+    """[s] how far the prediction reaches; with the delay within the default preview of 0.5 s."""
+    moves: Count = 8
+    """[1] H, equal blocks of constant joint velocity in the horizon; fewer where they were shorter than a period."""
+    delay: NonNegative = 0.1
+    """[s] until a command moves the joints: half of it transport, half of it lag; bridged."""
+    decay: Positive = 20.0
+    """[1/s] the error should decay as exp(−decay t); tuned."""
     move_weight: Positive = 0.001
-    """[m²/rad²] q of Q = q I; small, it only settles the free joints."""
+    """[m²/rad²] q of Q = q I, for the joint step of 0.05 s; small, it only settles the free joints."""
     terminal_weight: NonNegative = 0.0
-    """[1] extra weight of the error after H periods."""
+    """[1] extra weight of the error at the end, against that of 0.05 s."""
     iterations: Count = 2
     """[1] Gauss-Newton steps per period at most; 1 is the real-time iteration."""
-    disturbance_gain: Share = 0.0
-    """[1/period] share of the model's error at the camera that is fed back; 0 trusts encoders and model."""
+    disturbance_rate: NonNegative = 0.0
+    """[1/s] with which the model's error at the camera is estimated and fed back; 0 trusts encoders and model."""
     joint_acceleration_limit: PositiveOrInfinite = math.inf
     """[rad/s²] limit of the change between two commands; inf: none."""
     limit_position: bool = True
@@ -54,13 +64,14 @@ class NmpcCalibratedConfig:
 class NmpcCalibrated(Controller):
     """Predictive control with the true forward kinematics h, solved by sequential quadratic programming.
 
-        min  ½ Σ_τ w_τ ‖y_ref(k+d+τ) − β^τ e − h(q_τ) − b‖² + ½ q Σ_τ ‖dq_τ‖²,   q_τ = q̂(k+d) + Σ_{s≤τ} dq_s
+        min  ½ Σ_τ w_τ ‖y_ref(τ) − β^τ e − h(q_τ) − b‖² + ½ q Σ_τ ‖dq_τ‖²,   q_τ = q̂ + Σ_{s≤τ} dq_s
 
-    over speed, acceleration and position limits; e = y_ref(k+d) − h(q̂(k+d)) − b, β = exp(−ρ). The joints are taken
-    as ideal after d periods: q̂(k+d) = q + the last d steps sent. b follows the camera, b ← b + γ (y − h(q) − b); with
-    the default γ = 0 the controller does not look at it and shows what perfect calibration alone is worth. Each
+    over speed, acceleration and position limits; e = y_ref(0) − h(q̂) − b, β = exp(−decay Δ). Time τ counts blocks of
+    length Δ (`laws.mpc.blocks`) from `delay` ahead; after it the joints are taken as ideal: q̂ = q + the steps sent in
+    the last `delay` seconds. b follows the camera, b ← b + γ (y − h(q) − b) with γ = 1 − exp(−disturbance_rate dt);
+    with the default γ = 0 the controller does not look at it and shows what perfect calibration alone is worth. Each
     iteration is a Gauss-Newton step: h is linearised along the present plan, at first the last one shifted by one
-    period, and the program of `laws.mpc.qp` gives the next one. Not in the paper.
+    control period, and the program of `laws.mpc.qp` gives the next one. Not in the paper.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
@@ -75,29 +86,36 @@ class NmpcCalibrated(Controller):
         Raises:
             ValueError: the symbolic kinematics is not known or has another size, or the preview is too short.
         """
-        reach = config.horizon + config.delay_periods
-        if knowledge.preview < reach:
-            raise ValueError(f"preview must be at least horizon + delay_periods = {reach}, got {knowledge.preview}")
+        period = knowledge.spec.period
+        blocks = Blocks.of(config.horizon_time, config.moves, period)
+        reach = blocks.count * blocks.length + config.delay
+        check_preview(reach, knowledge.preview, period, "horizon_time + delay")
         if knowledge.true_symbolic is None:
             raise ValueError("true_symbolic must be known for nmpc_calibrated; this plant has no symbolic kinematics")
         self._config, self._spec, self._knowledge = config, knowledge.spec, knowledge
         n, m = self._spec.n, self._spec.m
         self._model = _linearisation(knowledge.true_symbolic, n, m)
-        self._along_plan = self._model.map(config.horizon)
-        self._shares = decay_shares(config.horizon, config.rho)
+        self._blocks, self._places = blocks, blocks.places(config.delay)
+        self._to_come = bridging_shares(config.delay, period)
+        self._along_plan = self._model.map(blocks.count)
+        self._shares = decay_shares(blocks.count, config.decay * blocks.length)
+        self._disturbance_share = -math.expm1(-config.disturbance_rate * period)
+        self._change: FloatArray = np.full(n, config.joint_acceleration_limit * blocks.length)
         limited = math.isfinite(config.joint_acceleration_limit)
         self._shape = QpShape(
-            weights=move_weights(config.horizon, 1.0, config.terminal_weight),
-            move_weight=np.full(n, config.move_weight),
+            weights=move_weights(blocks.count, 1.0, config.terminal_weight / blocks.relative_length),
+            move_weight=np.full(n, config.move_weight / blocks.relative_length**2),
             constant_gain=None,
-            largest_move=self._spec.joint_velocity_limit * self._spec.period,
-            largest_change=np.full(n, config.joint_acceleration_limit * self._spec.period**2) if limited else None,
+            largest_move=self._spec.joint_velocity_limit * blocks.length,
+            largest_change=self._change * blocks.length if limited else None,
             limit_position=config.limit_position,
             view_rows=np.zeros((0, m)),
             varying_jacobian=True,
         )
         self._program = QpProgram(self._shape, config.solver)
         self._b: FloatArray = np.zeros(m)
+        self._plan: FloatArray = np.zeros((blocks.count, n))
+        self._sent: FloatArray = np.zeros((len(self._to_come), n))
         self._jacobian: FloatArray | None = None
         self._forget()
 
@@ -118,22 +136,23 @@ class NmpcCalibrated(Controller):
             ValueError: an observation or a reference of the wrong size.
             SolverFailed: no solution, and the fallback is "raise".
         """
-        config, delay = self._config, self._config.delay_periods
         self._knowledge.check(observation, reference)
         present = observation.joint_position
         feature, self._jacobian = self._evaluate(present)
         if observation.feature_valid:
-            self._b = self._b + config.disturbance_gain * (observation.feature - feature - self._b)
-        start = present + sum(self._sent, np.zeros(self._spec.n))
-        rows = reference[delay : delay + config.horizon + 1]
+            self._b = self._b + self._disturbance_share * (observation.feature - feature - self._b)
+        start = present + self._to_come @ self._sent
+        rows = sampled(reference, self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
         wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
         plan, success = self._improve(start, wanted)
         limit = self._spec.joint_velocity_limit
-        velocity = np.clip(plan[0] / self._spec.period, -limit, limit) if success else np.zeros(self._spec.n)
-        self._plan = np.concatenate([plan[1:], plan[-1:]]) if success else np.zeros_like(plan)
-        self._last = velocity * self._spec.period
-        self._sent.append(self._last)
+        velocity = np.clip(plan[0] / self._blocks.length, -limit, limit) if success else np.zeros(self._spec.n)
+        passed = 1.0 / self._blocks.periods  # of the first block in this period
+        later = np.concatenate([plan[1:], plan[-1:]])
+        self._plan = (1.0 - passed) * plan + passed * later if success else np.zeros_like(plan)
+        self._last = velocity * self._blocks.length
+        self._sent = np.concatenate([self._sent, velocity[None] * self._spec.period])[1:]
         return Command(velocity)
 
     def diagnostics(self) -> Diagnostics:
@@ -148,9 +167,9 @@ class NmpcCalibrated(Controller):
         return self._knowledge, self._model, self._along_plan, self._shape, self._program
 
     def _forget(self) -> None:
-        n, delay = self._spec.n, self._config.delay_periods
-        self._plan = np.zeros((self._config.horizon, n))
-        self._sent: deque[FloatArray] = deque([np.zeros(n)] * delay, maxlen=delay)
+        n = self._spec.n
+        self._plan = np.zeros((self._blocks.count, n))
+        self._sent = np.zeros((len(self._to_come), n))
         self._last = np.zeros(n)
         self._b = np.zeros(self._spec.m)
         self._jacobian = None
@@ -169,7 +188,9 @@ class NmpcCalibrated(Controller):
             wanted: features that the model should show along the plan, (H, m), m.
         """
         config = self._config
-        bounds = joint_bounds(self._shape, self._spec, self._last, start, np.zeros(0))
+        bounds = joint_bounds(
+            self._shape, self._spec, (self._last, self._change * self._spec.period), start, np.zeros(0)
+        )
         plan, change, iterations = self._plan, math.inf, 0
         while iterations < config.iterations and change > _PLAN_TOLERANCE:
             J, targets = self._linearise(start, plan, wanted)
@@ -186,7 +207,7 @@ class NmpcCalibrated(Controller):
         """Return J (H, m, n) along the plan and the targets (H, m) that J Σ dq should meet."""
         travel = np.cumsum(plan, axis=0)
         features, jacobians = self._along_plan((start + travel).T)
-        J = np.asarray(jacobians).reshape(self._spec.m, self._config.horizon, self._spec.n).swapaxes(0, 1)
+        J = np.asarray(jacobians).reshape(self._spec.m, self._blocks.count, self._spec.n).swapaxes(0, 1)
         return J, wanted - np.asarray(features).T + np.einsum("tij,tj->ti", J, travel)
 
     def _fail(self, solution: QpSolution) -> FloatArray:

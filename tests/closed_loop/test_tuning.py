@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from optuna.distributions import CategoricalDistribution, IntDistribution
+from optuna.distributions import CategoricalDistribution
 from optuna.trial import TrialState
 
 from servobench import controllers
@@ -17,7 +17,6 @@ from servobench.harness.batch.workers import Workers, open_workers
 from servobench.harness.config.defaults import apply_settings, default_config
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
-from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective, study
 from servobench.harness.studies.tuning.files import read_tuned, write_tuned
 from servobench.harness.studies.tuning.objective import CURVE, MOVE, Trial, TuningSet, evaluate, run_cost, score
@@ -83,17 +82,17 @@ def test_every_corner_of_a_space_can_be_built_and_keeps_to_the_preview(name):
     for corner in corners[:: max(1, len(corners) // CORNERS)]:
         settings = nested_settings(dict(zip(space, corner, strict=True)))
         flat = flatten(apply_settings(find_tunable(name), settings))
-        reach = [value for key, value in flat.items() if key.endswith(("law.horizon", "delay_periods"))]
-        assert sum(reach) <= RunSettings().preview
+        reach = [value for key, value in flat.items() if key.endswith(("law.horizon_time", "law.delay"))]
+        assert sum(reach) <= 0.5 + 1e-9
         assert all(value >= 1 for key, value in flat.items() if key.endswith("horizon"))
 
 
 def test_predictive_reach_is_split_into_delay_and_horizon():
-    assert nested_settings({"law.reach": 9, "law.delay_periods": 2, "law.rho": 0.123456}) == {
-        "law": {"horizon": 7, "delay_periods": 2, "rho": 0.123}
+    assert nested_settings({"law.reach": 0.45, "law.delay": 0.1, "law.decay": 0.123456}) == {
+        "law": {"horizon_time": 0.35, "delay": 0.1, "decay": 0.123}
     }
-    assert nested_settings({"reach": 6, "delay_periods": 0}) == {"horizon": 6, "delay_periods": 0}
-    assert isinstance(SPACES["ukf_mpc"]["law.reach"], IntDistribution)
+    assert nested_settings({"reach": 0.3, "delay": 0.0}) == {"horizon_time": 0.3, "delay": 0.0}
+    assert "law.reach" in SPACES["ukf_mpc"]
 
 
 def test_tuned_files_do_not_matter_to_a_trial():

@@ -15,7 +15,7 @@ SETTINGS = [
     ("pid", {"damping": 0.0}),
     ("mfac", {"feedforward": True}),
     ("mpc", {}),
-    ("mpc", {**TIGHT, "horizon": 8, "delay_periods": 2, "fallback": "closed_form"}),
+    ("mpc", {**TIGHT, "horizon_time": 0.4, "delay": 0.1, "fallback": "closed_form"}),
     ("mpc", {**TIGHT, "mode": "constant", "terminal_weight": 1.0, "use_preview": False}),
     ("rbfnn", {}),
     ("rbfnn", {"row_space_only": False, "position": "commanded", "anti_windup": False, "preview": False}),

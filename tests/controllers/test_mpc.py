@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from kit.toy import PERIOD, Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import UnlimitedPlan, horizon_integrals, move_weights
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
@@ -22,6 +23,11 @@ def make_spec(n=6, m=3, **limits):
 
 def observe(spec, position=None, feature=None):
     return seen(np.zeros(spec.n) if position is None else position, np.zeros(spec.m) if feature is None else feature)
+
+
+def blocks(count):
+    """Settings of a horizon of so many blocks, each as long as a period of the toy."""
+    return {"horizon_time": count * PERIOD, "moves": count}
 
 
 def make_law(spec, preview=20, **settings):
@@ -58,7 +64,7 @@ def make_bounds(shape, travel=1e3, margin=-1e3):
 def test_first_step_of_the_constant_mode_by_hand():
     # One joint, J = 1, α = 1, H = 2: a = 8/3, b = 2, c = ∫ τ e^{−τ} dτ = 1 − 3 e^{−2}; with q = 1/3 dq = (b − c) e / 3.
     spec = make_spec(1, 1, speed=10.0)
-    law = make_law(spec, mode="constant", horizon=2, rho=1.0, move_weight=1 / 3)
+    law = make_law(spec, mode="constant", **blocks(2), decay=1.0 / PERIOD, move_weight=1 / 3)
     velocity = law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.3]))
     np.testing.assert_allclose(velocity, [(1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0 / PERIOD], rtol=1e-9)
 
@@ -66,7 +72,7 @@ def test_first_step_of_the_constant_mode_by_hand():
 def test_first_step_of_free_moves_by_hand():
     # H = 1, J = 2, q = 1, β = ½: min ½ (0.5·0.2 − 2 dq)² + ½ dq², so dq = 2·0.1 / (4 + 1) = 0.04.
     spec = make_spec(1, 1)
-    law = make_law(spec, horizon=1, rho=math.log(2.0), move_weight=1.0)
+    law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0)
     velocity = law.command(Estimate(np.array([[2.0]])), observe(spec), hold([0.2]))
     np.testing.assert_allclose(velocity, [0.04 / PERIOD], rtol=1e-9)
 
@@ -75,9 +81,11 @@ def test_first_step_of_free_moves_by_hand():
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
 def test_constant_mode_without_active_limits_is_equation_46(seed, solver):
     spec = make_spec(speed=1e3, reach=1e3)
-    law = make_law(spec, mode="constant", alpha=0.9, solver=solver, move_weight=0.5, use_preview=False)
+    law = make_law(
+        spec, mode="constant", forgetting=-math.log(0.9) / PERIOD, solver=solver, move_weight=0.5, use_preview=False
+    )
     J, e = random_jacobian(seed), np.random.default_rng(seed + 9).normal(scale=0.2, size=3)
-    abc = horizon_integrals(10, 0.9, MpcConfig.rho)
+    abc = horizon_integrals(10, 0.9, MpcConfig.decay * PERIOD)
     printed = np.linalg.pinv(abc.a * J + np.linalg.pinv(J.T) * 0.5) @ ((abc.b - abc.c) * e)
     np.testing.assert_allclose(law.command(Estimate(J), observe(spec), hold(e)) * PERIOD, printed, atol=1e-8)
 
@@ -158,7 +166,7 @@ def test_a_moving_reference_is_met_with_the_feedforward_of_its_preview():
 def test_commands_already_sent_bridge_the_delay():
     # A pure delay of two periods, exact J: with the bridge the error decays as β^τ from the first command on.
     spec = make_spec(2, 2, speed=10.0)
-    law = make_law(spec, delay_periods=2, horizon=1, rho=0.5, move_weight=1e-9)
+    law = make_law(spec, delay=2 * PERIOD, **blocks(1), decay=0.5 / PERIOD, move_weight=1e-9)
     q, queue, errors = np.zeros(2), [np.zeros(2)] * 2, []
     for _ in range(8):
         errors.append(np.array([0.3, -0.2]) - q)
@@ -198,7 +206,7 @@ def test_position_limits_are_kept_and_an_arm_outside_may_return(mode):
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 def test_the_predicted_feature_stays_in_the_pyramid_of_view(mode):
     spec = make_spec(3, 3)
-    settings = {"mode": mode, "view_tangent": (0.5, 0.4), "rho": 3.0, "horizon": 4}
+    settings = {"mode": mode, "view_tangent": (0.5, 0.4), "decay": 3.0 / PERIOD, **blocks(4)}
     law = make_law(spec, **settings)
     y = np.array([0.46, 0.0, 1.0])
     velocity = law.command(Estimate(np.eye(3)), observe(spec, feature=y), hold([0.9, 0.0, 1.0]))
@@ -215,7 +223,8 @@ def test_the_predicted_feature_stays_in_the_pyramid_of_view(mode):
 def infeasible(fallback, mode="moves"):
     """A joint at full speed right before its limit cannot brake in time at so low an acceleration."""
     spec = make_spec(2, 2, reach=1.0)
-    config = {"fallback": fallback, "mode": mode, "joint_acceleration_limit": 0.5, "rho": 3.0, "horizon": 5}
+    config = {"fallback": fallback, "mode": mode, "joint_acceleration_limit": 0.5}
+    config |= {"decay": 3.0 / PERIOD, **blocks(5)}
     law = make_law(spec, **config)
     J = np.eye(2)
     for _ in range(40):
@@ -267,7 +276,7 @@ def test_without_a_solution_and_fallback_it_is_a_named_failure():
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
 def test_a_command_depends_on_its_state_alone(solver):
     spec = make_spec()
-    law = make_law(spec, solver=solver, joint_acceleration_limit=3.0, delay_periods=2)
+    law = make_law(spec, solver=solver, joint_acceleration_limit=3.0, delay=2 * PERIOD)
 
     def commands(first):
         return [
@@ -289,7 +298,7 @@ def test_a_command_depends_on_its_state_alone(solver):
 def test_commands_are_finite_and_within_the_limits_for_any_size(n, m, mode, seed):
     rng = np.random.default_rng(seed)
     spec = make_spec(n, m, speed=float(rng.uniform(0.1, 3.0)))
-    law = make_law(spec, mode=mode, horizon=4, joint_acceleration_limit=8.0, fallback="closed_form")
+    law = make_law(spec, mode=mode, **blocks(4), joint_acceleration_limit=8.0, fallback="closed_form")
     scale = 10.0 ** rng.uniform(-6, 3)
     for _ in range(3):
         observation = observe(spec, rng.uniform(-7.0, 7.0, n), scale * rng.normal(size=m))
@@ -308,7 +317,7 @@ def test_a_jacobian_of_zeros_asks_for_nothing():
 
 def test_diagnostics_tell_the_predicted_error_of_the_plan():
     spec = make_spec(1, 1, speed=100.0)
-    law = make_law(spec, horizon=3, rho=0.4, move_weight=1e-10)
+    law = make_law(spec, **blocks(3), decay=0.4 / PERIOD, move_weight=1e-10)
     law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.5]))
     diagnostics = law.diagnostics()
     assert diagnostics["predicted_terminal_error"] == pytest.approx(np.exp(-1.2) * 0.5, rel=1e-6)
@@ -318,11 +327,54 @@ def test_diagnostics_tell_the_predicted_error_of_the_plan():
 
 def test_settings_that_do_not_fit_the_plant_are_named():
     config = MpcConfig()
-    with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 10, got 9"):
+    with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"):
         MpcLaw(config, RobotKnowledge(make_spec(), 9))
-    with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 13, got 10"):
-        MpcLaw(replace(config, delay_periods=3), RobotKnowledge(make_spec(), 10))
+    with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.65 s, got 10 rows of 0.05 s"):
+        MpcLaw(replace(config, delay=0.15), RobotKnowledge(make_spec(), 10))
     with pytest.raises(ValueError, match="view_tangent needs the 3 features x, y, z, got 2 features"):
         MpcLaw(replace(config, view_tangent=(0.5, 0.5)), RobotKnowledge(make_spec(m=2), 10))
     with pytest.raises(ValueError, match=r"joint_weight must have shape \(6,\), got \(2,\)"):
         MpcLaw(replace(config, joint_weight=(1.0, 2.0)), RobotKnowledge(make_spec(), 10))
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+@pytest.mark.parametrize("period", [0.02, 0.008, 0.004])
+def test_the_control_rate_changes_neither_the_plan_nor_the_command(mode, period):
+    J, y, sent = random_jacobian(4), np.array([0.1, -0.2, 0.05]), np.array([0.1, 0.0, -0.2, 0.3, 0.0, 0.1])
+    commands = []
+    for rate in (PERIOD, period):
+        spec = replace(make_spec(speed=0.5), period=rate)
+        ramp = np.outer(np.arange(0.0, 1.0, rate), [0.2, -0.1, 0.4])
+        law = MpcLaw(MpcConfig(mode=mode, delay=0.1), RobotKnowledge(spec, len(ramp) - 1))
+        state = law.start(observe(spec))
+        for _ in range(math.ceil(0.1 / rate)):
+            state = law.noted(state, sent)
+        state, velocity = law.command(state, Estimate(J), observe(spec, feature=y), ramp)
+        assert state.plan.moves.shape == (10 if mode == "moves" else 1, 6)
+        assert state.plan.active_limits > 0 or mode == "constant"
+        commands.append(velocity)
+    np.testing.assert_allclose(commands[1], commands[0], rtol=1e-7, atol=1e-9)
+
+
+def test_a_slow_rate_has_fewer_and_longer_blocks_of_the_same_weights():
+    assert Blocks.of(0.5, 10, 0.05) == Blocks(10, 0.05, 0.05)
+    assert Blocks.of(0.45, 10, 0.1) == Blocks(4, 0.1125, 0.1)
+    assert Blocks.of(0.02, 10, 0.1) == Blocks(1, 0.1, 0.1)
+    np.testing.assert_allclose(Blocks(2, 0.1, 0.04).places(0.06), [1.5, 4.0, 6.5])
+    np.testing.assert_allclose(bridging_shares(0.1, 0.05), [1.0, 1.0])
+    np.testing.assert_allclose(bridging_shares(0.05, 0.02), [0.5, 1.0, 1.0])
+    assert bridging_shares(0.0, 0.02).shape == (0,)
+
+
+@pytest.mark.parametrize("mode", ["moves", "constant"])
+@pytest.mark.parametrize("moves", [5, 20])
+def test_the_optimum_in_continuous_time_does_not_depend_on_the_length_of_the_blocks(mode, moves):
+    # In constant mode the integrals are exact, in the other one the sums tend to them.
+    J, spec = random_jacobian(5), replace(make_spec(speed=1e3, reach=1e3), period=0.025)
+    found = [
+        make_law(spec, mode=mode, moves=count, decay=2.0, move_weight=5.0, terminal_weight=1.0).command(
+            Estimate(J), observe(spec), hold([0.1, -0.2, 0.05])
+        )
+        for count in (10, moves)
+    ]
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9 if mode == "constant" else 0.15)

@@ -1,5 +1,7 @@
 """Test of the predictive law against the problem as its docstrings state it, apart from all code that solves it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import nnls
@@ -10,19 +12,21 @@ from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.signals import trusted_observation
 
-LANES, N, M = 6, 4, 3
+LANES, N, M, PREVIEW = 6, 4, 3, 40
+BLOCK = 0.05  # [s]
 LIMITS = {
     "speed": {"limit_position": False},
     "acceleration": {"joint_acceleration_limit": 6.0, "limit_position": False},
     "position": {},
     "view": {"view_tangent": (0.3, 0.25), "limit_position": False},
-    "all": {"joint_acceleration_limit": 12.0, "view_tangent": (0.3, 0.25), "alpha": 0.9, "terminal_weight": 0.5},
+    "all": {"joint_acceleration_limit": 12.0, "view_tangent": (0.3, 0.25), "forgetting": 2.1, "terminal_weight": 0.5},
 }
 
 
 def gradient(config, J, e, ahead, plan):
     """The gradient of the criterion in the docstring of `MpcLaw`, term by term; the integral by quadrature."""
-    H, beta, Q = config.horizon, np.exp(-config.rho), config.move_weight
+    H, block = config.moves, config.horizon_time / config.moves
+    beta, alpha, Q = np.exp(-config.decay * block), np.exp(-config.forgetting * block), config.move_weight
     knots = np.concatenate([np.zeros((1, len(e))), ahead])
 
     def pull(tau, travel):
@@ -32,22 +36,22 @@ def gradient(config, J, e, ahead, plan):
     found = Q * plan
     if config.mode == "moves":
         for tau in range(1, H + 1):
-            weight = config.alpha**tau + config.terminal_weight * (tau == H)
+            weight = alpha**tau + config.terminal_weight * (tau == H)
             found[:tau] += weight * pull(tau, plan[:tau].sum(axis=0))
         return found
     nodes, weights = np.polynomial.legendre.leggauss(20)
     for start in range(H):
         for x, weight in zip(start + 0.5 * (nodes + 1.0), 0.5 * weights, strict=True):
-            found[0] += weight * x * config.alpha**x * pull(x, x * plan[0])
+            found[0] += weight * x * alpha**x * pull(x, x * plan[0])
     found[0] += config.terminal_weight * H * pull(H, H * plan[0])
     return found
 
 
 def half_spaces(config, spec, J, last, q, y, moves):
     """The limits in the docstring of `qp` as A x ≤ b, row by row."""
-    A, b, most = [], [], spec.joint_velocity_limit * spec.period
-    change = config.joint_acceleration_limit * spec.period**2
-    stretch = 1.0 if config.mode == "moves" else config.horizon  # the one constant step is made H times
+    A, b, block = [], [], config.horizon_time / config.moves
+    most, last = spec.joint_velocity_limit * block, last / spec.period * block
+    stretch = 1.0 if config.mode == "moves" else config.moves  # the one constant step is made H times
 
     def add(t, direction, bound, before=slice(0)):
         row = np.zeros((moves, spec.n))
@@ -60,6 +64,7 @@ def half_spaces(config, spec, J, last, q, y, moves):
         for joint, axis in enumerate(np.eye(spec.n)):
             for sign, limit in ((1.0, spec.joint_upper), (-1.0, -spec.joint_lower)):
                 add([t], sign * axis, most[joint])
+                change = config.joint_acceleration_limit * block * (block if t else spec.period)
                 add([t], sign * axis, change + (0.0 if t else sign * last[joint]), before)
                 add(until, sign * stretch * axis, max(limit[joint] - sign * q[joint], 0.0))
         for h, v in [config.view_tangent] if config.view_tangent else []:
@@ -72,7 +77,7 @@ def half_spaces(config, spec, J, last, q, y, moves):
 def random_lanes(rng, scale):
     """Return an observation of an arm near its position limits, references and Jacobians."""
     q, y = rng.uniform(-0.28, 0.28, (LANES, N)), rng.normal(scale=0.25, size=(LANES, M)) + [0.0, 0.0, 1.0]
-    way = rng.normal(scale=0.1 * scale, size=(LANES, 21, M)).cumsum(axis=1)
+    way = rng.normal(scale=0.1 * scale, size=(LANES, 1 + PREVIEW, M)).cumsum(axis=1)
     reference = y[:, None] + scale * rng.normal(size=(LANES, 1, M)) + way
     look = trusted_observation(0.0, q, y, np.full(LANES, True), np.full((LANES, M), True))
     return look, reference, rng.normal(scale=0.4, size=(LANES, M, N))
@@ -80,11 +85,11 @@ def random_lanes(rng, scale):
 
 @pytest.mark.parametrize("mode", ["moves", "constant"])
 @pytest.mark.parametrize("limits", LIMITS)
-@pytest.mark.parametrize("scale", [1e-3, 0.05, 1.0])
-def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_documented(mode, limits, scale):
-    spec = plant_spec(N, M, reach=0.3 if limits in {"position", "all"} else 6.0)
-    config = MpcConfig(mode=mode, horizon=6, delay_periods=2, rho=0.4, **LIMITS[limits])
-    law, rng = MpcLaw(config, RobotKnowledge(spec, 20)), np.random.default_rng(7)
+@pytest.mark.parametrize(("scale", "period"), [(1e-3, 0.05), (0.05, 0.05), (1.0, 0.05), (1.0, 0.02), (0.05, 0.0125)])
+def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_documented(mode, limits, scale, period):
+    spec = replace(plant_spec(N, M, reach=0.3 if limits in {"position", "all"} else 6.0), period=period)
+    config = MpcConfig(mode=mode, horizon_time=0.3, moves=6, delay=0.1, decay=8.0, **LIMITS[limits])
+    law, rng = MpcLaw(config, RobotKnowledge(spec, PREVIEW)), np.random.default_rng(7)
     observation, reference, J = random_lanes(rng, scale)
     state, solved, active = law.start(observation), 0, 0
     for _ in range(4):
@@ -92,8 +97,10 @@ def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_
         state, velocity = law.command(before, Estimate(J), observation, reference)
         state = law.noted(state, velocity)
         y = observation.feature + np.array([J[i] @ before.sent[i].sum(axis=0) for i in range(LANES)])
+        places = (config.delay + BLOCK * np.arange(7)) / period
         for i in np.flatnonzero(state.plan.success):
-            rows, plan = reference[i, 2:9], state.plan.moves[i]
+            rows = np.stack([np.interp(places, np.arange(1 + PREVIEW), line) for line in reference[i].T], axis=-1)
+            plan = state.plan.moves[i]
             down = gradient(config, J[i], rows[0] - y[i], rows[1:] - rows[0], plan).ravel()
             A, b = half_spaces(config, spec, J[i], before.last[i], observation.joint_position[i], y[i], len(plan))
             slack = b - A @ plan.ravel()

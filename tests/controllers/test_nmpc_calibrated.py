@@ -37,7 +37,9 @@ def hold(target, preview=12):
 
 def test_first_step_by_hand():
     # h(q) = sin q at q = 0, H = 1, β = ½, q = 1e-9: sin(dq) = ½·0.4, so dq = asin 0.2.
-    config = NmpcCalibratedConfig(horizon=1, delay_periods=0, rho=math.log(2.0), move_weight=1e-9, iterations=20)
+    config = NmpcCalibratedConfig(
+        horizon_time=0.05, moves=1, delay=0.0, decay=20 * math.log(2.0), move_weight=1e-9, iterations=20
+    )
     controller = NmpcCalibrated(config, knowledge(plant_spec(1, 1, speed=10.0), casadi.sin))
     command = controller.step(Observation(0.0, [0.0], [0.0]), hold([0.4]))
     np.testing.assert_allclose(command.joint_velocity * 0.05, [math.asin(0.2)], rtol=1e-7)
@@ -47,10 +49,11 @@ def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
     rng = np.random.default_rng(0)
     J, offset = rng.normal(size=(2, 4)), rng.normal(size=2)
     spec = plant_spec(4, 2)
-    common = {"horizon": 6, "rho": 0.4, "move_weight": 0.05, "delay_periods": 2, "joint_acceleration_limit": 8.0}
-    law = MpcLaw(MpcConfig(**common), RobotKnowledge(spec, 12))
+    common = {"horizon_time": 0.3, "moves": 6, "decay": 8.0, "move_weight": 0.05, "delay": 0.1}
+    law = MpcLaw(MpcConfig(**common, joint_acceleration_limit=8.0), RobotKnowledge(spec, 12))
     controller = NmpcCalibrated(
-        NmpcCalibratedConfig(**common), knowledge(spec, lambda q: casadi.DM(J) @ q + casadi.DM(offset))
+        NmpcCalibratedConfig(**common, joint_acceleration_limit=8.0),
+        knowledge(spec, lambda q: casadi.DM(J) @ q + casadi.DM(offset)),
     )
     q = np.zeros(4)
     state = law.start(Observation(0.0, q, offset))
@@ -64,7 +67,7 @@ def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
 
 
 def test_the_plan_minimises_the_nonlinear_criterion():
-    config = NmpcCalibratedConfig(horizon=4, delay_periods=0, move_weight=0.01, iterations=50)
+    config = NmpcCalibratedConfig(horizon_time=0.2, moves=4, delay=0.0, move_weight=0.01, iterations=50)
     controller = NmpcCalibrated(config, knowledge())
     y = MODEL.feature(START)
     reference = y + np.linspace(0.0, 1.0, 13)[:, None] * [0.1, -0.08, 0.05]
@@ -75,7 +78,7 @@ def test_the_plan_minimises_the_nonlinear_criterion():
     feature = symbolic_feature(MODEL)
     cost = 0.005 * casadi.sumsqr(dq)
     for t in range(1, 5):
-        error = reference[t] - np.exp(-config.rho * t) * (reference[0] - y)
+        error = reference[t] - np.exp(-config.decay * 0.05 * t) * (reference[0] - y)
         cost += 0.5 * casadi.sumsqr(casadi.DM(error) - feature(START + casadi.sum2(dq[:, :t])))
     quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-12}}
     solver = casadi.nlpsol("oracle", "ipopt", {"x": casadi.vec(dq), "f": cost}, quiet)
@@ -103,17 +106,17 @@ def test_it_settles_and_then_follows_a_moving_target_within_a_millimetre():
 def test_a_disturbance_of_the_camera_is_followed_only_with_a_gain():
     y = MODEL.feature(START)
     shifted = Observation(0.0, START, y + np.array([0.01, 0.0, 0.0]))
-    for gain, moves in ((0.0, False), (1.0, True)):
-        command = make(disturbance_gain=gain).step(shifted, hold(y))
+    for gain, moves in ((0.0, False), (40.0, True)):
+        command = make(disturbance_rate=gain).step(shifted, hold(y))
         assert (np.abs(command.joint_velocity).max() > 1e-3) == moves
     lost = Observation(0.0, START, y + np.array([0.01, 0.0, 0.0]), feature_valid=False)
-    assert np.abs(make(disturbance_gain=1.0).step(lost, hold(y)).joint_velocity).max() < 1e-6
+    assert np.abs(make(disturbance_rate=40.0).step(lost, hold(y)).joint_velocity).max() < 1e-6
 
 
 def infeasible(fallback):
     """A joint at full speed right before its limit cannot brake in time at so low an acceleration."""
     spec = plant_spec(1, 1, reach=1.0)
-    config = NmpcCalibratedConfig(delay_periods=0, joint_acceleration_limit=0.5, fallback=fallback)
+    config = NmpcCalibratedConfig(delay=0.0, joint_acceleration_limit=0.5, fallback=fallback)
     controller = NmpcCalibrated(config, knowledge(spec, lambda q: 1.0 * q))
     for _ in range(40):
         controller.step(Observation(0.0, [-0.9], [-0.9]), hold([5.0]))
@@ -137,7 +140,7 @@ def test_without_a_solution_and_fallback_it_is_a_named_failure():
 
 def test_knowledge_that_does_not_suffice_is_named():
     config = NmpcCalibratedConfig()
-    with pytest.raises(ValueError, match=r"preview must be at least horizon \+ delay_periods = 10, got 9"):
+    with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"):
         NmpcCalibrated(config, knowledge(preview=9))
     with pytest.raises(ValueError, match="true_symbolic must be known for nmpc_calibrated"):
         NmpcCalibrated(config, knowledge(symbolic=None))

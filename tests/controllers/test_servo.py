@@ -162,7 +162,7 @@ def test_a_second_predict_stage_is_refused():
 
 
 def test_the_law_notes_what_is_sent():
-    law = MpcLaw(MpcConfig(use_preview=False, horizon=1), KNOWLEDGE)
+    law = MpcLaw(MpcConfig(use_preview=False, moves=1), KNOWLEDGE)
     controller = servo(Recorder(), law)
     first = seen(np.zeros(3), np.zeros(2))
     controller.reset(first, 0)

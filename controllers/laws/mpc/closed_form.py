@@ -1,13 +1,13 @@
 """The integrals a, b, c of eq. 46 and the predictive laws without limits, in closed form.
 
-Symbols (times τ and horizon H in control periods):
+Symbols (times τ and horizon H in blocks, see `blocks`; in the paper a block is a control period):
 
 | here | meaning | shape | unit |
 |---|---|---|---|
-| `H` | horizon | | periods |
-| `alpha` | α in (0, 1], weight of a later error against an earlier one, a period | | |
-| `beta` | β = exp(−ρ), share of the error that may be left after one period | | |
-| `a`, `b`, `c` | ∫ τ² α^τ dτ, ∫ τ α^τ dτ, ∫ τ (αβ)^τ dτ over [0, H] | | periods³, periods², periods² |
+| `H` | horizon | | blocks |
+| `alpha` | α in (0, 1], weight of a later error against an earlier one, a block | | |
+| `beta` | β = exp(−ρ), share of the error that may be left after one block | | |
+| `a`, `b`, `c` | ∫ τ² α^τ dτ, ∫ τ α^τ dτ, ∫ τ (αβ)^τ dτ over [0, H] | | blocks³, blocks², blocks² |
 | `J` | estimated ∂y/∂q | (m, n) | m/rad |
 | `Q` | diagonal of the move weight | (n,) | m²/rad² |
 
@@ -45,9 +45,9 @@ def horizon_integrals(horizon: float, alpha: float, rho: float) -> HorizonIntegr
     """Return a, b and c of eq. 46.
 
     Args:
-        horizon: H, periods, positive.
+        horizon: H, blocks, positive.
         alpha: α in (0, 1].
-        rho: ρ ≥ 0, decay rate a period.
+        rho: ρ ≥ 0, decay rate a block.
     """
     rate = -math.log(alpha)
     return HorizonIntegrals(
@@ -79,10 +79,10 @@ def _power(alpha: float, tau: float) -> float:
 
 
 def decay_shares(horizon: int, rho: float) -> FloatArray:
-    """Return the share 1 − β^τ of the error that should be gone after τ = 1 … H periods, (H,).
+    """Return the share 1 − β^τ of the error that should be gone after τ = 1 … H blocks, (H,).
 
     Args:
-        horizon: H, periods.
+        horizon: H, blocks.
         rho: ρ, β = exp(−ρ).
     """
     return np.array([-math.expm1(-rho * tau) for tau in range(1, horizon + 1)])
@@ -169,8 +169,8 @@ class UnlimitedPlan:
         With target = (b − c) e it is eq. 46 for Q = q I; for another Q the printed eq. 46 is not this minimiser.
 
         Args:
-            gain: a, periods³.
-            horizon: H, periods; the way is H dq.
+            gain: a, blocks³.
+            horizon: H, blocks; the way is H dq.
             move_weight: diagonal of Q, (n,), positive.
         """
         return cls(np.array([[gain]]), np.eye(1), np.array([[float(horizon)]]), move_weight)
@@ -180,7 +180,7 @@ class UnlimitedPlan:
 
         Args:
             J: (..., m, n), m/rad.
-            targets: (..., moves, m); for a constant step m times periods².
+            targets: (..., moves, m); for a constant step m times blocks².
         """
         weighted = J / self._move_weight
         s, V = np.linalg.eigh(weighted @ transposed(J))

@@ -21,7 +21,11 @@ def view_rows(tangent: tuple[float, ...], m: int) -> FloatArray:
 
 
 def joint_bounds(
-    shape: QpShape, spec: PlantSpec, last_step: FloatArray, joint_position: FloatArray, view_margin: FloatArray
+    shape: QpShape,
+    spec: PlantSpec,
+    last: tuple[FloatArray, FloatArray],
+    joint_position: FloatArray,
+    view_margin: FloatArray,
 ) -> QpBounds:
     """Return the bounds on the steps from `joint_position` on.
 
@@ -31,11 +35,12 @@ def joint_bounds(
     Args:
         shape: limits that do not change.
         spec: limits of the joint positions.
-        last_step: the step before the first move, (..., n), rad.
+        last: the last velocity sent, as the step of a block, (..., n), rad, and by how much the first move may differ
+            from it, (n,), rad; without a limit it is infinite.
         joint_position: (..., n), rad.
         view_margin: (..., v), see `QpBounds`.
     """
-    largest, change = shape.largest_move, np.inf if shape.largest_change is None else shape.largest_change
+    largest, (last_step, change) = shape.largest_move, last
     return QpBounds(
         first_lower=np.maximum(last_step - change, -largest),
         first_upper=np.minimum(last_step + change, largest),

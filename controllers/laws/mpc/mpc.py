@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, Final, Literal, NamedTuple, final
+from collections.abc import Mapping
+from typing import ClassVar, Final, Literal, final
 
 import numpy as np
-from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, Stage
 from servobench.controllers.laws.limit import scale_to_limit
+from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import (
     UnlimitedPlan,
     decay_shares,
@@ -22,10 +23,12 @@ from servobench.controllers.laws.mpc.closed_form import (
 )
 from servobench.controllers.laws.mpc.limits import exceeds, joint_bounds, view_rows
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver
+from servobench.controllers.laws.mpc.state import MpcState, Plan
+from servobench.controllers.laws.preview import check_preview, sampled
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
 from servobench.plant.lanes import branch, lane_by_lane, norm, transposed, where
-from servobench.plant.settings import Count, NonNegative, Periods, Positive, PositiveOrInfinite, settings
+from servobench.plant.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.signals import Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
@@ -35,24 +38,33 @@ _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier cou
 class MpcConfig:
     """Settings of the predictive law; "tuned" = on UR5s with ±15° camera, ±5 % links and 3 periods of delay."""
 
-    horizon: Count = 10
-    """[periods] H; tuned."""
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "horizon": "horizon_time, in seconds",
+        "alpha": "forgetting, −log(alpha) per second",
+        "rho": "decay, per second",
+        "delay_periods": "delay, in seconds",
+    }
+
+    horizon_time: Positive = 0.5
+    """[s] how far the prediction reaches; tuned."""
+    moves: Count = 10
+    """[1] H, equal blocks of constant joint velocity in the horizon; fewer where they were shorter than a period."""
     mode: Literal["moves", "constant"] = "moves"
-    """H free moves, or one constant step as in the paper."""
-    alpha: Annotated[Positive, Le(1.0)] = 1.0
-    """[1] α, weight of an error against the one a period earlier; 1 is the plain mean."""
-    rho: Positive = 0.25
-    """[1/period] ρ; the error should decay as exp(−ρ τ); tuned."""
+    """H free moves, or one constant velocity as in the paper."""
+    forgetting: NonNegative = 0.0
+    """[1/s] an error weighs exp(−forgetting t) after the time t; 0 is the plain mean."""
+    decay: Positive = 5.0
+    """[1/s] the error should decay as exp(−decay t); tuned."""
     move_weight: Positive = 0.15
-    """[m²/rad²] q of Q = q I; tuned."""
+    """[m²/rad²] q of Q = q I, for the joint step of 0.05 s; converted for blocks of another length; tuned."""
     joint_weight: tuple[Positive, ...] = ()
     """[1] relative weight of each joint, Q = q diag(…); empty: all 1."""
     terminal_weight: NonNegative = 0.0
-    """[1] extra weight of the error after H periods; 0 is the paper's criterion."""
+    """[1] extra weight of the error at the end, against that of 0.05 s; 0 is the paper's criterion."""
     use_preview: bool = True
     """Follow the previewed reference; false: hold the present one, as in the paper."""
-    delay_periods: Periods = 0
-    """[periods] until a command shows in the feature; bridged by the commands already sent."""
+    delay: NonNegative = 0.0
+    """[s] until a command shows in the feature; bridged by the commands already sent."""
     joint_acceleration_limit: PositiveOrInfinite = math.inf
     """[rad/s²] limit of the change between two commands; inf: none."""
     limit_position: bool = True
@@ -70,72 +82,37 @@ class MpcConfig:
             raise ValueError(f"view_tangent must be empty or (horizontal, vertical), got {self.view_tangent}")
 
 
-class Plan(NamedTuple):
-    """The moves of the last command and how they were found.
-
-    Attributes:
-        moves: dq_1 … dq_H, or the one constant step, (..., moves, n), rad.
-        success: (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before the first command.
-        iterations: (...), of the solver; 0 without an active limit.
-        active_limits: (...), NaN without a solution.
-    """
-
-    moves: FloatArray
-    success: FloatArray
-    iterations: FloatArray
-    active_limits: FloatArray
-
-
-class MpcState(NamedTuple):
-    """The state of the predictive law.
-
-    Attributes:
-        sent: (..., delay, n), rad, the last steps sent, the newest one last.
-        last: (..., n), rad, the last step sent.
-        fallbacks: (...), commands without a solution so far.
-        J: (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two.
-        targets: (..., moves, m), of the last command.
-        final: (..., m), m, error after H periods if the arm stood still.
-        plan: of the last command.
-    """
-
-    sent: FloatArray
-    last: FloatArray
-    fallbacks: FloatArray
-    J: FloatArray
-    targets: FloatArray
-    final: FloatArray
-    plan: Plan
-
-
 @final
 class MpcLaw(Law[MpcState]):
-    """Receding-horizon law on the affine prediction y(k+τ) = ŷ + Ĵ Σ_{s≤τ} dq_s, after eq. 46.
+    """Receding-horizon law on the affine prediction y(τ) = ŷ + Ĵ Σ_{s≤τ} dq_s, after eq. 46.
 
-    With e = y_ref − y now, r_τ = y_ref(k+τ) − y_ref(k), β = exp(−ρ), the predicted displacement should follow
+    Time τ counts blocks of the horizon (`Blocks`), whose length does not depend on the control rate. With e = y_ref − y
+    now, r_τ = y_ref(τ) − y_ref(0), β = exp(−ρ), the predicted displacement should follow
 
-        target_τ = r_τ + (1 − β^τ) e,   that is y_ref(k+τ) − y(k+τ) = β^τ e
+        target_τ = r_τ + (1 − β^τ) e,   that is y_ref(τ) − y(τ) = β^τ e
 
     "moves":     min ½ Σ_τ w_τ ‖target_τ − Ĵ Σ_{s≤τ} dq_s‖² + ½ Σ_τ dq_τᵀ Q dq_τ
     "constant":  min ½ ∫₀ᴴ α^τ ‖target(τ) − τ Ĵ dq‖² dτ + ½ dqᵀ Q dq, plus the terminal term
 
-    with w_τ = α^τ, plus `terminal_weight` at τ = H, over the joint limits; the first step is sent, u = dq / dt.
-    One target for both makes them one family: for a reference at rest, without active limits, "constant" is
-    (a ĴᵀĴ + Q) dq = (b − c) Ĵᵀ e, eq. 46 for Q = q I. The plan without limits has a closed form; where it keeps all
-    limits it is the optimum, and only the other lanes solve the quadratic program.
+    with w_τ = α^τ, plus `terminal_weight` at τ = H, over the joint limits; the velocity of the first block is sent for
+    one control period, u = dq_1 / Δ. One target for both makes them one family: for a reference at rest, without active
+    limits, "constant" is (a ĴᵀĴ + Q) dq = (b − c) Ĵᵀ e, eq. 46 for Q = q I. The plan without limits has a closed form;
+    where it keeps all limits it is the optimum, and only the other lanes solve the quadratic program.
 
     | here | meaning | shape | unit |
     |---|---|---|---|
     | `J` | Ĵ, estimated ∂y/∂q, frozen over the horizon | (m, n) | m/rad |
     | `e` | y_ref − y at the instant when a command first acts | (m,) | m |
-    | `dq` | joint step of one period | (n,) | rad |
+    | `dq` | joint step of one block | (n,) | rad |
+    | `Δ` | length of a block | | s |
     | `Q` | diagonal of the move weight | (n,) | m²/rad² |
-    | `rho`, `alpha` | decay rate ρ and forgetting α | | 1/period, – |
+    | `rho`, `alpha` | decay Δ, exp(−forgetting Δ) | | – |
 
     Departures from the paper: limits, preview, free moves and the terminal term; the printed eq. 46 is replaced by the
-    minimiser it comes from (they agree for Q = q I only). With `delay_periods` = d the prediction starts d periods
-    ahead, ŷ(k+d) = y + Ĵ Σ of the last d steps sent; the paper has d = 0. A position or view limit that is already
-    violated may not get worse, so that noise alone never makes the program infeasible.
+    minimiser it comes from (they agree for Q = q I only). The prediction starts `delay` ahead, ŷ = y + Ĵ Σ of the
+    steps sent in the last `delay` seconds; the paper has none. The printed eq. 46 with the speed limit alone is mode
+    "constant", `use_preview` and `limit_position` false, and else the defaults. A position or view limit that is
+    already violated may not get worse, so that noise alone never makes the program infeasible.
     """
 
     owns: ClassVar[frozenset[Stage]] = frozenset({"predict", "limit"})
@@ -146,33 +123,38 @@ class MpcLaw(Law[MpcState]):
         Raises:
             ValueError: the preview does not reach the horizon, or a setting does not fit the sizes.
         """
-        spec, preview = knowledge.spec, knowledge.preview
-        reach = config.horizon + config.delay_periods
-        if config.use_preview and preview < reach:
-            raise ValueError(f"preview must be at least horizon + delay_periods = {reach}, got {preview}")
+        spec = knowledge.spec
+        blocks = Blocks.of(config.horizon_time, config.moves, spec.period)
+        if config.use_preview:
+            reach = blocks.count * blocks.length + config.delay
+            check_preview(reach, knowledge.preview, spec.period, "horizon_time + delay")
         if config.view_tangent and spec.m != 3:
             raise ValueError(f"view_tangent needs the 3 features x, y, z, got {spec.m} features")
-        self._config, self._spec = config, spec
+        self._config, self._spec, self._blocks = config, spec, blocks
+        self._places, self._to_come = blocks.places(config.delay), bridging_shares(config.delay, spec.period)[:, None]
+        constant, horizon = config.mode == "constant", blocks.count
         weight = as_vector("joint_weight", config.joint_weight or np.ones(spec.n), spec.n)
-        self._Q: FloatArray = config.move_weight * weight
-        self._shares = decay_shares(config.horizon, config.rho)
-        self._integrals = horizon_integrals(config.horizon, config.alpha, config.rho)
-        self._preview_weights = preview_weights(config.horizon, config.alpha)
-        weights = move_weights(config.horizon, config.alpha, config.terminal_weight)
-        gain = self._integrals.a + config.terminal_weight * config.horizon**2
-        constant = config.mode == "constant"
-        change = np.full(spec.n, config.joint_acceleration_limit * spec.period**2)
+        # One constant velocity is weighed once, not in every block.
+        self._Q: FloatArray = config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
+        self._terminal = config.terminal_weight / blocks.relative_length
+        rho, alpha = config.decay * blocks.length, math.exp(-config.forgetting * blocks.length)
+        self._shares = decay_shares(horizon, rho)
+        self._integrals = horizon_integrals(horizon, alpha, rho)
+        self._preview_weights = preview_weights(horizon, alpha)
+        weights = move_weights(horizon, alpha, self._terminal)
+        gain = self._integrals.a + self._terminal * horizon**2
+        self._change: FloatArray = np.full(spec.n, config.joint_acceleration_limit * blocks.length)
         self._shape = QpShape(
             weights=weights,
             move_weight=self._Q,
             constant_gain=gain if constant else None,
-            largest_move=spec.joint_velocity_limit * spec.period,
-            largest_change=change if math.isfinite(config.joint_acceleration_limit) else None,
+            largest_move=spec.joint_velocity_limit * blocks.length,
+            largest_change=self._change * blocks.length if math.isfinite(config.joint_acceleration_limit) else None,
             limit_position=config.limit_position,
             view_rows=view_rows(config.view_tangent, spec.m),
         )
         self._unlimited = (
-            UnlimitedPlan.of_constant_step(gain, config.horizon, self._Q)
+            UnlimitedPlan.of_constant_step(gain, horizon, self._Q)
             if constant
             else UnlimitedPlan.of_free_moves(weights, self._Q)
         )
@@ -184,7 +166,7 @@ class MpcLaw(Law[MpcState]):
         n, m, moves = self._spec.n, self._spec.m, shape.moves
         unknown = np.full(lead, np.nan)
         return MpcState(
-            sent=np.zeros((*lead, self._config.delay_periods, n)),
+            sent=np.zeros((*lead, len(self._to_come), n)),
             last=np.zeros((*lead, n)),
             fallbacks=np.zeros(lead),
             J=np.full((*lead, m, n), np.nan),
@@ -207,12 +189,13 @@ class MpcLaw(Law[MpcState]):
         moves, travel = self._unlimited.minimise(J, targets)
         # A ball that is out of view already may not get further out.
         margin = np.minimum(-np.matvec(self._shape.view_rows, feature), 0.0)
-        bounds = joint_bounds(self._shape, self._spec, state.last, observation.joint_position, margin)
+        last = state.last * self._blocks.periods, self._change * self._spec.period
+        bounds = joint_bounds(self._shape, self._spec, last, observation.joint_position, margin)
         lead = feature.shape[:-1]
         plan = Plan(moves, success=np.ones(lead), iterations=np.zeros(lead), active_limits=np.zeros(lead))
         plan = branch(exceeds(self._shape, bounds, J, moves, travel), self._limited, plan, J, targets, bounds)
         limit = self._spec.joint_velocity_limit
-        velocity = np.clip(plan.moves[..., 0, :] / self._spec.period, -limit, limit)
+        velocity = np.clip(plan.moves[..., 0, :] / self._blocks.length, -limit, limit)
         fallbacks = np.asarray(state.fallbacks + (1.0 - plan.success))
         final = error + ahead[..., -1, :]
         return MpcState(state.sent, state.last, fallbacks, J, targets, final, plan), velocity
@@ -226,11 +209,10 @@ class MpcLaw(Law[MpcState]):
         self, sent: FloatArray, J: FloatArray, observation: Observation, reference: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return ŷ, e and r_1 … r_H, all at the instant when a command first acts."""
-        horizon, delay = self._config.horizon, self._config.delay_periods
-        feature = observation.feature + np.matvec(J, np.add.reduce(sent, axis=-2))
+        feature = observation.feature + np.matvec(J, np.add.reduce(self._to_come * sent, axis=-2))
         if not self._config.use_preview:
-            return feature, reference[..., 0, :] - feature, np.zeros((horizon, self._spec.m))
-        rows = reference[..., delay : delay + horizon + 1, :]
+            return feature, reference[..., 0, :] - feature, np.zeros((self._blocks.count, self._spec.m))
+        rows = sampled(reference, self._places)
         return feature, rows[..., 0, :] - feature, rows[..., 1:, :] - rows[..., :1, :]
 
     def diagnostics(self, state: MpcState) -> Diagnostics:
@@ -239,7 +221,7 @@ class MpcLaw(Law[MpcState]):
         Without an active limit the plan is that of the closed form, after no iteration.
         """
         plan, moves = state.plan, state.plan.moves
-        travel = moves.sum(axis=-2) * (self._config.horizon / self._shape.moves)
+        travel = moves.sum(axis=-2) * (self._blocks.count / self._shape.moves)
         return {
             "solver_success": plan.success,
             "solver_iterations": plan.iterations,
@@ -265,7 +247,7 @@ class MpcLaw(Law[MpcState]):
         if self._config.mode == "moves":
             return targets
         integral = (self._integrals.b - self._integrals.c) * error + np.vecmat(self._preview_weights, ahead)
-        terminal = self._config.terminal_weight * self._config.horizon * targets[..., -1, :]
+        terminal = self._terminal * self._blocks.count * targets[..., -1, :]
         return np.asarray((integral + terminal)[..., None, :])
 
     def _limited(self, plan: Plan, J: FloatArray, targets: FloatArray, bounds: QpBounds) -> Plan:

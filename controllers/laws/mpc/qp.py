@@ -53,10 +53,10 @@ class QpShape:
         move_weight: diagonal of Q, (n,).
         constant_gain: a of eq. 46 in constant-move mode, None for H free moves.
         largest_move: (n,), rad.
-        largest_change: (n,), rad, largest change from one move to the next, and of the first; None for no limit.
+        largest_change: (n,), rad, largest change from one move to the next; None for no limit, of the first move too.
         limit_position: whether the joint positions are limited.
         view_rows: V, (v, m); no rows = no limit on the view.
-        varying_jacobian: whether every period has a Jacobian of its own; for free moves only.
+        varying_jacobian: whether every block has a Jacobian of its own; for free moves only.
     """
 
     weights: FloatArray
@@ -92,7 +92,7 @@ class QpShape:
 
     @property
     def horizon(self) -> int:
-        """H, periods."""
+        """H, number of blocks."""
         return len(self.weights)
 
     @property

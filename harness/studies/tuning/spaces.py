@@ -5,7 +5,7 @@ Everything else keeps the default of its class, and is the same for all: limits,
 ten rows. The preview is offered to all methods alike. `rbfnn_mfac`, `ukf_mpc` and `nmpc_calibrated` look at it by
 construction; the laws `mfac` and `pid` may use its first row, and whether they do (`feedforward`) is a parameter, for
 all of them. Predictive laws must bridge delay and horizon within the preview, so that what is searched is their `reach`
-= horizon + delay_periods.
+= horizon_time + delay.
 
 `nmpc_calibrated` has no space. It is a bound that never looks at the camera: tuned where its model of the delay is
 exact it gains nothing (0.071 against 0.072) and then cycles around the target on the rendered plant, whose joints
@@ -70,10 +70,10 @@ SPACES: Final[Mapping[str, Space]] = {
         "estimator.initial_deviation": _log(0.005, 0.5),  # m/rad
     },
     "ukf_mpc": {
-        "law.rho": _log(0.03, 2.0),  # 1/period
+        "law.decay": _log(0.6, 40.0),  # 1/s
         "law.move_weight": _log(0.001, 1.0),  # m²/rad²
-        "law.reach": IntDistribution(5, 10),  # periods, at most the preview
-        "law.delay_periods": IntDistribution(0, 3),
+        "law.reach": FloatDistribution(0.25, 0.5, step=0.05),  # s, at most the preview
+        "law.delay": FloatDistribution(0.0, 0.15, step=0.05),  # s
         "estimator.process_deviation": _log(0.001, 0.3),  # m/rad
         "estimator.initial_deviation": _log(0.005, 0.5),  # m/rad
     },
@@ -123,7 +123,7 @@ def default_values(entry: ControllerEntry) -> dict[str, Any]:
     for key in SPACES[entry.name]:
         prefix, _, last = key.rpartition(REACH)
         if not last and key not in flat:
-            flat[key] = flat[f"{prefix}horizon"] + flat[f"{prefix}delay_periods"]
+            flat[key] = flat[f"{prefix}horizon_time"] + flat[f"{prefix}delay"]
     return {key: flat[key] for key in SPACES[entry.name]}
 
 
@@ -137,7 +137,7 @@ def nested_settings(values: Mapping[str, Any]) -> dict[str, Any]:
             target = target.setdefault(word, {})
         if last == REACH:
             dot = "." if prefix else ""
-            target["horizon"] = value - values[f"{prefix}{dot}delay_periods"]
+            target["horizon_time"] = float(f"{value - values[f'{prefix}{dot}delay']:.{DIGITS}g}")
         else:
             target[last] = float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
     return nested

@@ -1,0 +1,46 @@
+"""The reference and other rows of samples at instants between the control instants: all laws plan in physical time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servobench.plant.checks import FloatArray
+
+_WHOLE: float = 1e-9  # [1] a number of periods that is as near to a whole one is that one
+
+
+def in_periods(time: float, period: float) -> float:
+    """Return `time` [s] in control periods of `period` [s]: a fraction, or exactly a whole number up to rounding."""
+    count = time / period
+    return float(round(count)) if abs(count - round(count)) < _WHOLE * max(1.0, count) else count
+
+
+def check_preview(wanted: float, rows: int, period: float, what: str) -> None:
+    """Refuse a preview that does not reach far enough.
+
+    Args:
+        wanted: how far the law looks ahead [s].
+        rows: of the preview, one for each control period.
+        period: of control [s].
+        what: the settings that add up to `wanted`.
+
+    Raises:
+        ValueError: it is too short.
+    """
+    if rows < in_periods(wanted, period):
+        raise ValueError(f"preview must reach {what} = {wanted:g} s, got {rows} rows of {period:g} s")
+
+
+def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:
+    """Return samples between equidistant rows, (..., K, m): interpolated, and the row itself at a whole place.
+
+    Args:
+        rows: (..., N, m).
+        places: (K,), from 0 to N − 1, in rows.
+    """
+    before = np.minimum(places.astype(np.int_), max(rows.shape[-2] - 2, 0))
+    after = np.minimum(before + 1, rows.shape[-2] - 1)
+    share = (places - before)[:, None]
+    if not np.remainder(share, 1.0).any():
+        return rows[..., places.astype(np.int_), :]
+    return np.asarray((1.0 - share) * rows[..., before, :] + share * rows[..., after, :])
