@@ -8,17 +8,17 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, final
+from typing import Annotated, NamedTuple, final
 
 import numpy as np
+from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm, outer, transposed
-from servobench.plant.settings import NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.settings import NonNegative, Positive, settings
 from servobench.plant.signals import BoolArray
 
 
@@ -26,10 +26,8 @@ from servobench.plant.signals import BoolArray
 class RlsConfig:
     """Settings of recursive least squares."""
 
-    RENAMED: ClassVar[Mapping[str, str]] = {"forgetting": "memory, in seconds: -0.05 s / ln(forgetting)"}
-
-    memory: PositiveOrInfinite = 0.975
-    """[s] of motion that is remembered: λ = exp(−duration/memory), 0.95 for a motion of 0.05 s."""
+    forgetting: Annotated[Positive, Le(1.0)] = 0.95
+    """[1] λ per motion; remembers some 20 motions."""
     initial_covariance: Positive = 100.0
     """[1/rad²] P₀ = p₀ I: Ĵ₀ weighs as much as a motion of 0.1 rad of each joint."""
     covariance_limit: Positive = 100.0
@@ -47,7 +45,7 @@ class RlsConfig:
 
 
 def rls_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, forgetting: FloatArray
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, forgetting: float
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, P in Joseph form.
 
@@ -56,7 +54,7 @@ def rls_update(
         P: (..., n, n), 1/rad².
         joint_step: Δq, (..., n), rad.
         feature_step: Δy, (..., m), m.
-        forgetting: λ, (...).
+        forgetting: λ.
 
     Returns:
         The new Jacobian and P.
@@ -64,7 +62,7 @@ def rls_update(
     PH = np.matvec(P, joint_step)
     K = PH / (forgetting + np.vecdot(joint_step, PH))[..., None]
     A = P - outer(K, PH)
-    P = (A + outer(forgetting[..., None] * K - np.matvec(A, joint_step), K)) / forgetting[..., None, None]
+    P = (A + outer(forgetting * K - np.matvec(A, joint_step), K)) / forgetting
     return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
 
 
@@ -105,7 +103,7 @@ class RlsEstimator(Estimator[RlsState]):
 
     def _correct(self, state: RlsState, motion: Motion) -> RlsState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
-        J, P = rls_update(state.J, state.P, dq, dy, forgetting=np.exp(-np.asarray(motion.duration) / config.memory))
+        J, P = rls_update(state.J, state.P, dq, dy, forgetting=config.forgetting)
         P = P * np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))[..., None, None]
         cholesky_of(P)
         return state._replace(J=J, P=P)

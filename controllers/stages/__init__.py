@@ -1,1 +1,0 @@
-"""The stages of a composed controller around its estimator and its law."""
