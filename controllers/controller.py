@@ -26,6 +26,21 @@ Diagnostics: TypeAlias = Mapping[str, npt.ArrayLike]
 
 
 @dataclass(frozen=True)
+class Delays:
+    """How late commands and features are.
+
+    Attributes:
+        latency: s, of the camera.
+        command_delay: s, from a command to its first effect.
+        lag: s, time constant of the joints' velocity loops.
+    """
+
+    latency: float
+    command_delay: float
+    lag: float
+
+
+@dataclass(frozen=True)
 class RobotKnowledge:
     """What a controller may know about the robot, through its constructor.
 
@@ -37,6 +52,7 @@ class RobotKnowledge:
         true_jacobian: the same of the true robot; given only to a controller whose entry needs the truth.
         true_symbolic: a CasADi expression (MX) q, (n, 1) rad -> the expression of the true robot's feature, (m, 1);
             under the same condition.
+        true_delays: of the true robot and its camera; under the same condition.
         region: lower and upper joint positions, (n,) rad each, of the box in which the robot will work; networks are
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
@@ -48,6 +64,7 @@ class RobotKnowledge:
     nominal_jacobian: JacobianFunction | None = None
     true_jacobian: JacobianFunction | None = None
     true_symbolic: SymbolicFeature | None = None
+    true_delays: Delays | None = None
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
 

@@ -1,15 +1,17 @@
 """The methods by name, one row each: a control law, an estimator and the defaults that differ from those of the parts.
 
-Any other pair is a method too, called `law+estimator`. Method numbers and equations in the summaries are the paper's.
+A plain name is the method with all aids that help it; `NAME:published` has none and its law as printed. Any other pair
+is a method too, called `law+estimator`. Method numbers and equations in the summaries are the paper's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
+from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import ControllerEntry, RobotKnowledge
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.networks.config import TrainingConfig
@@ -18,6 +20,7 @@ from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.controllers.servo import Servo, ServoController
 
 Kind = TypeVar("Kind")
+PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed
 
 
 def _find(kind: str, name: str, parts: Mapping[str, Part[Kind]]) -> Part[Kind]:
@@ -34,11 +37,13 @@ class MethodConfig:
         estimator: settings of its estimator.
         law: settings of its control law.
         initial: where the first Jacobian comes from.
+        aids: the stages around them.
     """
 
     estimator: Any
     law: Any
     initial: InitialConfig
+    aids: AidsConfig
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,8 @@ class Method:
         estimator: a name in `ESTIMATORS`.
         summary: one line for `servobench controllers`.
         law_defaults: settings of the law that differ from its own defaults.
+        aids: settings of the aids that differ from none.
+        printed: settings of the law as published that differ from its own defaults; None: it is not published.
     """
 
     name: str
@@ -69,11 +76,20 @@ class Method:
     estimator: str
     summary: str
     law_defaults: Mapping[str, object] = field(default_factory=dict)
+    aids: Mapping[str, Any] = field(default_factory=dict)
+    printed: Mapping[str, object] | None = None
+
+    def divisions(self) -> list[Method]:
+        """Return the method best equipped and, where there is one, as published: without aids, its law as printed."""
+        if self.printed is None:
+            return [self]
+        summary = f"{self.summary}; as published, without aids"
+        return [self, replace(self, name=self.name + PUBLISHED, summary=summary, law_defaults=self.printed, aids={})]
 
     def config(self) -> MethodConfig:
         """Return the default settings."""
         law, estimator = self._parts()
-        settings = estimator.config(), law.config(**self.law_defaults), InitialConfig()
+        settings = estimator.config(), law.config(**self.law_defaults), InitialConfig(), AidsConfig(**self.aids)
         if law.trained or estimator.trained:
             return TrainedMethodConfig(*settings, TrainingConfig())
         return MethodConfig(*settings)
@@ -87,6 +103,7 @@ class Method:
             law.make(config.law, knowledge, *(networks if law.trained else ())),
             initial_jacobian(config.initial, knowledge),
             knowledge,
+            config.aids,
         )
         return ServoController(servo)
 
@@ -103,31 +120,53 @@ class Method:
         return _find("law", self.law, LAWS), _find("estimator", self.estimator, ESTIMATORS)
 
 
+_OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}  # it brings these
+_OF_RBFNN = {key: word for key, word in EQUIPPED.items() if key != "posture"}  # its network brings it
+_GIVEN = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
+_PRINTED_MPC = {"mode": "constant", "use_preview": False, "limit_position": False}
+
 _ROWS = (
     Method(
         "rbfnn_mfac", "rbfnn", "rbf",
         "the proposed method: a controller network and a Jacobian network that learn online (eqs. 7-39)",
+        {"preview": False}, _OF_RBFNN, printed={},
     ),
     Method(
-        "rbfnn_mfac_plus", "rbfnn_bridged", "rbf_aligned",
-        "the proposed method with an estimated camera map and delay, prediction past all delays and a faster law",
+        "map_mfac", "mfac", "constant",
+        "the nominal Jacobian seen through an estimated map of the camera, with model-free adaptive control",
+        {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
-    Method("ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)"),
-    Method("ukf_mpc", "mpc", "ukf", "unscented Kalman filter with model predictive control (eq. 46)"),
+    Method(
+        "ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)",
+        {}, EQUIPPED, printed={},
+    ),
+    Method(
+        "ukf_mpc", "mpc", "ukf", "unscented Kalman filter with model predictive control (eq. 46)",
+        {}, _OF_MPC, printed=_PRINTED_MPC,
+    ),
     Method(
         "rbf_pid", "pid", "rbf_lyapunov",
         "Jacobian network under a Lyapunov update with the pseudo-inverse law (eqs. 40-43)",
+        {}, EQUIPPED, printed={},
     ),
     Method("constant", "pid", "constant", "pseudo-inverse of the first Jacobian for ever: the lower bound"),
     Method(
-        "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian, with feedforward: the upper bound",
-        {"feedforward": True},
+        "calibrated", "pid", "true", "pseudo-inverse of the true Jacobian with the true delays: the upper bound",
+        {}, _GIVEN,
     ),
-    Method("broyden", "pid", "broyden", "Broyden's rank-one update with the pseudo-inverse law"),
-    Method("rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law"),
-    Method("cfdl_mfac", "mfac", "cfdl", "compact-form model-free adaptive control of Hou and Jin"),
+    Method(
+        "broyden", "pid", "broyden", "Broyden's rank-one update with the pseudo-inverse law", {}, EQUIPPED, printed={}
+    ),
+    Method(
+        "rls", "pid", "rls", "recursive least squares with forgetting, with the pseudo-inverse law",
+        {}, EQUIPPED, printed={},
+    ),
+    Method(
+        "cfdl_mfac", "mfac", "cfdl", "compact-form model-free adaptive control of Hou and Jin",
+        {}, EQUIPPED, printed={},
+    ),
 )  # fmt: skip
-METHODS: Mapping[str, ControllerEntry] = {row.name: row.entry() for row in _ROWS}
+METHODS: Mapping[str, ControllerEntry] = {method.name: method.entry() for row in _ROWS for method in row.divisions()}
 
 
 @cache

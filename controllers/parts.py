@@ -12,7 +12,6 @@ from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.estimators.fixed import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
-from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
 from servobench.controllers.estimators.ukf import UkfConfig, ukf_estimator
@@ -21,7 +20,6 @@ from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.pid import PidConfig, PidLaw
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
-from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
 
 Kind = TypeVar("Kind")
 
@@ -52,7 +50,6 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "rls": Part(RlsConfig, RlsEstimator),
     "rbf": Part(RbfConfig, RbfEstimator, trained=True),
     "rbf_lyapunov": Part(RbfLyapunovConfig, RbfLyapunovEstimator, trained=True),
-    "rbf_aligned": Part(RbfAlignedConfig, RbfAlignedEstimator, trained=True),
     "cfdl": Part(CfdlConfig, CfdlEstimator),
 }
 
@@ -61,5 +58,4 @@ LAWS: dict[str, Part[Law[Any]]] = {
     "mfac": Part(MfacConfig, MfacLaw),
     "mpc": Part(MpcConfig, MpcLaw),
     "rbfnn": Part(RbfnnConfig, RbfnnLaw, trained=True),
-    "rbfnn_bridged": Part(RbfnnBridgedConfig, RbfnnBridgedLaw, trained=True),
 }

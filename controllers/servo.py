@@ -1,9 +1,10 @@
-"""A controller composed of a Jacobian estimator, a control law and a provider of the initial Jacobian.
+"""A controller composed of a Jacobian estimator, a control law and the stages around them.
 
-    J(k) ← estimator(Δy, Δq),      u(k) = law(J(k), y(k), y_ref(k), y_ref(k+1), …)
+    Observation → pair → estimate → predict → law → feedforward, posture, limit → Command
 
-Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.parts`. `Servo`
-is the pure composition, for one run or many side by side; `ServoController` holds the state of one run.
+Any estimator works with any law. Which of them are known by name is written in `servobench.controllers.parts`; the
+stages are the aids (`servobench.controllers.aids`). `Servo` is the pure composition, for one run or many side by side;
+`ServoController` holds the state of one run.
 """
 
 from __future__ import annotations
@@ -12,65 +13,55 @@ from typing import Any, NamedTuple, final
 
 import numpy as np
 
-from servobench.controllers.controller import Controller, Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.controllers.aids import AidsConfig
+from servobench.controllers.controller import Controller, Delays, Diagnostics, RobotKnowledge
+from servobench.controllers.estimate import Estimate
+from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial import InitialJacobian
 from servobench.controllers.laws.law import Law
-from servobench.controllers.laws.prediction import Predictor, shifted
+from servobench.controllers.stages.estimation import Estimation, EstimationState
+from servobench.controllers.stages.finish import Finish
+from servobench.controllers.stages.pairing import PairState
+from servobench.controllers.stages.prediction import Past, Predictor, shifted
 from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import ControllerDiverged
-from servobench.plant.lanes import branch, norm
+from servobench.plant.lanes import branch
 from servobench.plant.signals import BoolArray, Command, Observation
-
-
-class Seen(NamedTuple):
-    """What was seen with the last valid feature.
-
-    Attributes:
-        time: (...) [s]; NaN before.
-        joint_position: (..., n) [rad].
-        feature: (..., m).
-        jacobian: Ĵ, (..., m, n), which predicts the next motion; NaN before.
-    """
-
-    time: FloatArray
-    joint_position: FloatArray
-    feature: FloatArray
-    jacobian: FloatArray
 
 
 class ServoState(NamedTuple):
     """The state of a composed controller.
 
     Attributes:
-        estimator: of the estimator.
+        estimation: of the pair and estimate stages.
         law: of the law.
         initial: of the provider of the initial Jacobian.
         predictor: of the predict stage; None without one.
         ready: (...), whether the initial Jacobian is known.
-        jacobian: (..., m, n), the one of the last step; NaN before.
-        seen: with the last valid feature.
-        unexplained: (...), ‖Δy − ĴΔq‖ of the last motion, with Ĵ from before its update; NaN before.
+        limited: (...), whether the last command was limited.
     """
 
-    estimator: Any
+    estimation: EstimationState
     law: Any
     initial: Any
     predictor: Any
     ready: BoolArray
-    jacobian: FloatArray
-    seen: Seen
-    unexplained: FloatArray
+    limited: BoolArray
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Ĵ of the last step, (..., m, n), m/rad; NaN before."""
+        return self.estimation.jacobian
 
 
 @final
 class Servo:
     """Estimates the Jacobian from observed motions and commands with the estimate.
 
-    Each step learns from the motion between the last valid feature and the present one, so that Δy and Δq span the same
-    gap when frames are lost; a step without a valid feature learns nothing. Joint positions are read without delay, so
-    under camera latency Δy is that of a motion a little earlier: while the arm speeds up or slows down, an estimator is
-    misled. While the initial Jacobian is probed, the probing moves are the command; estimator and law are not used.
+    Each motion spans the gap between two valid features, so that Δy and Δq belong together when frames are lost.
+    Without aids joint positions are taken as read, so under camera latency Δy is that of a motion a little earlier:
+    while the arm speeds up or slows down, an estimator is misled. While the initial Jacobian is probed, the probing
+    moves are the command; estimator and law are not used.
     """
 
     def __init__(
@@ -79,7 +70,7 @@ class Servo:
         law: Law[Any],
         initial: InitialJacobian[Any],
         knowledge: RobotKnowledge,
-        predictor: Predictor | None = None,
+        aids: AidsConfig | None = None,
     ) -> None:
         """Compose a controller.
 
@@ -87,34 +78,32 @@ class Servo:
             estimator: estimates the Jacobian.
             law: commands by the estimate.
             initial: provides the first Jacobian.
-            knowledge: of the robot.
-            predictor: the predict stage; None: the law gets what is measured.
+            knowledge: of the robot; it has the true delays where they are to be used instead of those of the aids.
+            aids: the stages around estimator and law; None for none.
 
         Raises:
-            ValueError: a predictor for a law that predicts itself.
+            ValueError: an aid that the estimator or the law brings itself.
         """
-        if predictor is not None and "predict" in law.owns:
-            raise ValueError(f"predictor must be None for {type(law).__name__}, which predicts itself")
-        self.estimator, self.law, self.initial = estimator, law, initial
-        self.knowledge, self.predictor = knowledge, predictor
+        aids = aids or AidsConfig()
+        predicts = aids.delay != "ignored" or aids.response != "ignored" or aids.filter
+        if predicts and "predict" in law.owns:
+            raise ValueError(f"aids: {type(law).__name__} predicts by itself; leave delay, response and filter off")
+        delays = knowledge.true_delays or Delays(aids.latency, aids.command_delay, aids.lag)
+        self.knowledge, self.law, self.initial = knowledge, law, initial
+        self.estimation = Estimation(estimator, knowledge, aids, delays)
+        self.predictor = Predictor(aids, knowledge.spec.period, delays) if predicts else None
+        self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
+        self._feeds_forward, self._turns = aids.feedforward, law.in_model_frame and aids.model == "map"
+        self._rows = 1 + knowledge.preview if "preview" in law.owns else 1 + int(aids.feedforward)
 
     def start(self, observation: Observation) -> ServoState:
         """Return the state at the start of a run that begins with `observation`."""
         initial = self.initial.start(observation)
         lead, (m, n) = observation.feature.shape[:-1], (self.knowledge.spec.m, self.knowledge.spec.n)
-        unknown = np.full((*lead, m, n), np.nan)
         known = self.initial.immediate
         first = self.initial.jacobian(initial) if known else np.zeros((*lead, m, n))
-        return ServoState(
-            estimator=self.estimator.start(first),
-            law=self.law.start(observation),
-            initial=initial,
-            predictor=None if self.predictor is None else self.predictor.start(observation),
-            ready=np.full(lead, known)[()],
-            jacobian=unknown,
-            seen=Seen(np.full(lead, np.nan)[()], observation.joint_position, observation.feature, unknown),
-            unexplained=np.full(lead, np.nan)[()],
-        )
+        ready, no = np.full(lead, known)[()], np.full(lead, False)[()]
+        return self._begin(ServoState(None, None, initial, None, ready, no), observation, first)  # type: ignore[arg-type]
 
     def step(self, state: ServoState, observation: Observation, reference: FloatArray) -> tuple[ServoState, FloatArray]:
         """Return the new state and the joint velocity (..., n) [rad/s] for the period that begins now.
@@ -131,74 +120,83 @@ class Servo:
 
     def _probe(self, both: tuple[ServoState, FloatArray], observation: Observation) -> tuple[ServoState, FloatArray]:
         initial, velocity, done = self.initial.step(both[0].initial, observation)
-        state = branch(done, self._begin, both[0]._replace(initial=initial), observation)
+        state = branch(done, self._end_probing, both[0]._replace(initial=initial), observation)
         return state, velocity
 
-    def _begin(self, state: ServoState, observation: Observation) -> ServoState:
+    def _end_probing(self, state: ServoState, observation: Observation) -> ServoState:
+        ready = np.full(observation.feature.shape[:-1], True)
+        return self._begin(state._replace(ready=ready), observation, self.initial.jacobian(state.initial))
+
+    def _begin(self, state: ServoState, observation: Observation, jacobian: FloatArray) -> ServoState:
         return state._replace(
-            estimator=self.estimator.start(self.initial.jacobian(state.initial)),
+            estimation=self.estimation.start(observation, jacobian),
             law=self.law.start(observation),
             predictor=None if self.predictor is None else self.predictor.start(observation),
-            ready=np.full(observation.feature.shape[:-1], True),
         )
 
     def _act(
         self, both: tuple[ServoState, FloatArray], observation: Observation, reference: FloatArray
     ) -> tuple[ServoState, FloatArray]:
         state, _ = both
-        learned = state.estimator, state.unexplained
-        learns = observation.feature_valid & (state.seen.time < observation.time)
-        estimator, unexplained = branch(learns, self._learn, learned, state.seen, observation, reference[..., 0, :])
-        estimate = self.estimator.estimate(estimator, observation.joint_position)
-        J = estimate.jacobian
+        estimation = self.estimation.update(state.estimation, observation, reference[..., 0, :])
+        J = estimation.jacobian
         if not is_finite(J):
             raise ControllerDiverged(f"jacobian is not finite at {observation.time:.5g} s: {J.tolist()}")
-        law, predictor = state.law, state.predictor
-        if self.predictor is None:
-            law, u = self.law.command(law, estimate, observation, reference)
-        else:
-            predictor, bound = self.predictor.predict(predictor, estimate, observation)
+        predictor, ahead, later = state.predictor, observation, reference
+        if self.predictor is not None:
+            past = self._past(self.predictor, estimation.learned.pair, observation)
+            predictor, bound = self.predictor.predict(predictor, J, past, observation)
             ahead = observation.seen_as(bound.joint_position, bound.feature)
-            law, u = self.law.command(law, estimate, ahead, shifted(reference, bound.lead, reference.shape[-2]))
-            predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)
-        if not is_finite(u):
+            later = shifted(reference, bound.lead, self._rows)
+        forward: FloatArray = np.zeros(())
+        if self._feeds_forward:
+            forward = later[..., 1, :] - later[..., 0, :]
+        law, wanted = self._command(state, estimation, ahead, later)
+        if not is_finite(wanted):
             raise ControllerDiverged(
-                f"joint_velocity is not finite at {observation.time:.5g} s: {u.tolist()}, by the Jacobian {J.tolist()}"
+                f"joint_velocity is not finite at {observation.time:.5g} s: {wanted.tolist()}, by the Jacobian "
+                f"{J.tolist()}"
             )
-        law = self.law.noted(law, u)
-        lead = observation.feature.shape[:-1]
-        time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
-        now = Seen(time, observation.joint_position, observation.feature, J)
-        seen = branch(observation.feature_valid, _newer, state.seen, now)
-        return ServoState(estimator, law, state.initial, predictor, state.ready, J, seen, unexplained), u
+        u, limited = self.finish.finish(wanted, J, ahead.joint_position, forward)
+        law = self.law.noted(law, u, limited)
+        if self.predictor is not None:
+            predictor = self.predictor.note(predictor, u * self.knowledge.spec.period)
+        return ServoState(estimation, law, state.initial, predictor, state.ready, limited), u
 
-    def _learn(
-        self, learned: tuple[Any, FloatArray], seen: Seen, observation: Observation, desired: FloatArray
+    def _past(self, predictor: Predictor, pair: PairState, observation: Observation) -> Past:
+        pairing = self.estimation.pairing
+        if pairing is None:
+            raise ValueError("a predictor needs the pair stage, which looks back")
+        exposed, before = pairing.exposed(pair)
+        span = observation.joint_position - pair.past[..., predictor.span, : self.knowledge.spec.n]
+        return Past(pairing.delay(pair), exposed, before, span)
+
+    def _command(
+        self, state: ServoState, estimation: EstimationState, ahead: Observation, reference: FloatArray
     ) -> tuple[Any, FloatArray]:
-        motion = Motion(
-            joint_position=seen.joint_position,
-            joint_step=observation.joint_position - seen.joint_position,
-            feature_step=observation.feature - seen.feature,
-            error=desired - observation.feature,
-            duration=observation.time - seen.time,
-        )
-        unexplained = norm(motion.feature_step - np.matvec(seen.jacobian, motion.joint_step))
-        return self.estimator.update(learned[0], motion), unexplained
+        """Return the law's new state and the joint velocity that it wants, (..., n), rad/s.
+
+        A law that was trained on the nominal model works in its frame: what is seen is turned by the map's rotation.
+        """
+        J = estimation.jacobian
+        if self._turns:
+            R = estimation.learned.pair.rotation
+            J, reference = R.mT @ J, reference @ R
+            ahead = ahead.seen_as(ahead.joint_position, np.vecmat(ahead.feature, R))
+        return self.law.command(state.law, Estimate(J), ahead, reference)
 
     def diagnostics(self, state: ServoState) -> Diagnostics:
-        """Return those of estimator and law, with `probing` and `jacobian_prediction_error`.
+        """Return those of all stages, with `probing`, `saturated`, and `lead` [s] of the predict stage.
 
-        `jacobian_prediction_error` is ‖Δy − ĴΔq‖ in m of the last motion, with Ĵ from before its update; NaN until
-        something has moved. `probing` is 1 while the initial Jacobian is being measured.
+        `probing` is 1 while the initial Jacobian is being measured.
         """
-        own = {"probing": 1.0 - state.ready, "jacobian_prediction_error": state.unexplained}
+        own: dict[str, Any] = {"probing": 1.0 - state.ready, "saturated": state.limited}
+        if self.predictor is not None:
+            own["lead"] = state.predictor.response.lead * self.knowledge.spec.period
+        estimation = self.estimation.diagnostics(state.estimation)
         if not np.any(state.ready):
-            return own
-        return {**own, **self.estimator.diagnostics(state.estimator), **self.law.diagnostics(state.law)}
-
-
-def _newer(seen: Seen, now: Seen) -> Seen:
-    return now
+            return {**own, "jacobian_prediction_error": estimation["jacobian_prediction_error"]}
+        return {**own, **estimation, **self.law.diagnostics(state.law)}
 
 
 @final

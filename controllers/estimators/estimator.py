@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 from servobench.controllers.controller import Diagnostics
-from servobench.controllers.estimate import Estimate
 from servobench.plant.checks import FloatArray
 
 State = TypeVar("State")
+MOTION_TIME: Final = 0.05  # [s] that a motion lasts at least, whatever the control period: what is learned per second
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,6 +27,7 @@ class Motion:
         feature_step: Δy, (..., m), m.
         error: e = y_ref − y at the end of the motion, (..., m), m.
         duration: (...), s.
+        noise: (...), standard deviation of the feature per axis, m; None where it is not identified.
     """
 
     joint_position: FloatArray
@@ -34,10 +35,17 @@ class Motion:
     feature_step: FloatArray
     error: FloatArray
     duration: FloatArray
+    noise: FloatArray | None = None
 
 
 class Estimator(ABC, Generic[State]):
-    """Estimates J = ∂y/∂q from motions; any estimator works with any law."""
+    """Estimates J = ∂y/∂q from motions; any estimator works with any law.
+
+    Attributes:
+        brings_model: whether it knows a Jacobian for every joint position by itself, so that no other model is added.
+    """
+
+    brings_model: ClassVar[bool] = False
 
     @abstractmethod
     def start(self, jacobian: FloatArray) -> State:
@@ -60,10 +68,6 @@ class Estimator(ABC, Generic[State]):
         one_matrix: Any = state
         jacobian: FloatArray = one_matrix.J
         return jacobian
-
-    def estimate(self, state: State, joint_position: FloatArray) -> Estimate:
-        """Return what the law needs to know; an estimator of delay or noise overrides this."""
-        return Estimate(self.jacobian(state, joint_position))
 
     def diagnostics(self, state: State) -> Diagnostics:
         """Return named numbers (...) about the last update, if there are any; for the log only."""

@@ -54,6 +54,8 @@ class TrueState(NamedTuple):
 class TrueEstimator(Estimator[TrueState]):
     """Ĵ(k) = J(q(k)), the Jacobian of the true robot."""
 
+    brings_model = True
+
     def __init__(self, config: TrueConfig, knowledge: RobotKnowledge) -> None:
         """Take the true Jacobian.
 

@@ -11,8 +11,8 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple, final
+from collections.abc import Callable, Mapping
+from typing import ClassVar, Literal, NamedTuple, final
 
 import numpy as np
 
@@ -29,12 +29,16 @@ from servobench.plant.signals import BoolArray
 class KalmanConfig:
     """Settings of the Kalman filter."""
 
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "process_deviation": "walk, per root of a second: process_deviation / sqrt(0.05 s)"
+    }
+
     initial_deviation: Positive = 0.05
     """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""
-    process_deviation: NonNegative = 0.02
-    """[m/rad] of an entry's walk over one motion; tuned on mismatched kinematic plants."""
+    walk: NonNegative = 0.089443
+    """[m/rad/√s] deviation of an entry after a second of motion; tuned on mismatched kinematic plants."""
     feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis; R = 2σ² I."""
+    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
     min_joint_step: NonNegative = 0.002
     """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     form: Literal["split", "full"] = "split"
@@ -75,8 +79,8 @@ def kalman_update(
         P: its covariance, (..., s, s).
         H: measurement matrix, (..., m, s).
         z: measurement, (..., m).
-        Q: process covariance, (s, s).
-        R: measurement covariance, (m, m).
+        Q: process covariance, (..., s, s).
+        R: measurement covariance, (..., m, m).
 
     Returns:
         The new state and covariance.
@@ -90,7 +94,7 @@ def kalman_update(
 
 
 def split_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: float, r: float
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Do the same for P = I_m ⊗ P_n, Q = q I, R = r I: all rows of J share the gain K (n,).
 
@@ -101,18 +105,18 @@ def split_update(
         P: covariance of each of its rows, (..., n, n), (m/rad)².
         joint_step: Δq, (..., n), rad.
         feature_step: Δy, (..., m), m.
-        q: variance of the walk, (m/rad)².
-        r: variance of Δy, m².
+        q: variance of the walk, (...), (m/rad)².
+        r: variance of Δy, (...), m².
 
     Returns:
         The new Jacobian and covariance.
     """
-    P = plus_diagonal(P, q)
+    P = plus_diagonal(P, q[..., None])
     PH = np.matvec(P, joint_step)
     K = PH / (np.vecdot(joint_step, PH) + r)[..., None]
     # (I − KΔqᵀ) P (I − KΔqᵀ)ᵀ + r K Kᵀ with A = P − K PHᵀ multiplied out: A − (A Δq) Kᵀ + r K Kᵀ
     A = P - outer(K, PH)
-    P = A + outer(r * K - np.matvec(A, joint_step), K)
+    P = A + outer(r[..., None] * K - np.matvec(A, joint_step), K)
     return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
 
 
@@ -159,8 +163,8 @@ class KalmanEstimator(Estimator[KalmanState]):
     ) -> None:
         """Take the settings and what the form "full" calls, as `full_update`; nothing about the robot is needed."""
         self._config, self._full_update = config, update
-        self._q = config.process_deviation**2
-        self._r = 2.0 * config.feature_noise**2
+        self._walk = config.walk**2
+        self._noise: FloatArray = np.asarray(config.feature_noise)[()]
 
     def start(self, jacobian: FloatArray) -> KalmanState:
         """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance."""
@@ -180,11 +184,13 @@ class KalmanEstimator(Estimator[KalmanState]):
 
     def _correct(self, state: KalmanState, motion: Motion) -> KalmanState:
         dq, dy = motion.joint_step, motion.feature_step
+        noise: FloatArray = self._noise if motion.noise is None else motion.noise
+        q, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
         if self._config.form == "split":
-            J, P = split_update(state.J, state.P, dq, dy, q=self._q, r=self._r)
+            J, P = split_update(state.J, state.P, dq, dy, q=q, r=r)
             cholesky_of(P)
         else:
-            Q, R = self._q * np.eye(state.P.shape[-1]), self._r * np.eye(state.J.shape[-2])
+            Q, R = (x[..., None, None] * np.eye(size) for x, size in ((q, state.P.shape[-1]), (r, state.J.shape[-2])))
             J, P = self._full_update(state.J, state.P, dq, dy, Q=Q, R=R)
         return state._replace(J=J, P=P)
 

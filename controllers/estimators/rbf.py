@@ -17,6 +17,8 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import norm
 from servobench.plant.settings import Count, NonNegative, Positive, settings
 
+USUAL_NOISE = 0.001  # [m] at which ε holds
+
 
 @settings
 class RbfConfig:
@@ -27,7 +29,8 @@ class RbfConfig:
     k2: Annotated[Positive, Lt(2.0)] = 0.5
     """[1] k₂, step size."""
     epsilon: NonNegative = 1e-3
-    """[rad²] ε, joint motion (squared, summed over the window) below which learning fades."""
+    """[rad²] ε, joint motion (squared, summed over the window) below which learning fades. It holds at `USUAL_NOISE`;
+    where the noise is identified it grows with its variance."""
 
 
 def window_step(
@@ -104,6 +107,8 @@ class RbfEstimator(Estimator[RbfState]):
     there; the sum in α₂ runs over the same window as the gradient (the paper's has one term more).
     """
 
+    brings_model = True
+
     def __init__(self, config: RbfConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
         """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
@@ -126,11 +131,10 @@ class RbfEstimator(Estimator[RbfState]):
 
     def update(self, state: RbfState, motion: Motion) -> RbfState:
         """Learn from the window that `motion` completes."""
-        return self.learn(state, motion, self._config.epsilon)
-
-    def learn(self, state: RbfState, motion: Motion, epsilon: npt.ArrayLike) -> RbfState:
-        """Do the same with another ε, (...), rad²."""
         config, network = self._config, self._network
+        epsilon: FloatArray | float = config.epsilon
+        if motion.noise is not None:
+            epsilon = epsilon * (motion.noise / USUAL_NOISE) ** 2
         theta = self._features.at(motion.joint_position)[..., None, :, :]
         joint_steps, feature_steps = motion.joint_step[..., None, :], motion.feature_step[..., None, :]
         if config.window > 1:

@@ -51,6 +51,8 @@ class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
     small: n₃ Σ Δq_i² ‖θ_i‖² / duration < 2 for the s-part alone.
     """
 
+    brings_model = True
+
     def __init__(self, config: RbfLyapunovConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
         """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config

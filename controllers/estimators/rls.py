@@ -8,17 +8,17 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, final
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple, final
 
 import numpy as np
-from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm, outer, transposed
-from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.settings import NonNegative, Positive, PositiveOrInfinite, settings
 from servobench.plant.signals import BoolArray
 
 
@@ -26,8 +26,10 @@ from servobench.plant.signals import BoolArray
 class RlsConfig:
     """Settings of recursive least squares."""
 
-    forgetting: Annotated[Positive, Le(1.0)] = 0.95
-    """[1] λ per motion; remembers some 20 motions."""
+    RENAMED: ClassVar[Mapping[str, str]] = {"forgetting": "memory, in seconds: -0.05 s / ln(forgetting)"}
+
+    memory: PositiveOrInfinite = 0.975
+    """[s] of motion that is remembered: λ = exp(−duration/memory), 0.95 for a motion of 0.05 s."""
     initial_covariance: Positive = 100.0
     """[1/rad²] P₀ = p₀ I: Ĵ₀ weighs as much as a motion of 0.1 rad of each joint."""
     covariance_limit: Positive = 100.0
@@ -45,7 +47,7 @@ class RlsConfig:
 
 
 def rls_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, forgetting: float
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, forgetting: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Correct by one motion, P in Joseph form.
 
@@ -54,7 +56,7 @@ def rls_update(
         P: (..., n, n), 1/rad².
         joint_step: Δq, (..., n), rad.
         feature_step: Δy, (..., m), m.
-        forgetting: λ.
+        forgetting: λ, (...).
 
     Returns:
         The new Jacobian and P.
@@ -62,7 +64,7 @@ def rls_update(
     PH = np.matvec(P, joint_step)
     K = PH / (forgetting + np.vecdot(joint_step, PH))[..., None]
     A = P - outer(K, PH)
-    P = (A + outer(forgetting * K - np.matvec(A, joint_step), K)) / forgetting
+    P = (A + outer(forgetting[..., None] * K - np.matvec(A, joint_step), K)) / forgetting[..., None, None]
     return J + outer(feature_step - np.matvec(J, joint_step), K), (P + transposed(P)) / 2
 
 
@@ -103,7 +105,7 @@ class RlsEstimator(Estimator[RlsState]):
 
     def _correct(self, state: RlsState, motion: Motion) -> RlsState:
         config, dq, dy = self._config, motion.joint_step, motion.feature_step
-        J, P = rls_update(state.J, state.P, dq, dy, forgetting=config.forgetting)
+        J, P = rls_update(state.J, state.P, dq, dy, forgetting=np.exp(-np.asarray(motion.duration) / config.memory))
         P = P * np.minimum(1.0, config.covariance_limit / _mean_diagonal(P))[..., None, None]
         cholesky_of(P)
         return state._replace(J=J, P=P)

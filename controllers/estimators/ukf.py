@@ -15,9 +15,10 @@ multiples of the identity it even splits by rows: the form "split" gives the sam
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -32,12 +33,14 @@ from servobench.plant.settings import NonNegative, Positive, settings
 class UkfConfig:
     """Settings of the unscented Kalman filter."""
 
+    RENAMED: ClassVar[Mapping[str, str]] = KalmanConfig.RENAMED
+
     initial_deviation: Positive = 0.05
     """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""
-    process_deviation: NonNegative = 0.02
-    """[m/rad] of an entry's walk over one motion; tuned on mismatched kinematic plants."""
+    walk: NonNegative = 0.089443
+    """[m/rad/√s] deviation of an entry after a second of motion; tuned on mismatched kinematic plants."""
     feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis; R = 2σ² I."""
+    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
     min_joint_step: NonNegative = 0.002
     """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     alpha: Positive = 1.0
@@ -93,8 +96,8 @@ def unscented_update(
         P: covariance of vec(J) by rows, (..., mn, mn), (m/rad)².
         joint_step: Δq, (..., n), rad.
         feature_step: Δy, (..., m), m.
-        Q: process covariance, (mn, mn), (m/rad)².
-        R: covariance of Δy, (m, m), m².
+        Q: process covariance, (..., mn, mn), (m/rad)².
+        R: covariance of Δy, (..., m, m), m².
         weights: from `sigma_weights` with s = mn.
 
     Returns:
@@ -130,6 +133,6 @@ def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) ->
         weights = sigma_weights(J.shape[-2] * J.shape[-1], config.alpha, config.beta, config.kappa)
         return unscented_update(J, *arguments, **noise, weights=weights)
 
-    walk = config.initial_deviation, config.process_deviation, config.feature_noise, config.min_joint_step
+    walk = config.initial_deviation, config.walk, config.feature_noise, config.min_joint_step
     form: Literal["split", "full"] = "split" if config.form == "split" else "full"
     return KalmanEstimator(KalmanConfig(*walk, form), knowledge, update)

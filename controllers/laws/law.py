@@ -12,9 +12,9 @@ from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimate import Estimate
 from servobench.plant.checks import FloatArray
-from servobench.plant.signals import Observation
+from servobench.plant.signals import BoolArray, Observation
 
-Stage: TypeAlias = Literal["predict", "posture", "limit"]
+Stage: TypeAlias = Literal["predict", "preview", "posture", "limit"]
 State = TypeVar("State")
 
 
@@ -22,10 +22,13 @@ class Law(ABC, Generic[State]):
     """Turns the error into a joint velocity with the help of an estimate; any law works with any estimator.
 
     Attributes:
-        owns: the stages of the chain that the law brings itself, so that a controller may not add another one.
+        owns: the stages of the chain that the law brings itself, so that a controller may not add another one;
+            "preview": it looks at more of the reference than the present row.
+        in_model_frame: whether it was trained on the nominal model, so that it works in that model's frame.
     """
 
-    owns: ClassVar[frozenset[Stage]] = frozenset({"limit"})
+    owns: frozenset[Stage] = frozenset()
+    in_model_frame: ClassVar[bool] = False
 
     @abstractmethod
     def start(self, observation: Observation) -> State:
@@ -39,7 +42,7 @@ class Law(ABC, Generic[State]):
 
         Args:
             state: after the last command.
-            estimate: the Jacobian, and delay and noise where they are identified.
+            estimate: the Jacobian.
             observation: what is seen now.
             reference: (..., 1 + preview, m): row 0 is now, the rest are the next control instants.
 
@@ -51,14 +54,15 @@ class Law(ABC, Generic[State]):
             RunFault: it cannot go on in at least one lane.
         """
 
-    def noted(self, state: State, joint_velocity: FloatArray) -> State:
+    def noted(self, state: State, joint_velocity: FloatArray, limited: BoolArray) -> State:
         """Return the state after a velocity left the chain; a law that remembers its commands overrides this.
 
         Args:
             state: after the command of this period.
             joint_velocity: what is sent to the robot, after all stages, (..., n), rad/s.
+            limited: (...), whether it had to be limited.
         """
-        del joint_velocity
+        del joint_velocity, limited
         return state
 
     @abstractmethod

@@ -8,31 +8,35 @@ newest measured error is used. Along a singular value σ of Ĵ the loop gain a p
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, final
+import math
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple, final
 
 import numpy as np
-from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law
-from servobench.controllers.laws.limit import largest_excess
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import plus_diagonal, transposed
-from servobench.plant.settings import Positive, settings
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.settings import Positive, PositiveOrInfinite, settings
+from servobench.plant.signals import Observation
 
 
 @settings
 class MfacConfig:
     """Settings of the MFAC law."""
 
-    step_factor: Annotated[Positive, Le(1.0)] = 0.15
-    """[1] ρ; not the paper's 1: with three periods of delay a gain of 0.44 per period is unstable."""
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "step_factor": "gain, in 1/s: -ln(1 - step_factor) / period",
+        "feedforward": "aids.feedforward",
+    }
+
+    gain: PositiveOrInfinite = 3.25
+    """[1/s] K: ρ = 1 − exp(−K dt), 0.15 at 20 Hz; not the paper's ρ = 1 (`inf`), which three periods of delay make
+    unstable."""
     step_weight: Positive = 0.02
     """[m²/rad²] λ; halves the gain where a singular value is 0.14 m/rad."""
-    feedforward: bool = False
-    """Add the reference's next step; needs a preview of at least 1; not in the paper."""
 
 
 def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: float) -> FloatArray:
@@ -52,47 +56,29 @@ def mfac_step(J: FloatArray, e: FloatArray, step_factor: float, step_weight: flo
 
 
 class MfacState(NamedTuple):
-    """Whether the last command was limited, (...); the law itself has no state."""
-
-    saturated: BoolArray
+    """The law has no state."""
 
 
 @final
 class MfacLaw(Law[MfacState]):
-    """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 45), limited as a whole so that the direction stays.
-
-    With `feedforward` the motion of the reference over the coming period is added without the factor ρ:
-    dq = Ĵᵀ (λI + ĴĴᵀ)⁻¹ (ρ e + y_ref(k+1) − y_ref(k)).
-    """
+    """u = ρ Ĵᵀ (λI + ĴĴᵀ)⁻¹ e / dt (eq. 45)."""
 
     def __init__(self, config: MfacConfig, knowledge: RobotKnowledge) -> None:
-        """Take settings, limits and period.
-
-        Raises:
-            ValueError: a feedforward without a preview.
-        """
-        if config.feedforward and knowledge.preview < 1:
-            raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
-        self._config = config
-        self._limit = knowledge.spec.joint_velocity_limit
+        """Take settings and period."""
         self._dt = knowledge.spec.period
+        self._share, self._weight = 1.0 - math.exp(-config.gain * self._dt), config.step_weight
 
     def start(self, observation: Observation) -> MfacState:
-        """No command was limited yet."""
-        return MfacState(np.full(observation.feature.shape[:-1], False))
+        """Nothing is remembered."""
+        return MfacState()
 
     def command(
         self, state: MfacState, estimate: Estimate, observation: Observation, reference: FloatArray
     ) -> tuple[MfacState, FloatArray]:
         """Return u, (..., n), rad/s; see `Law.command`."""
-        config, J = self._config, estimate.jacobian
-        dq = mfac_step(J, reference[..., 0, :] - observation.feature, config.step_factor, config.step_weight)
-        if config.feedforward:
-            dq = dq + mfac_step(J, reference[..., 1, :] - reference[..., 0, :], 1.0, config.step_weight)
-        wanted = dq / self._dt
-        excess = largest_excess(wanted, self._limit)
-        return MfacState(excess > 1.0), np.asarray(wanted / np.maximum(excess, 1.0)[..., None])
+        e = reference[..., 0, :] - observation.feature
+        return state, mfac_step(estimate.jacobian, e, self._share, self._weight) / self._dt
 
     def diagnostics(self, state: MfacState) -> Diagnostics:
-        """Return whether the last command was limited."""
-        return {"saturated": state.saturated}
+        """Return nothing."""
+        return {}

@@ -1,25 +1,25 @@
 """Resolved-rate control with a discrete PID on the error (eq. 43 of the paper, extended).
 
-    v(k) = K_p e(k) + K_i I(k) + K_d d(k) [+ ẏ_ref(k)],      u(k) = Ĵᵀ (ĴĴᵀ + δ²I)⁻¹ v(k)
+    v(k) = K_p e(k) + K_i I(k) + K_d d(k),      u(k) = Ĵᵀ (ĴĴᵀ + δ²I)⁻¹ v(k)
 
 with e = y_ref − y (..., m), its integral I and its filtered derivative d:
 
-    I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt),   ẏ_ref(k) = (y_ref(k+1) − y_ref(k)) / dt
+    I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt)
 
 K_i = K_d = 0 and δ = 0 is eq. 43 (and eq. 9), whose minus sign belongs to the paper's error y − y_ref.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, final
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.inverses import damped_inverse
 from servobench.controllers.laws.law import Law
-from servobench.controllers.laws.limit import largest_excess
+from servobench.controllers.stages.inverses import damped_inverse
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm
 from servobench.plant.settings import NonNegative, Positive, settings
@@ -29,6 +29,8 @@ from servobench.plant.signals import BoolArray, Observation
 @settings
 class PidConfig:
     """Settings of the PID law; the defaults damp a loop with three periods of delay at 20 Hz well."""
+
+    RENAMED: ClassVar[Mapping[str, str]] = {"feedforward": "aids.feedforward"}
 
     proportional_gain: Positive = 2.5
     """[1/s] K_p; a share K_p dt = 0.125 of the error per period, as fast as the default of `mfac`."""
@@ -40,8 +42,6 @@ class PidConfig:
     """[s] τ, time constant of the filtered derivative; two periods at 20 Hz."""
     damping: NonNegative = 0.02
     """[m/rad] δ, damping of the inverse; a tenth of the smallest singular value in a UR5's workspace."""
-    feedforward: bool = False
-    """Add the reference's own velocity; needs a preview of at least 1."""
 
 
 class PidState(NamedTuple):
@@ -52,61 +52,55 @@ class PidState(NamedTuple):
         derivative: d, (..., m), m/s.
         last_error: e of the last valid feature, (..., m), m.
         started: (...), whether there was a valid feature.
-        saturated: (...), whether the last command was limited.
+        integral_before: I of the period before, (..., m), m s.
     """
 
     integral: FloatArray
     derivative: FloatArray
     last_error: FloatArray
     started: BoolArray
-    saturated: BoolArray
+    integral_before: FloatArray
 
 
 @final
 class PidLaw(Law[PidState]):
-    """u = Ĵ⁺ (K_p e + K_i I + K_d d [+ ẏ_ref]), limited as a whole so that the direction stays.
+    """u = Ĵ⁺ (K_p e + K_i I + K_d d).
 
     Anti-windup by conditional integration: while the command is limited, the integral grows no further (it may shrink).
     Without a valid feature the integral and the derivative wait.
     """
 
     def __init__(self, config: PidConfig, knowledge: RobotKnowledge) -> None:
-        """Take settings, limits and period.
-
-        Raises:
-            ValueError: a feedforward without a preview.
-        """
-        if config.feedforward and knowledge.preview < 1:
-            raise ValueError(f"preview must be at least 1 for feedforward, got {knowledge.preview}")
+        """Take settings and period."""
         self._config = config
-        self._limit = knowledge.spec.joint_velocity_limit
         self._dt = knowledge.spec.period
 
     def start(self, observation: Observation) -> PidState:
         """Return zero integral and derivative."""
         zero, no = np.zeros(observation.feature.shape), np.full(observation.feature.shape[:-1], False)
-        return PidState(integral=zero, derivative=zero, last_error=zero, started=no, saturated=no)
+        return PidState(integral=zero, derivative=zero, last_error=zero, started=no, integral_before=zero)
 
     def command(
         self, state: PidState, estimate: Estimate, observation: Observation, reference: FloatArray
     ) -> tuple[PidState, FloatArray]:
         """Return the new state and u, (..., n), rad/s; see `Law.command`."""
-        config, before = self._config, state.integral
+        config = self._config
         e = reference[..., 0, :] - observation.feature
+        state = state._replace(integral_before=state.integral)
         state = branch(observation.feature_valid, self._learn, state, e)
         v = config.proportional_gain * e + config.integral_gain * state.integral
         v = v + config.derivative_gain * state.derivative
-        if config.feedforward:
-            v = v + (reference[..., 1, :] - reference[..., 0, :]) / self._dt
-        wanted = np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
-        excess = largest_excess(wanted, self._limit)
-        state = state._replace(saturated=excess > 1.0)
-        winds_up = state.saturated & (np.vecdot(state.integral, state.integral) >= np.vecdot(before, before))
-        return branch(winds_up, _hold_integral, state, before), wanted / np.maximum(excess, 1.0)[..., None]
+        return state, np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
+
+    def noted(self, state: PidState, joint_velocity: FloatArray, limited: BoolArray) -> PidState:
+        """Hold an integral that grows while the command is limited."""
+        integral, before = state.integral, state.integral_before
+        winds_up = limited & (np.vecdot(integral, integral) >= np.vecdot(before, before))
+        return branch(winds_up, _hold_integral, state)
 
     def diagnostics(self, state: PidState) -> Diagnostics:
-        """Return the norm of the integral, m s, and whether the command was limited."""
-        return {"integral_norm": norm(state.integral), "saturated": state.saturated}
+        """Return the norm of the integral, m s."""
+        return {"integral_norm": norm(state.integral)}
 
     def _learn(self, state: PidState, e: FloatArray) -> PidState:
         """Integrate and differentiate the error of a valid feature."""
@@ -118,5 +112,5 @@ class PidLaw(Law[PidState]):
         return state._replace(derivative=(tau * state.derivative + e - state.last_error) / (tau + self._dt))
 
 
-def _hold_integral(state: PidState, integral: FloatArray) -> PidState:
-    return state._replace(integral=integral)
+def _hold_integral(state: PidState) -> PidState:
+    return state._replace(integral=state.integral_before)

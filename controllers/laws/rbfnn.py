@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, NamedTuple, final
+from typing import Annotated, Literal, NamedTuple, final
 
 import numpy as np
 from annotated_types import Lt
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.inverses import project_to_row_space
-from servobench.controllers.laws.joint_response import pushed
 from servobench.controllers.laws.law import Law, Stage
-from servobench.controllers.laws.limit import largest_excess, scale_to_limit
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, sum_of_squares, update_step
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
+from servobench.controllers.stages.inverses import project_to_row_space
+from servobench.controllers.stages.joint_response import pushed
+from servobench.controllers.stages.limit import largest_excess
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm
 from servobench.plant.settings import Count, NonNegative, Positive, settings
@@ -51,7 +51,6 @@ class RbfnnState(NamedTuple):
         positions: q(k−1), q(k−2), …, (..., L_c, n), rad.
         predicted: e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them.
         step_size: α of the last update, (...).
-        wanted: (..., n), rad, the joint step of the last command before it was limited.
     """
 
     learned: FloatArray
@@ -59,7 +58,6 @@ class RbfnnState(NamedTuple):
     positions: FloatArray
     predicted: FloatArray
     step_size: FloatArray
-    wanted: FloatArray
 
 
 @final
@@ -85,7 +83,7 @@ class RbfnnLaw(Law[RbfnnState]):
     - Without a valid feature nothing is learned; the last error is held.
     """
 
-    owns: ClassVar[frozenset[Stage]] = frozenset({"posture", "limit"})
+    in_model_frame = True
 
     def __init__(self, config: RbfnnConfig, knowledge: RobotKnowledge, networks: TrainedNetworks) -> None:
         """Take the settings, the offline networks, limits, period and preview.
@@ -105,6 +103,8 @@ class RbfnnLaw(Law[RbfnnState]):
             )
         self._config = config
         self._network = network
+        own: tuple[Stage, ...] = ("posture", "preview") if config.preview else ("posture",)
+        self.owns = frozenset(own)
         self._period = spec.period
         self._step_limit = spec.joint_velocity_limit * spec.period
 
@@ -117,7 +117,6 @@ class RbfnnLaw(Law[RbfnnState]):
             positions=np.repeat(q[..., None, :], network.position_history, axis=-2),
             predicted=np.zeros((*lead, self._config.horizon, network.m)),
             step_size=np.zeros(lead),
-            wanted=np.zeros(q.shape),
         )
 
     def command(
@@ -138,12 +137,11 @@ class RbfnnLaw(Law[RbfnnState]):
         alpha, wanted = self._update(direction, ahead, observation.feature_valid)
         direction *= alpha[..., None, None, None]
         learned = np.add(learned, direction, out=direction)  # weights are large: no array more than is needed
-        step = scale_to_limit(wanted, self._step_limit)
         alpha = np.where(observation.feature_valid, alpha, state.step_size)[()]
-        new = RbfnnState(learned, errors, positions, ahead.errors, alpha, wanted)
-        return new, step / self._period
+        new = RbfnnState(learned, errors, positions, ahead.errors, alpha)
+        return new, wanted / self._period
 
-    def noted(self, state: RbfnnState, joint_velocity: FloatArray) -> RbfnnState:
+    def noted(self, state: RbfnnState, joint_velocity: FloatArray, limited: BoolArray) -> RbfnnState:
         """Return the state with the step that is sent among the commanded positions; see `Law.noted`."""
         if self._config.position == "measured":
             return state
@@ -151,14 +149,13 @@ class RbfnnLaw(Law[RbfnnState]):
         return state._replace(positions=pushed(state.positions, newest))
 
     def diagnostics(self, state: RbfnnState) -> Diagnostics:
-        """Return I_c = ½ Σ ‖e(k+t)‖² (eq. 15, m²), step size α, ‖e(k+T)‖ (m), norms of weights, saturation."""
+        """Return I_c = ½ Σ ‖e(k+t)‖² (eq. 15, m²), step size α, ‖e(k+T)‖ (m), norms of weights."""
         return {
             "criterion": 0.5 * sum_of_squares(state.predicted, 2),
             "step_size": state.step_size,
             "predicted_error": norm(state.predicted[..., -1, :]),
             "controller_weight_norm": np.sqrt(sum_of_squares(self._network.weights + state.learned, 3)),
             "learned_weight_norm": np.sqrt(sum_of_squares(state.learned, 3)),
-            "saturated": largest_excess(state.wanted, self._step_limit) > 1.0,
         }
 
     def _reference_steps(self, reference: FloatArray) -> FloatArray:

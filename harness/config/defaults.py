@@ -19,7 +19,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 
 def tuned_file(name: str) -> Traversable:
     """Return where the tuned values of the controller called `name` lie, if it has any."""
-    return files("servobench.controllers") / "tuned" / f"{name}.toml"
+    return files("servobench.controllers") / "tuned" / f"{name.replace(':', '.')}.toml"
 
 
 @cache

@@ -29,6 +29,7 @@ PLANTS = {
 MAPPED = "fmu:"
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
+FORMER_NAMES = {"rbfnn_mfac_plus": "map_mfac"}  # understood until 0.3.0
 
 
 _OFFERED: dict[str, ControllerEntry] = {}
@@ -83,6 +84,7 @@ def find_controller(name: str) -> ControllerEntry:
     Raises:
         ConfigurationError: no such controller, or a third party's that cannot be loaded.
     """
+    name = FORMER_NAMES.get(name, name)
     law, plus, estimator = name.partition("+")
     if plus:
         try:

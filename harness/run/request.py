@@ -59,10 +59,12 @@ class RunRequest:
     @property
     def run_id(self) -> str:
         """Return a name for the run that is the same wherever it is made, and fit for a file."""
-        mismatch, plant = (UNFIT_FOR_FILES.sub("_", str(name)) for name in (self.mismatch, self.plant))
+        mismatch, plant, controller = (
+            UNFIT_FOR_FILES.sub("_", str(name)) for name in (self.mismatch, self.plant, self.controller)
+        )
         noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
         latency = "" if self.latency_periods is None else f"-latency{self.latency_periods}"
-        return f"{plant}-{self.controller}-{self.task}-{mismatch}{noise}{latency}-{self.seed}"
+        return f"{plant}-{controller}-{self.task}-{mismatch}{noise}{latency}-{self.seed}"
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 
 from kit.toy import PERIOD, A, M, N, ToyArm
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.feature_filter import FeatureFilter
-from servobench.controllers.laws.joint_response import JointResponse, with_response
-from servobench.controllers.laws.limit import redistribute, scale_to_limit
-from servobench.controllers.laws.prediction import Predictor, shifted
-from servobench.controllers.noise_level import NoiseLevel
+from servobench.controllers.stages.feature_filter import FeatureFilter
+from servobench.controllers.stages.joint_response import JointResponse, with_response
+from servobench.controllers.stages.limit import redistribute, scale_to_limit
+from servobench.controllers.stages.noise_level import NoiseLevel
+from servobench.controllers.stages.prediction import Predictor, shifted
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
 

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from servobench.controllers.estimators.map_bank import map_update, near_rotation
 from servobench.controllers.rotation import nearest_rotation
+from servobench.controllers.stages.map_bank import map_update, near_rotation
 from servobench.plant.faults import FilterDiverged
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from servobench.controllers.noise_level import NoiseLevel
+from servobench.controllers.stages.noise_level import NoiseLevel
 
 
 @pytest.mark.parametrize("true", [0.0003, 0.001, 0.004])

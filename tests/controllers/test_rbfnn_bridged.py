@@ -10,12 +10,12 @@ from kit.toy import KNOWLEDGE, LIMIT, PERIOD, PREVIEW, A, Commanding, M, N, ToyA
 from servobench.controllers.estimate import MAX_DELAY, Estimate
 from servobench.controllers.estimators.rbf_aligned import RbfAlignedConfig, RbfAlignedEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
-from servobench.controllers.laws.inverses import damped_inverse
 from servobench.controllers.laws.learned_correction import LearnedCorrection
 from servobench.controllers.laws.rbfnn_bridged import RbfnnBridgedConfig, RbfnnBridgedLaw
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, update_step
 from servobench.controllers.networks.rbf import ControllerNetwork
 from servobench.controllers.servo import Servo, ServoController
+from servobench.controllers.stages.inverses import damped_inverse
 
 TURN = Rotation.from_rotvec(np.radians(100.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
 

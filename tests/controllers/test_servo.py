@@ -14,8 +14,8 @@ from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.controllers.laws.prediction import Prediction, Predictor
 from servobench.controllers.servo import Servo, ServoController
+from servobench.controllers.stages.prediction import Prediction, Predictor
 from servobench.plant.faults import ControllerDiverged
 
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])

@@ -11,7 +11,6 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, Stage
-from servobench.controllers.laws.limit import scale_to_limit
 from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import (
     UnlimitedPlan,
@@ -25,11 +24,12 @@ from servobench.controllers.laws.mpc.limits import exceeds, joint_bounds, view_r
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver
 from servobench.controllers.laws.mpc.state import MpcState, Plan
 from servobench.controllers.laws.preview import check_preview, sampled
+from servobench.controllers.stages.limit import scale_to_limit
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.faults import SolverFailed
 from servobench.plant.lanes import branch, lane_by_lane, norm, transposed, where
 from servobench.plant.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
-from servobench.plant.signals import Observation
+from servobench.plant.signals import BoolArray, Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
 
@@ -115,8 +115,6 @@ class MpcLaw(Law[MpcState]):
     already violated may not get worse, so that noise alone never makes the program infeasible.
     """
 
-    owns: ClassVar[frozenset[Stage]] = frozenset({"predict", "limit"})
-
     def __init__(self, config: MpcConfig, knowledge: RobotKnowledge) -> None:
         """Build the quadratic program.
 
@@ -131,6 +129,8 @@ class MpcLaw(Law[MpcState]):
         if config.view_tangent and spec.m != 3:
             raise ValueError(f"view_tangent needs the 3 features x, y, z, got {spec.m} features")
         self._config, self._spec, self._blocks = config, spec, blocks
+        own: dict[Stage, bool] = {"limit": True, "preview": config.use_preview, "predict": config.delay > 0.0}
+        self.owns = frozenset(stage for stage, brought in own.items() if brought)
         self._places, self._to_come = blocks.places(config.delay), bridging_shares(config.delay, spec.period)[:, None]
         constant, horizon = config.mode == "constant", blocks.count
         weight = as_vector("joint_weight", config.joint_weight or np.ones(spec.n), spec.n)
@@ -200,7 +200,7 @@ class MpcLaw(Law[MpcState]):
         final = error + ahead[..., -1, :]
         return MpcState(state.sent, state.last, fallbacks, J, targets, final, plan), velocity
 
-    def noted(self, state: MpcState, joint_velocity: FloatArray) -> MpcState:
+    def noted(self, state: MpcState, joint_velocity: FloatArray, limited: BoolArray) -> MpcState:
         """Return the state with the step that is sent; see `Law.noted`."""
         last = joint_velocity * self._spec.period
         return state._replace(sent=np.concatenate([state.sent, last[..., None, :]], axis=-2)[..., 1:, :], last=last)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.controllers.laws.inverses import damped_inverse
+from servobench.controllers.stages.inverses import damped_inverse
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch
 from servobench.plant.signals import BoolArray

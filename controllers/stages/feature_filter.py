@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.controllers.noise_level import NoiseLevel
+from servobench.controllers.estimators.estimator import MOTION_TIME
+from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch
 
-REST_DRIFT = 1e-4  # [m] r, process noise of z per period at rest
+REST_DRIFT = 4.472136e-4  # [m/√s] process noise of z at rest; r in the formula is that of a period
 RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y
 
 
@@ -39,19 +40,21 @@ class FeatureFilter(NamedTuple):
         """Return the filter at a feature y, (..., m), m."""
         return self._replace(feature=feature, variance=self.noise.variance)
 
-    def advance(self, jacobian: FloatArray, joint_step: FloatArray, model_error: float) -> FeatureFilter:
+    def advance(self, jacobian: FloatArray, joint_step: FloatArray, model_error: float, period: float) -> FeatureFilter:
         """Return the filter one period later, before the frame of that period.
 
         Args:
             jacobian: Ĵ, (..., m, n), m/rad.
             joint_step: Δq, (..., n), rad.
-            model_error: c, error of the Jacobian as a share of ‖Ĵ‖.
+            model_error: c, error of the Jacobian as a share of ‖Ĵ‖, which lasts for `MOTION_TIME`.
+            period: s.
         """
         flat = jacobian.reshape(*jacobian.shape[:-2], -1)
         uncertainty = np.vecdot(flat, flat) * np.vecdot(joint_step, joint_step) / joint_step.shape[-1]
+        error = model_error**2 * (MOTION_TIME / period)
         return self._replace(
             feature=self.feature + np.matvec(jacobian, joint_step),
-            variance=self.variance + model_error**2 * uncertainty + REST_DRIFT**2,
+            variance=self.variance + error * uncertainty + REST_DRIFT**2 * period,
         )
 
     def correct(self, feature: FloatArray, find_noise: bool) -> FeatureFilter:

@@ -1,0 +1,1 @@
+"""The stages of a composed controller around its estimator and its law."""

@@ -1,0 +1,167 @@
+"""The predict stage: the feature that the arm is bound for, past all delays.
+
+    ŷ = z + Ĵ (q(k) − q(k−d) + flight)              where the feature will be when all commands are carried out
+    q̂ = q(k) + flight                               and the joints
+    compared with the reference at k + lead
+
+z is the feature at its exposure, d periods ago (`feature_filter`); flight and lead follow from the part of the commands
+that is still to come (`joint_response`). Both halves can be left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.controllers.aids import AidsConfig
+from servobench.controllers.controller import Delays
+from servobench.controllers.estimators.estimator import MOTION_TIME
+from servobench.controllers.stages.feature_filter import FeatureFilter
+from servobench.controllers.stages.joint_response import JointResponse
+from servobench.controllers.stages.noise_level import NoiseLevel
+from servobench.controllers.stages.pairing import periods_in
+from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import branch
+from servobench.plant.signals import BoolArray, Observation
+
+IntArray = npt.NDArray[np.int_]
+
+
+class Prediction(NamedTuple):
+    """What the predict stage hands to a law.
+
+    Attributes:
+        feature: ŷ, (..., m).
+        joint_position: q̂, (..., n), rad.
+        lead: (...) [periods] by which the reference is to be shifted, a fraction.
+    """
+
+    feature: FloatArray
+    joint_position: FloatArray
+    lead: FloatArray
+
+
+class Past(NamedTuple):
+    """What the predict stage needs of the past.
+
+    Attributes:
+        delay: d, (...), periods.
+        exposed: q(k−d), (..., n), rad.
+        before: q(k−d) − q(k−d−1), (..., n), rad.
+        span: q(k) − q(k−r), (..., n), rad, over the r periods of a span of the response.
+    """
+
+    delay: IntArray
+    exposed: FloatArray
+    before: FloatArray
+    span: FloatArray
+
+
+class PredictorState(NamedTuple):
+    """The state of the predict stage.
+
+    Attributes:
+        response: of the joints.
+        filter: of the feature.
+        delay: (...) [periods] of the camera, at which the filter runs; −1 before the first frame.
+    """
+
+    response: JointResponse
+    filter: FeatureFilter
+    delay: IntArray
+
+
+@final
+class Predictor:
+    """ŷ, q̂ and lead as above, as far as the aids ask for it.
+
+    Attributes:
+        span: r, periods.
+    """
+
+    def __init__(self, aids: AidsConfig, period: float, delays: Delays) -> None:
+        """Take the settings.
+
+        Args:
+            aids: the settings.
+            period: s.
+            delays: of a given response.
+        """
+        self._aids, self._period, self._delays = aids, period, delays
+        self.span = max(1, periods_in(MOTION_TIME, period))
+        self._length = max(1, periods_in(aids.response_length, period * self.span))
+
+    def start(self, observation: Observation) -> PredictorState:
+        """Return the state of an arm at rest."""
+        q, y, delays = observation.joint_position, observation.feature, self._delays
+        noise = NoiseLevel.guess(self._aids.feature_noise, y.shape[:-1])
+        if self._aids.response == "given":
+            count = self._length * self.span
+            response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
+        else:
+            response = JointResponse.immediate(self._length, q, self.span)
+        return PredictorState(response, FeatureFilter(y, noise.variance, noise), np.full(y.shape[:-1], -1))
+
+    def predict(
+        self, state: PredictorState, jacobian: FloatArray, past: Past, observation: Observation
+    ) -> tuple[PredictorState, Prediction]:
+        """Return the new state and the prediction of this period."""
+        q, response, lead = observation.joint_position, state.response, np.zeros_like(state.filter.variance)
+        bound = q
+        if self._aids.response != "ignored":
+            if self._aids.response == "identified":
+                response = response.learn(past.span)
+            bound, lead = q + response.flight(), response.lead
+        found = state.filter._replace(feature=observation.feature)
+        if self._aids.filter:
+            found = self._observe(state, past, jacobian, observation)
+        feature = found.feature + np.matvec(jacobian, bound - past.exposed)
+        return PredictorState(response, found, past.delay), Prediction(feature, bound, lead)
+
+    def note(self, state: PredictorState, joint_step: FloatArray) -> PredictorState:
+        """Return the state after the joint step (..., n), rad, left the chain."""
+        if self._aids.response == "ignored":
+            return state
+        return state._replace(response=state.response.command(joint_step))
+
+    def _observe(
+        self, state: PredictorState, past: Past, jacobian: FloatArray, observation: Observation
+    ) -> FeatureFilter:
+        """Return the filter at the exposure."""
+        same, y = past.delay == state.delay, observation.feature
+        found = branch(same, self._follow, state.filter, jacobian, past.before, y, observation.feature_valid)
+        return branch(np.logical_not(same), FeatureFilter.restart, found, y)
+
+    def _follow(
+        self,
+        state: FeatureFilter,
+        jacobian: FloatArray,
+        joint_step: FloatArray,
+        feature: FloatArray,
+        valid: bool | BoolArray,
+    ) -> FeatureFilter:
+        state = state.advance(jacobian, joint_step, self._aids.filter_error, self._period)
+        return branch(valid, FeatureFilter.correct, state, feature, self._aids.noise == "identified")
+
+
+def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:
+    """Return the reference `lead` periods later, (..., rows, m): interpolated, and extrapolated beyond its end.
+
+    Args:
+        reference: (..., 1 + preview, m), m.
+        lead: (...), periods, at least 0.
+        rows: how many instants are wanted, at most 1 + preview.
+    """
+    now = reference[..., :rows, :]
+    return branch(lead > 0.0, _interpolated, now, reference, lead) if reference.shape[-2] > 1 else now
+
+
+def _interpolated(now: FloatArray, reference: FloatArray, lead: FloatArray) -> FloatArray:
+    """Return y_0 + Σ_j s_j (y_{j+1} − y_j), (..., rows, m), with s_j the share of segment j that has passed."""
+    segments = reference.shape[-2] - 1
+    passed = lead[..., None, None] + (np.arange(now.shape[-2])[:, None] - np.arange(segments))
+    passed[..., :-1] = np.minimum(passed[..., :-1], 1.0)  # the last segment goes on
+    steps = reference[..., 1:, :] - reference[..., :-1, :]
+    return np.asarray(reference[..., :1, :] + np.maximum(passed, 0.0) @ steps)
