@@ -6,7 +6,7 @@ What a run without a settling time counts as:
 |---|---|
 | `settled_share` | is not settled |
 | `compare_pairs` | counts as `never`, the duration of the run: a bound from below, as ranks need finite numbers |
-| `outcomes` | is `not_settled` if it completed, else the fault |
+| `outcomes` | is what the table says came of it, such as `not_settled` or `target_unreachable` |
 
 A run that did not complete never settled, whatever its error was before: see `settling_times`.
 """
@@ -30,10 +30,9 @@ from servobench.harness.analysis.statistics import (
     success_rate,
 )
 from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
 from servobench.plant.checks import FloatArray
 
-SETTLED: Final = "settled"
-NOT_SETTLED: Final = "not_settled"
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
 CONDITION: Final = ("plant", "task", "mismatch", "noise_factor", "latency_periods")
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
@@ -99,10 +98,28 @@ def settled_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimat
     return success_rate(int(settling_times(runs).notna().sum()), len(runs), confidence).scaled(100.0)
 
 
+def achieved_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estimate:
+    """Return how many of `runs` settled or followed their curve, in percent, with the Wilson interval."""
+    return success_rate(int(outcomes(runs).isin(ACHIEVED).sum()), len(runs), confidence).scaled(100.0)
+
+
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
-    """Return for each run `settled`, `not_settled` (it completed, outside the band) or the fault that ended it."""
-    settled = pd.Series(np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED), index=runs.index)
-    return settled.where(runs["status"] == COMPLETED, runs["status"]).rename("outcome").astype(str)
+    """Return what came of each run; in a table that does not tell it, without the reasons of a run that completed."""
+    curve = runs.reindex(columns=["task_kind"])["task_kind"] == CURVE
+    follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(runs, "settling_band")
+    on_curve, moved = (
+        np.where(follows, FOLLOWED, NOT_FOLLOWED),
+        np.where(settling_times(runs).notna(), SETTLED, NOT_SETTLED),
+    )
+    guessed = pd.Series(np.where(curve, on_curve, moved), index=runs.index)
+    guessed = guessed.where(runs["status"] == COMPLETED, runs["status"])
+    told = runs.reindex(columns=["outcome"])["outcome"].astype(object)
+    return told.where(told.notna(), guessed).rename("outcome").astype(str)
+
+
+def achievement(runs: pd.DataFrame) -> str:
+    """Return the word for a good outcome of these runs of one task: `settled`, or `followed` on a curve."""
+    return FOLLOWED if len(split_tasks(runs)[1]) else SETTLED
 
 
 def compare_pairs(

@@ -14,6 +14,16 @@ def handy_unit(feature_unit: str | None) -> tuple[str, float]:
     return HANDY_UNITS.get(feature_unit or "", (feature_unit or "feature unit", 1.0))
 
 
+def settling_band(runs: pd.DataFrame, factor: float = 1.0) -> str:
+    """Return the settling band of these runs times a factor with its unit, `5 mm`; words where they have several."""
+    known = runs.reindex(columns=["settling_band", "feature_unit"]).dropna().drop_duplicates()
+    if len(known) != 1:
+        return "the settling band" if factor == 1.0 else f"{factor:g} settling bands"
+    (band,), (unit,) = known["settling_band"], known["feature_unit"]
+    name, handy = handy_unit(str(unit))
+    return f"{factor * handy * float(band):g} {name}"
+
+
 class Measure(NamedTuple):
     """How a column of the table of runs is shown; where `unit` is None, in the unit of the plant's feature."""
 
@@ -34,10 +44,12 @@ MEASURES: Final = {
     "settling_time_s": Measure("settling time", 2, "s"),
     "overshoot": Measure("overshoot", 1, "%", 100.0),
     "steady_state_error": Measure("last second", 2),
+    "rms_error_second_lap": Measure("RMS of the second lap", 2),
     "rms_error_evaluated": Measure("RMS of the evaluated part", 2),
     "max_error": Measure("largest error", 1),
     "path_length_ratio": Measure("path ratio", 3, "1"),
     "jacobian_error_mean": Measure("mean Jacobian error", 1, "%", 100.0),
+    "max_joint_position_rad": Measure("largest joint position", 2, "rad"),
     "control_effort_rad": Measure("control effort", 2, "rad"),
     "saturation_fraction": Measure("saturated periods", 1, "%", 100.0),
     "feature_invalid_fraction": Measure("periods without a feature", 1, "%", 100.0),

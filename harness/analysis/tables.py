@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from itertools import combinations
 from typing import Any, Final
@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.comparison import (
-    SETTLED,
+    achieved_share,
+    achievement,
     column_of,
     compare_pairs,
     outcomes,
@@ -21,9 +22,17 @@ from servobench.harness.analysis.comparison import (
     split_tasks,
 )
 from servobench.harness.analysis.measures import MEASURES, Measure
-from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, tail_mean
+from servobench.harness.analysis.statistics import (
+    MISSING,
+    NO_ESTIMATE,
+    Estimate,
+    median_with_interval,
+    success_rate,
+    tail_mean,
+)
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.outcome import ACHIEVED
 from servobench.plant.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
@@ -31,63 +40,11 @@ Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 
 SWEPT: Final = ("noise_factor", "latency_periods")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
-SWEEP_COLUMNS: Final = (*CONDITIONS, "task", "controller", "status", "settling_time_s")  # what `sweep_tables` reads
-SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "controller"]
 COSTS: Final = ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
                 "jacobian_error_mean")  # fmt: skip
+CURVE_MEASURES: Final = ("rms_error_second_lap", "rms_error_evaluated", "max_error", "max_joint_position_rad")
 TAIL: Final = 0.95
 MAX_REASON: Final = 60  # characters of a reason that are shown in a table
-SUMMARY_LEGEND: Final = (
-    "done: reached the last period; settled: came within 5 mm and stayed; the rest are medians over runs"
-)
-SWEEP_LEGEND: Final = "settled: came within 5 mm and stayed; noise: factor; latency: periods, – as configured"
-
-
-def summary_tables(runs: pd.DataFrame) -> Tables:
-    """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
-    for (plant, mismatch, task), place in runs.groupby(["plant", "mismatch", "task"], sort=False):
-        rows = []
-        for name, own in place.groupby("controller", sort=False):
-            completed, settled = int((own["status"] == COMPLETED).sum()), int(settling_times(own).notna().sum())
-            unit, factor = MEASURES["rms_error_evaluated"].scale(place)
-            rows.append(
-                {
-                    "controller": str(name),
-                    "done": f"{completed}/{len(own)}",
-                    "settled": f"{settled}/{len(own)}",
-                    "after\ns": _middle(own, "settling_time_s", 1.0, 2),
-                    "overshoot\n%": _middle(own, "overshoot", 100.0, 0),
-                    f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
-                    "path\nratio": _middle(own, "path_length_ratio", 1.0, 2),
-                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0),
-                }
-            )
-        yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
-
-
-def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
-    """Yield what a sweep ends with: for each plant and task the share of settled runs, a row for each condition.
-
-    Args:
-        parts: pieces of the table of runs; only numbers of runs are kept of each.
-    """
-    counts = pd.concat([_count_settled(part) for part in parts]).groupby(level=SWEEP_KEYS, sort=False).sum()
-    for (plant, task), place in counts.groupby(level=["plant", "task"], sort=False):
-        own = place.droplevel(["plant", "task"])
-        share, count = (numbers.unstack(sort=False) for numbers in (100.0 * own["sum"] / own["size"], own["size"]))
-        table = share.map(lambda value: MISSING if pd.isna(value) else f"{value:.1f}")
-        table["runs"] = count.max(axis=1).map("{:.0f}".format)
-        yield f"{task} on {plant}: settled, %", table.rename_axis(columns=None).reset_index()
-
-
-def _count_settled(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return how many runs there are in each condition, `size`, and how many of them settled, `sum`."""
-    runs = runs.assign(
-        settled=settling_times(runs).notna(),
-        noise=runs["noise_factor"].map("{:g}".format),
-        latency=[MISSING if pd.isna(value) else f"{value:g}" for value in runs["latency_periods"]],
-    )
-    return runs.groupby(SWEEP_KEYS, sort=False)["settled"].agg(["sum", "size"])
 
 
 def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
@@ -112,13 +69,13 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
-        failed = ended[ended != SETTLED].value_counts()
+        failed = ended[~ended.isin(ACHIEVED)].value_counts()
         final = column_of(own, "steady_state_error").where(own["status"] == COMPLETED)
         rows.append(
             {
                 "controller": str(name),
                 "runs": str(len(own)),
-                "settled, %": f"{settled_share(own):.1f}",
+                f"{achievement(runs)}, %": f"{achieved_share(own):.1f}",
                 "settling time, s": f"{_median(settling_times(own)):.2f}",
                 "overshoot, %": f"{_median(100.0 * column_of(own, 'overshoot')):.1f}",
                 f"RMS end, {unit}": f"{_median(factor * column_of(own, 'rms_error_evaluated')):.1f}",
@@ -168,6 +125,20 @@ def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: fl
     )
 
 
+def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each condition, task and controller how many runs had which outcome, in percent."""
+    named = runs.assign(outcome=outcomes(runs))
+    words = named["outcome"].value_counts().index
+    rows = []
+    for key, group in _groups(named, "task"):
+        counts = {word: int((group["outcome"] == word).sum()) for word in words}
+        shares = {
+            word: f"{success_rate(n, len(group)).scaled(100.0):.0f}" if n else MISSING for word, n in counts.items()
+        }
+        rows.append(key | {"runs": len(group)} | {f"{word} [%]": share for word, share in shares.items()})
+    return pd.DataFrame(rows)
+
+
 def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return for each condition and controller how many moves settled, how fast, and with what error."""
     moves, _ = split_tasks(runs)
@@ -190,7 +161,7 @@ def tracking_table(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for key, group in _groups(curves, "task"):
         counts = {"runs": len(group), "completed": int((group["status"] == COMPLETED).sum())}
-        rows.append(key | counts | _medians(group, curves, "rms_error_evaluated", "max_error"))
+        rows.append(key | counts | _medians(group, curves, *filter(partial(_is_informative, curves), CURVE_MEASURES)))
     return pd.DataFrame(rows)
 
 
@@ -220,7 +191,7 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return every run as a row: conditions, how it ended, and its measures."""
-    names = (*CONDITIONS, "task", "controller", "seed", "status")
+    names = (*CONDITIONS, "task", "controller", "seed", "status", "outcome")
     table = runs[[name for name in names if _is_informative(runs, name)]].copy()
     for name in MEASURES:
         if _is_informative(runs, name):
@@ -277,8 +248,3 @@ def _rounded(value: float, digits: int) -> float:
 def _median(values: pd.Series[float]) -> Estimate:
     """Return the median of a column, a missing value counting as ∞; no estimate where all are missing."""
     return median_with_interval(values) if values.notna().any() else NO_ESTIMATE
-
-
-def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:
-    value = column_of(runs, name).median()
-    return MISSING if pd.isna(value) else f"{factor * value:.{digits}f}"

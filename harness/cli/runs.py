@@ -117,7 +117,7 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
 
 def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> None:
     """Check everything, run everything, and leave tables, figures and a report behind."""
-    from servobench.harness.analysis.tables import SUMMARY_LEGEND, summary_tables
+    from servobench.harness.analysis.summary import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.cli.progress import ConsoleObserver
@@ -136,7 +136,7 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
             interrupted = True
     results.collect(folder)
     runs = results.load_runs(folder)
-    print_tables(summary_tables(runs), SUMMARY_LEGEND)
+    print_tables(summary_tables(runs), summary_legend(runs))
     _print_faults(runs)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)

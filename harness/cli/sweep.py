@@ -32,7 +32,7 @@ def sweep(
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
-    from servobench.harness.analysis.tables import SWEEP_COLUMNS, SWEEP_LEGEND, sweep_tables
+    from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.compare import Batch, parse_seeds
@@ -54,7 +54,8 @@ def sweep(
     campaign = Campaign(plan.cells(), overrides.settings())
     with watching(console, out) as observer:
         carry_out(campaign, out, running.execution(observer))
-    print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), SWEEP_LEGEND)
+    legend = sweep_legend(results.iterate_runs(out, SWEEP_COLUMNS))
+    print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), legend)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 
 

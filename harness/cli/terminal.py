@@ -10,8 +10,8 @@ from rich.console import Console
 if TYPE_CHECKING:
     import pandas as pd
 
-LEFT = ("controller", "mismatch", "noise", "latency", "pair", "failures")  # columns of words
-WHOLE = ("controller", "pair")  # columns whose words are not broken over lines
+LEFT = ("controller", "mismatch", "noise", "latency", "pair", "failures", "outcome")  # columns of words
+WHOLE = ("controller", "pair", "outcome")  # columns whose words are not broken over lines
 
 console = Console()
 

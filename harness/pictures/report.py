@@ -7,6 +7,7 @@ tables and figures in a notebook.
 from __future__ import annotations
 
 import base64
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,19 +21,32 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.folder import describe_folder, other_tables
-from servobench.harness.analysis.tables import cost_table, failure_table, runs_table, settling_table, tracking_table
+from servobench.harness.analysis.measures import settling_band
+from servobench.harness.analysis.tables import (
+    cost_table,
+    failure_table,
+    outcome_table,
+    runs_table,
+    settling_table,
+    tracking_table,
+)
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import folder_figures, picture_of
 from servobench.harness.pictures.interactive import interactive_paths, plotly_script
 from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.harness.run.outcome import FOLLOWING_BANDS
 from servobench.plant.files import write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
 MAX_PICTURES: Final = 24  # a page stays under 10 MB; all figures are in the folder itself
 ROWS_AT_ONCE: Final = 15  # a longer table gets a search field and pages
+
+INFINITE: Final = re.compile(
+    r'(\[\\")\s*inf(\\", \\"___Infinity___)'
+)  # text and value of a cell of numbers, from itables
 
 
 @dataclass(frozen=True)
@@ -106,6 +120,11 @@ def table_options(table: pd.DataFrame) -> dict[str, Any]:
     }
 
 
+def sortable_table(rows: pd.DataFrame) -> Markup:
+    """Return a table as HTML in which infinity is written as the sign ∞ and still sorts behind all numbers."""
+    return Markup(INFINITE.sub(r"\1∞\2", to_html_datatable(rows, **table_options(rows))))
+
+
 def _page(folder: Path, runs: pd.DataFrame) -> str:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
@@ -119,7 +138,10 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
     return environment.get_template(TEMPLATE).render(
         folder=folder.resolve().name,
         scripts=Markup(scripts),
-        table=lambda rows: Markup(to_html_datatable(rows, **table_options(rows))),
+        table=sortable_table,
+        band=settling_band(runs),
+        following=settling_band(runs, FOLLOWING_BANDS),
+        outcomes=outcome_table(runs),
         facts=describe_folder(folder, runs),
         others=list(other_tables(folder)),
         pictures=report_pictures(folder, runs),

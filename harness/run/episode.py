@@ -13,13 +13,15 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.experiment import Drawn, build
+from servobench.harness.run.experiment import Drawn, build, draw
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import SETTLING_BAND, judge_run
+from servobench.harness.run.outcome import find_outcome
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.side_by_side import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
+from servobench.harness.run.tasks import Scenario
 from servobench.harness.run.threads import one_thread
 from servobench.harness.run.together import Together, build_together
 from servobench.plant.checks import FloatArray
@@ -30,6 +32,7 @@ COMPLETED = "completed"
 NUMERICAL_ERROR = "numerical_error"
 CRASHED = "crashed"
 TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the time limit
+ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
 STATUSES = (COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT)  # besides those of the kinds of `RunFault`
 
 
@@ -84,8 +87,7 @@ def carry_out(
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
         plant.close()
-    metrics = judge_run(logged, scenario.kind, scenario.evaluate_from) if len(logged) else {}
-    row = _row(experiment.drawn, resolved.request, (status, reason), _numbers(metrics), logged)
+    row = _row(experiment.drawn, resolved.request, (status, reason), _numbers(_judge(logged, scenario)), logged)
     table = logged.table(resolved.request.run_id, full_jacobian=experiment.run.full_jacobian) if steps else None
     return RunResult(row, table, image)
 
@@ -101,6 +103,13 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
         Exception: they cannot be built together, because something is wrong with one of them; each has to be carried
             out by itself, and its row says what it is.
     """
+    most = max(1, ROWS_AT_ONCE // runs[0].run.periods(draw(runs[0]).scenario.duration))
+    parts = (runs[first : first + most] for first in range(0, len(runs), most))
+    return [result for part in parts for result in _carry_out_part(part, keep)]
+
+
+def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunResult]:
+    """Carry out runs whose logs fit into memory side by side."""
     many = build_together(runs, keep=keep)
     ends = Ends(len(runs))
     log = ManyLogs(many.bench.spec, many.loop.periods, ends)
@@ -115,19 +124,23 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
 
 def _judge_together(runs: Sequence[ResolvedRun], many: Together, ends: Ends, logged: Steps) -> list[RunResult]:
     task = many.drawn[0].scenario
-    metrics = judge_run(logged, task.kind, task.evaluate_from) if len(ends.running) else {}
+    metrics = _judge(logged, task) if len(ends.running) else {}
     columns = {name: values.tolist() for name, values in metrics.items()}
     results = []
     for lane, (run, drawn) in enumerate(zip(runs, many.drawn, strict=True)):
         if lane in ends.faults:
             own = logged.run(lane, ends.rows[lane])
-            judged = judge_run(own, task.kind, task.evaluate_from) if len(own) else {}
-            row = _row(drawn, run.request, _ending(ends.faults[lane]), _numbers(judged), own)
+            row = _row(drawn, run.request, _ending(ends.faults[lane]), _numbers(_judge(own, task)), own)
         else:
             values = {name: column[lane] for name, column in columns.items()}
-            row = _row(drawn, run.request, (COMPLETED, ""), values, logged)
+            row = _row(drawn, run.request, (COMPLETED, ""), values, logged.run(lane, len(logged)))
         results.append(RunResult(row, None))
     return results
+
+
+def _judge(logged: Steps, task: Scenario) -> dict[str, FloatArray]:
+    """Return the metrics of a run or of runs side by side; none without rows."""
+    return judge_run(logged, task.kind, task.evaluate_from, task.lap_time) if len(logged) else {}
 
 
 @contextlib.contextmanager
@@ -153,23 +166,37 @@ def _numbers(metrics: dict[str, FloatArray]) -> dict[str, float]:
 def _row(
     drawn: Drawn, request: RunRequest, ending: tuple[str, str], metrics: dict[str, float], logged: Steps
 ) -> dict[str, Any]:
-    spec = logged.spec
+    spec, (status, reason) = logged.spec, ending
+    outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
     return {
         **request.as_row(),
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
         "settling_band": SETTLING_BAND * spec.feature.scale,
-        "status": ending[0],
+        "status": status,
+        "outcome": outcome,
         **metrics,
         "periods": len(logged),
-        "reason": ending[1],
+        "reason": reason,
         "mismatch_values": json.dumps(drawn.sample.as_record() if drawn.sample else {}),
     }
 
 
+def _outcome(drawn: Drawn, metrics: dict[str, float], logged: Steps) -> str:
+    times = metrics["settling_time_s"], metrics["rms_error_evaluated"]
+    return find_outcome(logged, drawn.scenario, *times, drawn.final)
+
+
 def failed_row(request: RunRequest, status: str, reason: str) -> dict[str, Any]:
     """Return the row of a run of which nothing is left but why it failed."""
-    return {**request.as_row(), "status": status, "periods": 0, "reason": reason, "mismatch_values": "{}"}
+    return {
+        **request.as_row(),
+        "status": status,
+        "outcome": status,
+        "periods": 0,
+        "reason": reason,
+        "mismatch_values": "{}",
+    }
 
 
 def describe_error(error: BaseException) -> str:

@@ -25,7 +25,7 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
-from servobench.plant.robot.hand_eye import FEATURE_NAMES, HandEyeModel, TrueJacobian, hand_eye_spec
+from servobench.plant.robot.hand_eye import FEATURE, HandEyeModel, TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_seed
@@ -40,6 +40,11 @@ class Drawn:
     true: HandEyeModel | None = None  # the true robot; None for a plant that brings its own
     sample: MismatchSample | None = None  # how it differs from the nominal one
     moved: HandEyeModel | None = None  # the true robot after its camera was moved; None if it is not
+
+    @property
+    def final(self) -> HandEyeModel | None:
+        """The true robot with the camera as it is at the end of the run."""
+        return self.moved or self.true
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +117,7 @@ def draw(resolved: ResolvedRun) -> Drawn:
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     moved = sample.moved(true)
-    setting = TaskSetting(true, true.arm.n, FEATURE_NAMES, named_seed(request.seed, "task"), moved)
+    setting = TaskSetting(true, true.arm.n, FEATURE, named_seed(request.seed, "task"), moved)
     return Drawn(_build_scenario(resolved, setting), true, sample, moved)
 
 
@@ -206,7 +211,7 @@ def _build_with_own_robot(
     plant = _build_plant(resolved, entry, PlantSetup(None, None, run.period))
     try:
         spec = plant.spec
-        setting = TaskSetting(None, spec.n, spec.feature_names, named_seed(request.seed, "task"))
+        setting = TaskSetting(None, spec.n, spec.feature, named_seed(request.seed, "task"))
         scenario = _build_scenario(resolved, setting)
         nominal = plant.nominal_jacobian()
         source = None if nominal is None else network_source(nominal, spec, keep, progress)

@@ -7,8 +7,10 @@
 | overshoot | how far the feature passes a fixed target, as a share of the initial error; NaN when tracking |
 | steady_state_error | mean error of the last second |
 | rms_error, max_error | over the whole run |
+| rms_error_second_lap | over the second lap; NaN where nothing is repeated |
 | rms_error_evaluated | over the evaluated part: the last lap, the last quarter of a move, the last half of a path |
 | path_length_ratio | true path over the straight line (point to point) or over the reference's path (tracking) |
+| max_joint_position_rad | largest |q| of all joints and periods |
 | control_effort_rad | Σ |u| dt over joints and periods |
 | saturation_fraction | share of periods in which a joint is commanded at its speed limit |
 | feature_invalid_fraction | share of periods without a valid feature |
@@ -16,6 +18,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -75,13 +78,14 @@ def path_length(points: FloatArray) -> FloatArray:
     return np.asarray(norm(steps).sum(axis=-1))
 
 
-def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, FloatArray]:
+def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan) -> dict[str, FloatArray]:
     """Return the metrics of a run, or of runs side by side.
 
     Args:
         steps: the rows, at least one.
         kind: of the task; "point_to_point" has a fixed target.
         evaluate_from: where the evaluated part begins [s].
+        lap_time: of a curve that is repeated [s]; NaN of any other.
 
     Returns:
         Metric name -> (...); NaN where a metric does not apply, as the times of runs side by side.
@@ -92,7 +96,10 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, F
     )
     # Column after column: the order of a sum decides its last bits, and stored tables are compared bit for bit.
     feature, reference, command = map(_columns, (steps.true_feature, steps.reference, steps.command))
-    evaluated = error[..., np.searchsorted(steps.time, evaluate_from - 1e-9) :]
+    judged_from, second_lap, third_lap = np.searchsorted(
+        steps.time, [evaluate_from - 1e-9, lap_time - 1e-9, 2.0 * lap_time - 1e-9]
+    )
+    evaluated, second = error[..., judged_from:], error[..., second_lap:third_lap]
     final = error[..., -max(1, round(FINAL_SPAN / spec.period)) :]
     way = norm(reference[..., 0] - feature[..., 0]) if fixed else path_length(reference)
     effort = np.abs(command)
@@ -108,8 +115,10 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float) -> dict[str, F
         "steady_state_error": final.mean(axis=-1),
         "rms_error": _rms(error),
         "max_error": error.max(axis=-1),
+        "rms_error_second_lap": _rms(second) if second.shape[-1] else unknown,
         "rms_error_evaluated": _rms(evaluated) if evaluated.shape[-1] else unknown,
         "path_length_ratio": path_length_ratio,
+        "max_joint_position_rad": np.abs(_columns(steps.joint_position)).max(axis=(-2, -1)),
         "control_effort_rad": effort.reshape(*effort.shape[:-2], -1).sum(axis=-1) * spec.period,
         "saturation_fraction": at_limit.any(axis=-2).mean(axis=-1),
         "feature_invalid_fraction": np.mean(_columns(~steps.feature_valid), axis=-1),

@@ -11,7 +11,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from servobench.harness.run.log import column_unit
 from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.signals import Channel
 
 TaskKind: TypeAlias = Literal["point_to_point", "curve"]
 """Whether a task's reference is a fixed target or moves."""
@@ -102,17 +104,17 @@ def line(start: FloatArray, end: FloatArray, duration: float) -> Waypoints:
     return Waypoints(np.array([0.0, duration]), np.stack([start, end]))
 
 
-def read_waypoints(path: Path, feature_names: tuple[str, ...]) -> Waypoints:
-    """Read waypoints from a CSV file with the columns time_s and <feature>_m.
+def read_waypoints(path: Path, feature: Channel) -> Waypoints:
+    """Read waypoints from a CSV file with the columns time_s and <feature>_<unit>, named as in the log.
 
     Args:
         path: the file.
-        feature_names: names of the m features, as in the plant's spec.
+        feature: names and unit of the m features, as in the plant's spec.
 
     Raises:
         ValueError: the file is missing, lacks a column, or holds something that is not a finite number.
     """
-    wanted = ("time_s", *(f"{name}_m" for name in feature_names))
+    wanted = ("time_s", *(f"{name}_{column_unit(feature.unit)}" for name in feature.names))
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))

@@ -7,10 +7,11 @@ given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import Count, NonNegative, Number, Positive, settings, suggest
+from servobench.plant.signals import Channel
 
 Vector: TypeAlias = tuple[float, ...]
 
@@ -39,6 +41,7 @@ class Scenario:
     duration: float  # [s]
     evaluate_from: float  # where the evaluated part begins [s]
     kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
+    lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
 
 
 @settings
@@ -97,6 +100,20 @@ class LemniscateTask(CircleTask):
 
 
 @settings
+class EnduranceTask:
+    """Many laps on the curve of the task `circle` or `lemniscate`: whether a method stays as good as it was."""
+
+    curve: Literal["circle", "lemniscate"] = "circle"
+    """the task whose centre and radius the curve has"""
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    lap_time: Positive = 10.0
+    """[s] 200 points a lap at the default period"""
+    laps: Count = 180
+    """laps in the run, half an hour; the first one is the entry, the last one is judged"""
+
+
+@settings
 class LineTask:
     """A straight line at constant speed, then rest at its end."""
 
@@ -114,7 +131,7 @@ class LineTask:
 
 @settings
 class WaypointTask:
-    """Waypoints from a CSV file with the columns time_s, x_m, y_m, z_m in the camera frame."""
+    """Waypoints from a CSV file, in the camera frame; its columns are time_s, x_m, y_m, z_m on a UR5."""
 
     start: Vector = HOME
     """[rad] joint positions at time 0"""
@@ -142,14 +159,14 @@ class TaskSetting:
 
     model: HandEyeModel | None  # the true robot, or None for a plant that brings its own
     n: int  # number of joints
-    feature_names: tuple[str, ...]  # m names
+    feature: Channel  # names and unit of the m features
     seed: int  # for tasks that draw random numbers
     moved: HandEyeModel | None = None  # the true robot once its camera was moved; None if it is not
 
     @property
     def m(self) -> int:
         """Number of features."""
-        return len(self.feature_names)
+        return len(self.feature.names)
 
     def taught_on(self) -> HandEyeModel:
         """Return the true robot, for a target that is taught on it.
@@ -220,7 +237,13 @@ def _build_laps(config: CircleTask, setting: TaskSetting) -> Scenario:
     centre, eight = as_vector("centre", config.centre, setting.m), isinstance(config, LemniscateTask)
     reference = Laps(centre, config.radius, config.lap_time, eight)
     laps, lap_time = config.laps, config.lap_time
-    return Scenario(setting.start(config.start), reference, laps * lap_time, (laps - 1) * lap_time)
+    start, judged_from = setting.start(config.start), (laps - 1) * lap_time
+    return Scenario(start, reference, laps * lap_time, judged_from, lap_time=lap_time)
+
+
+def _build_endurance(config: EnduranceTask, setting: TaskSetting) -> Scenario:
+    shape = LemniscateTask if config.curve == "lemniscate" else CircleTask
+    return _build_laps(shape(start=config.start, lap_time=config.lap_time, laps=config.laps), setting)
 
 
 def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
@@ -232,7 +255,7 @@ def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
 def _build_waypoints(config: WaypointTask, setting: TaskSetting) -> Scenario:
     if not config.file:
         raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
-    reference = read_waypoints(Path(config.file).expanduser(), setting.feature_names)
+    reference = read_waypoints(Path(config.file).expanduser(), setting.feature)
     duration = float(reference.times[-1]) + config.settle
     check_number("last waypoint's time plus settle", duration, above=0.0)
     return Scenario(setting.start(config.start), reference, duration, 0.5 * duration)
@@ -255,6 +278,9 @@ EXP4 = PointTask(
     start=(-0.938, -1.724, -1.814, 0.812, 0.855, 0.0),  # (0.12, -0.55, 0.50) m; the shoulder is 0.69 rad outside
     target=(0.403, -1.847, -2.248, 0.826, 1.231, 0.0),  # (0.55, 0.05, 0.25) m
 )
+# The arm stretched level over the table, the ball at (1.03, 0, 0.09) m: its Jacobian has lost the way out and back.
+SINGULAR = PointTask(start=(0.132772, -3.141593, 0.0, -0.483504, 1.421076, -0.000417))
+UNREACHABLE = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)  # 1.5 m straight on from where the ball starts
 
 _ENTRIES = (
     TaskEntry("exp1", "a move whose target lies outside the training region", EXP1, _build_point),
@@ -266,6 +292,11 @@ _ENTRIES = (
     TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(), _build_laps, any_robot=True),
     TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
     TaskEntry("target", "a move to a given feature (target.target)", TargetTask(), _build_target, any_robot=True),
+    TaskEntry(
+        "endurance", "half an hour on the circle or the lemniscate", EnduranceTask(), _build_endurance, any_robot=True
+    ),
+    TaskEntry("unreachable", "a target 1.5 m away, out of the arm's reach", UNREACHABLE, _build_target, any_robot=True),
+    TaskEntry("singular_start", "a move that starts with the arm stretched", SINGULAR, _build_point),
     TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),
 )
 TASKS = {entry.name: entry for entry in _ENTRIES}

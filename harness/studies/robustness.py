@@ -16,6 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.measures import settling_band
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import Cell
@@ -147,8 +148,9 @@ def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:
     """
     if "axis" not in runs or not set(runs["axis"]) & {line.axis for line in LINES}:
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
+    arrived = f"Runs that arrived within {settling_band(runs)} and stayed, %"
     return [
-        *_draw(runs, folder / "robustness", "Runs that arrived within 5 mm and stayed, %", settled_share, 104.0),
+        *_draw(runs, folder / "robustness", arrived, settled_share, 104.0),
         *_draw(
             runs,
             folder / "robustness_settling",

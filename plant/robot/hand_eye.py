@@ -14,9 +14,10 @@ import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.signals import PlantSpec
+from servobench.plant.signals import Channel, PlantSpec
 
 FEATURE_NAMES = ("x", "y", "z")
+FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
 ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
 
 

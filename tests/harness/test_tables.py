@@ -10,15 +10,15 @@ from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
 from servobench.harness.analysis.comparison import split_conditions, split_tasks
 from servobench.harness.analysis.folder import describe_folder
+from servobench.harness.analysis.summary import outcome_legend, summary_tables, sweep_tables
 from servobench.harness.analysis.tables import (
     compare_controllers,
     cost_table,
     failure_table,
     judge_controllers,
+    outcome_table,
     runs_table,
     settling_table,
-    summary_tables,
-    sweep_tables,
     tracking_table,
 )
 from servobench.harness.batch import results
@@ -110,14 +110,44 @@ def test_a_comparison_ends_with_a_table_for_each_task(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
     titles, tables = zip(*summary_tables(runs), strict=True)
     assert titles == tuple(f"{task} on kinematic, moderate" for task in ("exp1", "exp2", "circle"))
-    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "1/1", "1.50", "2", "2.0", "–", "130"]
-    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "0/1", "–", "–", "2.0", "–", "130"]
+    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "settled", "1.50", "2", "2.0", "500", "–", "130"]
+    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "followed", "–", "–", "2.0", "500", "–", "130"]
+
+
+def test_the_outcomes_of_several_runs_are_shares():
+    words = ["settled", "settled", "target_unreachable", "settled"]
+    runs = pd.DataFrame([made_up_row(str(i), seed=i, outcome=word) for i, word in enumerate(words)])
+    ((_, table),) = summary_tables(runs)
+    assert table["outcome"].tolist() == ["75 % settled\n25 % target_unreachable"]
+    row = outcome_table(runs).iloc[0]
+    assert row["settled [%]"] == "75 [30, 95]"  # Wilson
+    assert row["target_unreachable [%]"] == "25 [5, 70]"
+    assert judge_controllers(runs)["failures"].tolist() == ["1 target_unreachable"]
+
+
+def test_an_endless_curve_tells_its_second_lap_and_its_joints():
+    laps = {"rms_error_second_lap": 0.003, "max_joint_position_rad": 2.345, "task_kind": "curve"}
+    runs = pd.DataFrame([made_up_row("a", task="endurance", settling_time_s=np.nan, outcome="followed", **laps)])
+    ((_, table),) = summary_tables(runs)
+    assert table[["RMS lap 2\nmm", "joints\nrad", "RMS end\nmm"]].iloc[0].tolist() == ["3.0", "2.35", "2.0"]
+    (row,) = tracking_table(runs).to_dict("records")
+    assert (row["RMS of the second lap [mm]"], row["largest joint position [rad]"]) == (3.0, 2.35)
+
+
+def test_the_legend_tells_the_band_of_the_feature(runs):
+    banded = runs.assign(settling_band=0.02)
+    assert outcome_legend([banded]).startswith("settled: came within 20 mm and stayed; followed: ")
+    assert outcome_legend([banded.assign(feature_unit="px", settling_band=2.0)]).endswith("at most 4 px")
+    assert "within the settling band" in outcome_legend([banded, runs.assign(settling_band=0.005)])
 
 
 def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path):
     runs = results.load_runs(sweep(tmp_path / "out"))
     wanted = runs[runs["run_id"] != "someone_elses-60-0"].assign(latency_periods=None)
-    ((title, table),) = sweep_tables([wanted.iloc[:7], wanted.iloc[7:]])
+    (title, table), (second, kinds) = sweep_tables([wanted.iloc[:7], wanted.iloc[7:]])
+    assert second == "random on kinematic: what came of the runs, %"
+    assert kinds.values.tolist() == [
+        ["settled", "72.2", "72.2", "76.5"], ["feature_lost", "27.8", "27.8", "23.5"]]  # fmt: skip
     assert title == "random on kinematic: settled, %"
     assert table.values.tolist() == [
         ["camera_rotation=0deg", "1", "–", "100.0", "100.0", "100.0", "6"],

@@ -1,0 +1,133 @@
+"""What a command that carries out runs prints at its end: a table for each place, and what its words mean."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+import pandas as pd
+
+from servobench.harness.analysis.comparison import achievement, column_of, outcomes, split_tasks
+from servobench.harness.analysis.measures import MEASURES, settling_band
+from servobench.harness.analysis.statistics import MISSING
+from servobench.harness.analysis.tables import CONDITIONS, Tables
+from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
+
+BAND: Final = ("settling_band", "feature_unit")
+SWEEP_COLUMNS: Final = (
+    *CONDITIONS,
+    "task",
+    "controller",
+    "status",
+    "outcome",
+    "settling_time_s",
+    "task_kind",
+    "rms_error_evaluated",
+    *BAND,
+)  # what `sweep_tables` and `outcome_legend` read
+SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "controller"]
+
+
+def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
+    """Return what the good outcomes of runs mean, whose table comes in pieces."""
+    bands = pd.concat([part.reindex(columns=list(BAND)).drop_duplicates() for part in parts])
+    return (
+        f"{SETTLED}: came within {settling_band(bands)} and stayed; "
+        f"{FOLLOWED}: RMS error of the judged part at most {settling_band(bands, FOLLOWING_BANDS)}"
+    )
+
+
+def summary_legend(runs: pd.DataFrame) -> str:
+    """Return what the words in `summary_tables` mean."""
+    return f"done: reached the last period; {outcome_legend([runs])}; the rest are medians over runs"
+
+
+def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
+    """Return what the words in `sweep_tables` mean."""
+    return f"{outcome_legend(parts)}; noise: factor; latency: periods, – as configured"
+
+
+def summary_tables(runs: pd.DataFrame) -> Tables:
+    """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
+    for (plant, mismatch, task), place in runs.groupby(["plant", "mismatch", "task"], sort=False):
+        rows = []
+        for name, own in place.groupby("controller", sort=False):
+            unit, factor = MEASURES["rms_error_evaluated"].scale(place)
+            if achievement(place) == FOLLOWED:
+                special = {
+                    f"RMS lap 2\n{unit}": _middle(own, "rms_error_second_lap", factor, 1),
+                    "joints\nrad": _middle(own, "max_joint_position_rad", 1.0, 2),
+                }
+            else:
+                special = {
+                    "after\ns": _middle(own, "settling_time_s", 1.0, 2),
+                    "overshoot\n%": _middle(own, "overshoot", 100.0, 0),
+                }
+            rows.append(
+                {
+                    "controller": str(name),
+                    "done": f"{int((own['status'] == COMPLETED).sum())}/{len(own)}",
+                    "outcome": _shares(own),
+                    **special,
+                    f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
+                    f"largest\n{unit}": _middle(own, "max_error", factor, 0),
+                    "path\nratio": _middle(own, "path_length_ratio", 1.0, 2),
+                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0),
+                }
+            )
+        yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
+
+
+def _shares(runs: pd.DataFrame) -> str:
+    """Return a line for each outcome with its share of the runs, or the outcome of a single run."""
+    counts = outcomes(runs).value_counts()
+    return "\n".join(
+        f"{100.0 * n / len(runs):.0f} % {word}" if len(runs) > 1 else str(word) for word, n in counts.items()
+    )
+
+
+def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
+    """Yield what a sweep ends with, for each plant and task.
+
+    That is the share of settled runs, or of those that followed their curve, a row for each condition; and where there
+    are others, the share of each outcome over all conditions.
+
+    Args:
+        parts: pieces of the table of runs; only numbers of runs are kept of each.
+    """
+    counted, curves = [], set[str]()
+    for part in parts:
+        counted.append(_count_outcomes(part))
+        curves |= set(split_tasks(part)[1]["task"])
+    counts = pd.concat(counted).groupby([*SWEEP_KEYS, "outcome"], sort=False, as_index=False)["runs"].sum()
+    for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
+        good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
+        sums = place.assign(good=good).groupby(SWEEP_KEYS[2:], sort=False)[["good", "runs"]].sum()
+        table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(_percent)
+        table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
+        word = FOLLOWED if task in curves else SETTLED
+        yield f"{task} on {plant}: {word}, %", table.rename_axis(columns=None).reset_index()
+        if good.sum() < place["runs"].sum():
+            kinds = place.pivot_table(values="runs", index="outcome", columns="controller", aggfunc="sum", sort=False)
+            table = (100.0 * kinds / kinds.sum()).map(_percent)
+            yield f"{task} on {plant}: what came of the runs, %", table.rename_axis(columns=None).reset_index()
+
+
+def _percent(value: float) -> str:
+    return MISSING if pd.isna(value) else f"{value:.1f}"
+
+
+def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return how many runs of each condition had which outcome."""
+    runs = runs.assign(
+        outcome=outcomes(runs),
+        noise=runs["noise_factor"].map("{:g}".format),
+        latency=[MISSING if pd.isna(value) else f"{value:g}" for value in runs["latency_periods"]],
+    )
+    return runs.groupby([*SWEEP_KEYS, "outcome"], sort=False).size().rename("runs").reset_index()
+
+
+def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:
+    value = column_of(runs, name).median()
+    return MISSING if pd.isna(value) else f"{factor * value:.{digits}f}"

@@ -1,0 +1,80 @@
+"""What came of a run, in one word; `status` says how it ended.
+
+| outcome | of | meaning |
+|---|---|---|
+| settled | moves | the run has a settling time: it came into the settling band and stayed there |
+| not_settled | moves | it did not, for none of the reasons below |
+| followed | curves | the RMS error of the judged part is at most two settling bands, 10 mm on a UR5 |
+| not_followed | curves | it is larger, for none of the reasons below |
+| target_unreachable | both | the true arm cannot come into the band around the target or a judged part of the curve |
+| joint_at_limit | both | for a second a joint was at its stop while the error was outside the band |
+| a status | both | the run did not complete |
+
+The first word that applies counts, from the good ones over `target_unreachable` to `joint_at_limit`: a target out of
+reach drives joints to their stops, not the other way round. The band of a curve is two settling bands wide.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from servobench.harness.run.log import Steps
+from servobench.harness.run.metrics import SETTLING_BAND
+from servobench.harness.run.tasks import Scenario
+from servobench.plant.checks import FloatArray
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.inverse import closest_distance
+
+SETTLED, NOT_SETTLED = "settled", "not_settled"
+FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"
+TARGET_UNREACHABLE, JOINT_AT_LIMIT = "target_unreachable", "joint_at_limit"
+ACHIEVED: Final = (SETTLED, FOLLOWED)
+OUTCOMES: Final = (*ACHIEVED, NOT_SETTLED, NOT_FOLLOWED, TARGET_UNREACHABLE, JOINT_AT_LIMIT)  # beside the faults
+
+FOLLOWING_BANDS: Final = 2.0  # settling bands: an RMS error of 10 mm on the UR5
+AT_STOP: Final = 1e-6  # [rad] from a joint's stop
+HELD: Final = 1.0  # [s] at a stop
+CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
+
+
+def find_outcome(
+    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: HandEyeModel | None
+) -> str:
+    """Return what came of a run that completed.
+
+    Args:
+        steps: its rows.
+        scenario: its task.
+        settling_time: [s]; NaN if it never settled.
+        rms_error_evaluated: of the judged part [unit of the feature].
+        robot: the true arm with the camera as it is at the end of the run; None if only the plant knows it.
+    """
+    move = scenario.kind == "point_to_point"
+    band = (1.0 if move else FOLLOWING_BANDS) * SETTLING_BAND * steps.spec.feature.scale
+    if not math.isnan(settling_time) if move else rms_error_evaluated <= band:
+        return SETTLED if move else FOLLOWED
+    if robot is not None and _is_out_of_reach(steps, robot, scenario.evaluate_from, band):
+        return TARGET_UNREACHABLE
+    if joint_rests_at_limit(steps, band):
+        return JOINT_AT_LIMIT
+    return NOT_SETTLED if move else NOT_FOLLOWED
+
+
+def joint_rests_at_limit(steps: Steps, band: float) -> bool:
+    """Return whether a joint of a single run stays at its stop for a second while the error is outside the band."""
+    q, spec = steps.joint_position, steps.spec
+    at_stop = (q >= spec.joint_upper - AT_STOP) | (q <= spec.joint_lower + AT_STOP)
+    held = at_stop & (steps.error_norm() > band)[:, None]
+    rows = max(1, math.ceil(HELD / spec.period - 1e-9))
+    count = np.vstack([np.zeros((1, spec.n), dtype=np.intp), np.cumsum(held, axis=0)])
+    return bool((count[rows:] - count[:-rows] == rows).any())
+
+
+def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, band: float) -> bool:
+    judged = steps.reference[np.searchsorted(steps.time, evaluate_from - 1e-9) :]
+    points: FloatArray = np.unique(judged[:: max(1, len(judged) // CURVE_POINTS)], axis=0)
+    spec = steps.spec
+    return bool((closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper) > band).any())

@@ -1,0 +1,85 @@
+"""How near an arm can bring its ball to a point: inverse kinematics of the position alone, within the joint limits.
+
+Levenberg and Marquardt's damped least squares from many starts at once. With the error e = p* − p(q), of each start and
+point by itself,
+
+    Δq = Jᵀ (J Jᵀ + λ I)⁻¹ e,        q ← clip(q + Δq, lower, upper)   if that brings the ball nearer
+
+where J is the arm's own position Jacobian without the columns of those joints that are at a stop and would leave it.
+The damping λ shrinks after a step that is taken and grows after one that is not. A point that can be reached has
+many solutions, and most starts find one; of a point out of reach the nearest place that the ball can be at is found.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import norm, plus_diagonal, transposed
+from servobench.plant.robot.arm import SerialArm
+
+STARTS: Final = 16
+ITERATIONS: Final = 120
+CLOSE_ENOUGH: Final = 1e-6  # [m] a point counts as reached, and the search for it ends
+FIRST_DAMPING: Final = 1e-2  # [m²]
+DAMPING_BOUNDS: Final = (1e-9, 1e6)  # [m²]
+SHRINK, GROW = 0.3, 4.0  # of the damping after a step that is taken, and after one that is not
+
+
+def closest_distance(
+    arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike, starts: int = STARTS
+) -> FloatArray:
+    """Return how near the ball can be brought to a point.
+
+    Args:
+        arm: one arm, or arms whose leading axes are the last ones of the points'.
+        point: (..., 3), in the base frame [m].
+        lower: (n,), joint limits [rad].
+        upper: (n,) [rad].
+        starts: from how many joint positions the search begins; more of them miss the nearest place less often.
+
+    Returns:
+        (...) [m]; of a point that can be reached, at most `CLOSE_ENOUGH`.
+    """
+    target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
+    q = _starts(starts, target.shape[:-1], low, high)
+    error, J = _error(arm, target, q)
+    distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
+    for _ in range(ITERATIONS):
+        found = distance.min(axis=0) <= CLOSE_ENOUGH
+        if found.all():
+            break
+        tried = _step(q, error, J, damping, low, high)
+        new_error, new_J = _error(arm, target, tried)
+        nearer = (norm(new_error) < distance) & ~found
+        q = np.where(nearer[..., None], tried, q)
+        error, J = np.where(nearer[..., None], new_error, error), np.where(nearer[..., None, None], new_J, J)
+        distance = norm(error)
+        damping = np.clip(damping * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
+    return np.asarray(distance.min(axis=0))
+
+
+def _starts(count: int, lead: tuple[int, ...], lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """Return where the search begins, (count, ..., n) rad: the same joint positions for every point, within a turn."""
+    drawn = np.random.default_rng(0).uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower)))
+    return np.broadcast_to(drawn.reshape(count, *(1,) * len(lead), -1), (count, *lead, len(lower))).copy()
+
+
+def _error(arm: SerialArm, target: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the error, (starts, ..., 3) m, and the position Jacobian, (starts, ..., 3, n) m/rad."""
+    ball, J = arm.ball_and_jacobian(q)
+    return target - ball, np.ascontiguousarray(J)
+
+
+def _step(
+    q: FloatArray, error: FloatArray, J: FloatArray, damping: FloatArray, lower: FloatArray, upper: FloatArray
+) -> FloatArray:
+    """Return the joint positions after a damped step, (starts, ..., n) rad, within the limits."""
+    downhill = np.vecmat(error, J)
+    free = ~((q <= lower) & (downhill < 0.0) | (q >= upper) & (downhill > 0.0))
+    J = J * free[..., None, :]
+    weighted = np.linalg.solve(plus_diagonal(J @ transposed(J), damping[..., None]), error[..., None])[..., 0]
+    return np.asarray(np.clip(q + np.vecmat(weighted, J), lower, upper))
