@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -53,6 +54,13 @@ def test_the_notebook_runs_on_every_kind_of_folder(monkeypatch, capsys, tmp_path
     for cell in notebook_cells():
         exec(compile("".join(cell["source"]), "analysis.ipynb", "exec"), names)
     assert "HTML object" in capsys.readouterr().out
+
+
+def test_infinity_is_the_sign_in_numbers_as_in_intervals_and_still_sorts_as_a_number():
+    table = pd.DataFrame({"time": [1.5, np.inf], "word": ["inf", "none"]})
+    html = report.sortable_table(table)
+    assert r"[\"∞\", \"___Infinity___\"]" in html
+    assert html.count(r"\"inf\"") == 1  # the word, which is no number
 
 
 def test_a_comparison_ends_with_a_report_that_holds_everything_in_itself(compared):
@@ -139,7 +147,7 @@ def test_the_page_of_a_comparison_works_in_a_browser_without_a_network(compared,
         assert page.evaluate("document.querySelector('#paths').data.length") == 8
         headings = page.evaluate("Array.from(document.querySelectorAll('h2'), h => h.firstChild.textContent)")
         assert headings == page.evaluate("Array.from(document.querySelectorAll('nav a'), a => a.textContent)")
-        assert len(headings) == 8
+        assert len(headings) == 9
         assert page.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)")
         assert "exp2 on kinematic" in page.evaluate("document.querySelector('#paths').textContent")
         assert not page.evaluate("document.querySelector('[data-title*=Share]')")
