@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, NamedTuple, final
 
 import numpy as np
@@ -10,6 +11,7 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, Stage
+from servobench.controllers.laws.preview import check_preview, in_periods, sampled
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, sum_of_squares, update_step
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
@@ -27,9 +29,9 @@ class RbfnnConfig:
     """Settings of the online update; the structure of the network (L_e, L_c, N_h, kernel) belongs to its training."""
 
     horizon: Count = 8
-    """[periods] T, predicted steps."""
+    """[1] T, predicted steps, each as long as `training.controller.step`."""
     k: Annotated[Positive, Lt(2.0)] = 0.1
-    """[1] share of the predicted error that one update removes; a large one is fast and little damped."""
+    """[1] share of the predicted error that the updates of one step remove; a large one is fast and little damped."""
     epsilon: NonNegative = 1e-3
     """[m⁴] ε; updates fade where predicted errors are millimetres."""
     preview: bool = True
@@ -47,8 +49,8 @@ class RbfnnState(NamedTuple):
 
     Attributes:
         learned: W − W(0), (..., n, p, N_h).
-        errors: e(k), e(k−1), …, (..., L_e, m), m; NaN before the first command.
-        positions: q(k−1), q(k−2), …, (..., L_c, n), rad.
+        errors: e, the newest one first, a row for each control period, (..., rows, m), m; NaN before the first command.
+        positions: q, likewise, (..., rows, n), rad.
         predicted: e(k+1) … e(k+T), (..., T, m), m, as the last command predicted them.
         step_size: α of the last update, (...).
     """
@@ -62,15 +64,21 @@ class RbfnnState(NamedTuple):
 
 @final
 class RbfnnLaw(Law[RbfnnState]):
-    """u(k) = (ψ(k) ξ(k) − q) / dt, with ψ_j = W_j h(ξ) learned online.
+    """u(k) = (ψ(k) ξ(k) − q) / s, with ψ_j = W_j h(ξ) learned online.
 
         ξ(k) = [e(k) … e(k−L_e+1), q(k−1) … q(k−L_c)]                        (eq. 11)
         h_l = exp(−‖ξ − c_l‖ / γ_l²)                                          (eq. 16)
         W_j ← W_j + α Σ_{t=1..T} [Ĵᵀ e(k+t)] ξ_j(k+t−1) h(k+t−1)ᵀ             (eqs. 18, 19)
-        α = k Σ ‖e(k+t)‖² / (ε + ‖Σ_t …‖²_F),   0 < k < 2                     (eq. 23)
+        α = k' Σ ‖e(k+t)‖² / (ε + ‖Σ_t …‖²_F),   0 < k' < 2                    (eq. 23)
+
+    All of it counts in steps of s seconds, the step for which the network was trained, and not in control periods of dt
+    seconds: k ± 1 is s later or earlier. The update is an Euler step of an integration, which in continuous time is
+    dW/dt = (k / s) Σ ‖e‖² / (ε + ‖…‖²_F) Σ_t …; in each control period k' = k dt / s of it are made (`update_share`).
+    Command and learning per second therefore do not depend on the control rate. The paper has s = dt.
 
     e(k+t) come from `roll_out`; the command uses the new weights. Symbols: e = y_ref − y (..., m) m; q joint position
-    (..., n) rad; Ĵ (..., m, n) m/rad; W_j (..., n, N_h); T horizon; α step size.
+    (..., n) rad; Ĵ (..., m, n) m/rad; W_j (..., n, N_h); T horizon; α step size;
+    s step [s].
 
     Departures from the paper:
     - ε, and the joint-speed limit in prediction and command.
@@ -96,25 +104,27 @@ class RbfnnLaw(Law[RbfnnState]):
             raise ValueError(
                 f"network must be of {spec.n} joints and {spec.m} features, got {network.n} and {network.m}"
             )
-        if config.preview and knowledge.preview < config.horizon:
-            raise ValueError(
-                f"preview must be at least the horizon of {config.horizon} rows, got {knowledge.preview}; "
-                "lengthen it, shorten the horizon or switch the law's preview off"
-            )
+        if config.preview:
+            check_preview(config.horizon * network.step, knowledge.preview, spec.period, "the law's horizon")
         self._config = config
         self._network = network
         own: tuple[Stage, ...] = ("posture", "preview") if config.preview else ("posture",)
         self.owns = frozenset(own)
-        self._period = spec.period
-        self._step_limit = spec.joint_velocity_limit * spec.period
+        self._period, self._step = spec.period, network.step
+        self._step_limit = spec.joint_velocity_limit * network.step
+        self._share = update_share(config.k, spec.period, network.step)
+        rate = in_periods(network.step, spec.period)
+        self._preview_places = _places(config.horizon + 1, rate)
+        self._error_places = _places(network.error_history, rate)
+        self._position_places = _places(network.position_history, rate)
 
     def start(self, observation: Observation) -> RbfnnState:
         """Return the state of the offline network."""
         network, lead, q = self._network, observation.feature.shape[:-1], observation.joint_position
         return RbfnnState(
             learned=np.zeros((*lead, *network.weights.shape)),
-            errors=np.full((*lead, network.error_history, network.m), np.nan),
-            positions=np.repeat(q[..., None, :], network.position_history, axis=-2),
+            errors=np.full((*lead, _rows(self._error_places), network.m), np.nan),
+            positions=np.repeat(q[..., None, :], _rows(self._position_places), axis=-2),
             predicted=np.zeros((*lead, self._config.horizon, network.m)),
             step_size=np.zeros(lead),
         )
@@ -132,14 +142,15 @@ class RbfnnLaw(Law[RbfnnState]):
         if config.row_space_only:
             learned = project_to_row_space(learned, jacobian)
         weights, steps = self._network.weights + learned, self._reference_steps(reference)
-        ahead = roll_out(self._network, weights, jacobian, (errors, positions), steps, self._step_limit)
+        history = sampled(errors, self._error_places), sampled(positions, self._position_places)
+        ahead = roll_out(self._network, weights, jacobian, history, steps, self._step_limit)
         direction = descent_direction(jacobian, ahead)
         alpha, wanted = self._update(direction, ahead, observation.feature_valid)
         direction *= alpha[..., None, None, None]
         learned = np.add(learned, direction, out=direction)  # weights are large: no array more than is needed
         alpha = np.where(observation.feature_valid, alpha, state.step_size)[()]
         new = RbfnnState(learned, errors, positions, ahead.errors, alpha)
-        return new, wanted / self._period
+        return new, wanted / self._step
 
     def noted(self, state: RbfnnState, joint_velocity: FloatArray, limited: BoolArray) -> RbfnnState:
         """Return the state with the step that is sent among the commanded positions; see `Law.noted`."""
@@ -163,7 +174,8 @@ class RbfnnLaw(Law[RbfnnState]):
         horizon = self._config.horizon
         if not self._config.preview:
             return np.zeros((*reference.shape[:-2], horizon, self._network.m))
-        return np.asarray(reference[..., 1 : horizon + 1, :] - reference[..., :horizon, :])
+        rows = sampled(reference, self._preview_places)
+        return np.asarray(rows[..., 1:, :] - rows[..., :-1, :])
 
     def _update(self, direction: FloatArray, ahead: RollOut, valid: bool | BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return α, (...), and the joint step that the weights want with the update α G, (..., n), rad.
@@ -172,7 +184,7 @@ class RbfnnLaw(Law[RbfnnState]):
         further is dropped.
         """
         config = self._config
-        alpha = update_step(direction, ahead, config.k, config.epsilon) * valid
+        alpha = update_step(direction, ahead, self._share, config.epsilon) * valid
         push = controller_output(direction, ahead.xi[..., 0, :], ahead.h[..., 0, :])
         renewed = ahead.wanted + alpha[..., None] * push
         if not config.anti_windup:
@@ -183,6 +195,30 @@ class RbfnnLaw(Law[RbfnnState]):
         return alpha, ahead.wanted + alpha[..., None] * push
 
 
+def update_share(k: float, period: float, step: float) -> float:
+    """Return k', the share of the predicted error that one update removes, below 2.
+
+    Args:
+        k: that of the updates of one step, below 2.
+        period: of control, in which one update is made [s].
+        step: [s].
+
+    Returns:
+        k period / step; where a period takes several steps, not more than all of the error, or k.
+    """
+    return min(k * in_periods(period, step), max(k, 1.0))
+
+
+def _places(count: int, rate: float) -> FloatArray:
+    """Return `count` instants that lie `rate` periods apart, in periods from the first one."""
+    return np.array([rate * step for step in range(count)])
+
+
+def _rows(places: FloatArray) -> int:
+    """Return how many rows a history needs that is sampled at these places."""
+    return 1 + math.ceil(float(places[-1]))
+
+
 def _filled_by_first(errors: FloatArray) -> FloatArray:
-    """Return errors (..., L_e, m) that are all the first one."""
+    """Return errors (..., rows, m) that are all the first one."""
     return np.repeat(errors[..., :1, :], errors.shape[-2], axis=-2)

@@ -1,6 +1,6 @@
 """The predicted loop of the proposed method and the update of its controller matrix (eqs. 7–27), as pure functions.
 
-With Ĵ and the weights frozen, for t = 1 … T:
+With Ĵ and the weights frozen, for t = 1 … T, in steps of the length for which the network was trained:
 
     q(k+t−1) = limit(ψ(ξ) ξ),   e(k+t) = y_ref(k+t) − y_ref(k+t−1) + e(k+t−1) − Ĵ Δq(k+t−1)
     G_j = Σ_t [Ĵᵀ e(k+t)] ξ_j(k+t−1) h(k+t−1)ᵀ,   α = k Σ_t ‖e(k+t)‖² / (ε + ‖G‖²_F),   W_j ← W_j + α G_j
@@ -54,7 +54,7 @@ def roll_out(
         jacobian: Ĵ, (..., m, n), m/rad.
         history: errors e(k) …, (..., L_e, m), and joint positions q(k−1) …, (..., L_c, n), the newest first.
         reference_steps: y_ref(k+t) − y_ref(k+t−1) for t = 1 … T, (..., T, m), m.
-        step_limit: (n,), rad, largest joint step of a period.
+        step_limit: (n,), rad, largest joint step.
 
     Returns:
         Errors, information vectors and hidden layers.

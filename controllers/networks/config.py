@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from annotated_types import Ge, Len, Lt
 
-from servobench.controllers.networks.rbf import Kernel
+from servobench.controllers.networks.rbf import STEP, Kernel
 from servobench.plant.checks import FloatArray, as_vector
 from servobench.plant.settings import Count, NonNegative, Number, Periods, Positive, nested, settings
 
@@ -48,6 +48,8 @@ class ControllerTraining:
     """[1] N_h, units."""
     kernel: Kernel = "exponential"
     """Of eq. 16; "gaussian" squares the norm."""
+    step: Positive = STEP
+    """[s] s, in which the network thinks, whatever the control period; the paper's is the control period."""
     gain: Positive = 3.0
     """[1/s] K_p of the law that is imitated."""
     posture_gain: NonNegative = 0.5

@@ -13,7 +13,7 @@ from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwo
 from servobench.plant.files import write_atomically
 
 FORMAT = "servobench networks"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 ARRAYS = ("centres", "widths", "weights")  # of either network
 
 
@@ -109,6 +109,7 @@ def _as_arrays(networks: TrainedNetworks) -> dict[str, Any]:
         "sizes": np.array([jacobian.n, jacobian.m]),
         "history": np.array([controller.error_history, controller.position_history]),
         "kernel": np.array(controller.kernel),
+        "step": np.array(controller.step),
         "held_out_error": np.array([networks.jacobian_error, networks.controller_error]),
         **{f"jacobian_{name}": getattr(jacobian, name) for name in ARRAYS},
         **{f"controller_{name}": getattr(controller, name) for name in ARRAYS},
@@ -123,5 +124,6 @@ def _from_arrays(arrays: dict[str, Any]) -> TrainedNetworks:
         raise ValueError(f"sizes must be {(jacobian.n, jacobian.m)}, got {arrays['sizes'].tolist()}")
     centres, widths, weights = (arrays[f"controller_{name}"] for name in ARRAYS)
     kernel = cast(Kernel, str(arrays["kernel"]))
-    controller = ControllerNetwork(centres, widths, weights, error_history, position_history, kernel)
+    step = float(arrays["step"])
+    controller = ControllerNetwork(centres, widths, weights, error_history, position_history, kernel, step)
     return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, str(arrays["digest"]))

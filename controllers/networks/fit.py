@@ -5,11 +5,11 @@ Jacobian network: ridge least squares of W_i on J_i(q) = W_i θ_i(q), one fit fo
 Controller network, one of two fits by ridge least squares on samples of ξ:
 
 - "output" (default): ψ ξ ≈ q_cmd, linear in W with the features ξ ⊗ h(ξ);
-- "entries" (the paper's reading): ψ ≈ [K_p dt J⁺, 0, I, 0], linear in W with the features h(ξ). Its error in the
+- "entries" (the paper's reading): ψ ≈ [K_p s J⁺, 0, I, 0], linear in W with the features h(ξ). Its error in the
   identity block is multiplied by joint positions of some radians.
 
 The paper's ideal law leaves the null space of J alone, so an arm with n > m wanders out of the region on which it was
-trained. The output fit therefore imitates ψ ξ ≈ q + K_p dt J⁺ e + K_n dt (I − J⁺J)(q_c − q), which draws the posture
+trained. The output fit therefore imitates ψ ξ ≈ q + K_p s J⁺ e + K_n s (I − J⁺J)(q_c − q), which draws the posture
 towards the region's middle q_c without moving the feature; K_n = 0 is the paper's law.
 
 Widths and regularisation are the best of a small grid on held-out samples. Nothing here is random beyond the
@@ -56,7 +56,7 @@ def train(
     Args:
         config: region, sizes, grids and seed.
         nominal_jacobian: (S, n) rad -> (S, m, n).
-        spec: sizes, speed limit and control period.
+        spec: sizes and speed limit.
         progress: called with the share that is done and what is being done.
 
     Returns:
@@ -125,7 +125,7 @@ def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> Traine
 
 
 def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, spec: PlantSpec) -> str:
-    """Return a hash of all that the networks depend on: configuration, sizes, period, speed limit and model.
+    """Return a hash of all that the networks depend on: configuration, sizes, speed limit and model.
 
     Raises:
         ValueError: as `train`.
@@ -136,7 +136,6 @@ def training_digest(config: TrainingConfig, nominal_jacobian: JacobianFunction, 
     content = {
         "config": asdict(config),
         "sizes": [spec.n, spec.m],
-        "period": spec.period,
         "joint_velocity_limit": spec.joint_velocity_limit.tolist(),
         "model": (np.round(J, DIGEST_DECIMALS) + 0.0).ravel().tolist(),
     }
@@ -196,7 +195,7 @@ def _train_controller(
         h = hidden_features(samples.xi, centres, widths, plan.kernel)
         for weights in _controller_weights(plan, samples, wanted, h, held):
             candidate = ControllerNetwork(
-                centres, widths, weights, plan.error_history, plan.position_history, plan.kernel
+                centres, widths, weights, plan.error_history, plan.position_history, plan.kernel, plan.step
             )
             error = float(np.sqrt(np.mean((candidate.command(samples.xi[:held]) - wanted[:held]) ** 2)))
             if error < best:
@@ -223,7 +222,7 @@ def _controller_weights(
 
 
 def ideal_controller_matrix(gain: FloatArray, error_history: int, position_history: int) -> FloatArray:
-    """Return ψ* = [K_p dt J⁺, 0, I, 0] (eq. 10), (S, n, m L_e + n L_c), from K_p dt J⁺ (S, n, m)."""
+    """Return ψ* = [K_p s J⁺, 0, I, 0] (eq. 10), (S, n, m L_e + n L_c), from K_p s J⁺ (S, n, m)."""
     count, n, m = gain.shape
     psi = np.zeros((count, n, m * error_history + n * position_history))
     psi[:, :, :m] = gain

@@ -26,6 +26,7 @@ from servobench.plant.lanes import transposed
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)
+STEP = 0.05  # [s] default step of a controller network
 MAX_EXPONENT = 60.0
 MIN_EXPONENT = np.array(-MAX_EXPONENT)
 
@@ -216,6 +217,7 @@ class ControllerNetwork:
         error_history: L_e, how many errors ξ holds.
         position_history: L_c, how many joint positions ξ holds.
         kernel: of the hidden layer, see `hidden_features`.
+        step: between the instants of ξ, and from q to the position ψ ξ [s].
     """
 
     centres: FloatArray
@@ -224,11 +226,14 @@ class ControllerNetwork:
     error_history: int
     position_history: int
     kernel: Kernel = "exponential"
+    step: float = STEP
 
     def __post_init__(self) -> None:
         """Check that arrays and sizes fit together and freeze the arrays."""
         if self.kernel not in KERNELS:
             raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, got {self.kernel!r}")
+        if not 0.0 < self.step < np.inf:
+            raise ValueError(f"step must be positive, got {self.step}")
         if self.weights.ndim != 3 or 0 in self.weights.shape:
             raise ValueError(f"weights must be (n, p, N_h) with all sizes at least 1, got {self.weights.shape}")
         n, p, hidden = self.weights.shape

@@ -62,8 +62,8 @@ class ControllerSamples:
         xi: ξ, (S, p), m and rad.
         error: e(k), (S, m), m.
         position: q(k−1), (S, n), rad.
-        gain: K_p dt J⁺ at q(k−1), (S, n, m), rad/m.
-        posture_step: K_n dt (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
+        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m.
+        posture_step: K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
     """
 
     xi: FloatArray
@@ -96,14 +96,14 @@ def controller_samples(
     Args:
         unit: (S, controller_dimension), points of the unit cube.
         config: the region, the gains and from where the errors and histories come.
-        spec: sizes, speed limit and control period.
+        spec: sizes and speed limit.
         jacobian: of the nominal model, vectorised.
     """
     plan, (lower, upper), (n, m) = config.controller, config.region(spec.n), (spec.n, spec.m)
     q = joint_samples(unit[:, :n], lower, upper)
     direction, magnitude = 2.0 * unit[:, n : n + m] - 1.0, unit[:, n + m : n + m + 1]
     error = plan.error_range * magnitude * direction
-    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (spec.joint_velocity_limit * spec.period)
+    steps = (2.0 * unit[:, n + m + 1 :].reshape(len(unit), -1, n) - 1.0) * (spec.joint_velocity_limit * plan.step)
     back = np.concatenate([np.zeros((len(unit), 1, n)), np.cumsum(steps, axis=1)], axis=1)
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
@@ -112,5 +112,5 @@ def controller_samples(
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
-    proportional, posture = plan.gain * spec.period, posture_gain * spec.period
+    proportional, posture = plan.gain * plan.step, posture_gain * plan.step
     return ControllerSamples(information_vector(errors, positions), error, q, proportional * pinv, posture * free)

@@ -1,5 +1,9 @@
 """Tests of the proposed law: automatic differentiation, contraction, plain loops, a step by hand and refusals."""
 
+import math
+from dataclasses import replace
+from itertools import pairwise
+
 import casadi
 import numpy as np
 import pytest
@@ -9,7 +13,7 @@ from hypothesis import strategies as st
 from kit.toy import PERIOD, PREVIEW, Commanding, only_controller, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
+from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw, update_share
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, update_step
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
 from servobench.controllers.stages.limit import scale_to_limit
@@ -249,5 +253,54 @@ def test_nothing_to_descend_gives_no_step():
 def test_a_network_of_another_robot_and_a_short_preview_are_refused():
     with pytest.raises(ValueError, match="network must be of 6 joints and 3 features, got 3 and 2"):
         RbfnnLaw(RbfnnConfig(), knowledge(6, 3), only_controller(network()))
-    with pytest.raises(ValueError, match="preview must be at least the horizon of 8 rows, got 7"):
+    with pytest.raises(ValueError, match="preview must reach the law's horizon = 0.4 s, got 7 rows of 0.05 s"):
         RbfnnLaw(RbfnnConfig(horizon=8), knowledge(preview=7), only_controller(network()))
+
+
+def at_rate(rate, net, **config):
+    """Return a law that is asked every `rate` seconds, and its preview of a reference at rest."""
+    spec = replace(plant_spec(net.n, net.m, 1e6), period=rate)
+    made = RbfnnLaw(RbfnnConfig(**config), RobotKnowledge(spec, math.ceil(0.5 / rate)), only_controller(net))
+    return made, math.ceil(0.5 / rate) + 1
+
+
+def test_every_update_removes_its_part_of_what_the_updates_of_one_step_remove():
+    assert update_share(0.1, 0.05, 0.05) == 0.1
+    assert update_share(0.1, 0.004, 0.05) == pytest.approx(0.008)
+    assert update_share(0.4, 0.1, 0.05) == pytest.approx(0.8)
+    assert update_share(0.4, 1.0, 0.05) == 1.0
+    assert update_share(1.7, 1.0, 0.05) == 1.7
+
+
+@pytest.mark.parametrize(("error_history", "position_history"), [(1, 1), (3, 2)])
+@pytest.mark.parametrize("position", ["measured", "commanded"])
+def test_what_is_seen_at_another_rate_asks_for_the_same_velocity(error_history, position_history, position):
+    # Feature, joints and reference move evenly. Without learning every rate has the same ξ and the same command.
+    net, J = network(error_history=error_history, position_history=position_history), np.ones((2, 3)) + np.eye(2, 3)
+    velocity, commands, predicted = np.array([0.3, -0.2, 0.1]), [], []
+    for rate in (0.1, PERIOD, 0.02, 0.004):
+        made, rows = at_rate(rate, net, k=1e-9, position=position)
+        ahead = 0.5 + np.outer(np.arange(rows) * rate, [0.2, 0.4])
+        state = made.start(seen(-velocity, np.zeros(2)))
+        for k in range(-round(1.0 / rate), 1):
+            look = seen(velocity * k * rate, -J @ velocity * k * rate)
+            state, u = made.command(state, Estimate(J), look, ahead)
+            state = made.noted(state, velocity, np.asarray(False))
+        commands.append(u)
+        predicted.append(state.predicted)
+    np.testing.assert_allclose(commands, np.tile(commands[1], (4, 1)), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(predicted, np.tile(predicted[1], (4, 1, 1)), rtol=0, atol=1e-6)
+
+
+def test_learning_per_second_does_not_depend_on_the_rate():
+    net, J, look = network(), np.ones((2, 3)) + np.eye(2, 3), seen(np.full(3, 0.5), np.zeros(2))
+    learned = []
+    for rate in (0.01, 0.005, 0.0025):
+        made, rows = at_rate(rate, net, k=0.1)
+        state = made.start(look)
+        for _ in range(round(0.5 / rate)):
+            state, _ = made.command(state, Estimate(J), look, np.full((rows, 2), 0.3))
+        learned.append(state.learned)
+    np.testing.assert_allclose(learned[2], learned[1], rtol=0, atol=0.05 * np.abs(learned[1]).max())
+    coarse, fine = (np.abs(one - two).max() for one, two in pairwise(learned))
+    assert fine == pytest.approx(coarse / 2.0, rel=0.2)  # an Euler step of the same integration

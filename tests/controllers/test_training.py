@@ -142,14 +142,34 @@ def test_progress_is_told_from_none_to_all():
     assert {what for _, what in told} == {"Jacobian network", "controller network", "done"}
 
 
+def of_step(step):
+    return dataclasses.replace(CONFIG, controller=dataclasses.replace(CONFIG.controller, step=step))
+
+
 def test_the_digest_tells_models_sizes_and_settings_apart():
     digests = {
         training_digest(CONFIG, planar_jacobian, SPEC),
         training_digest(CONFIG, longer_jacobian, SPEC),
         training_digest(dataclasses.replace(CONFIG, seed=1), planar_jacobian, SPEC),
-        training_digest(CONFIG, planar_jacobian, dataclasses.replace(SPEC, period=0.1)),
+        training_digest(of_step(0.1), planar_jacobian, SPEC),
     }
     assert len(digests) == 4
+
+
+def test_one_training_serves_all_control_rates(networks):
+    other = dataclasses.replace(SPEC, period=0.004)
+    assert training_digest(CONFIG, planar_jacobian, other) == networks.digest
+    found = train(CONFIG, planar_jacobian, other).controller
+    np.testing.assert_array_equal(found.weights, networks.controller.weights)
+    assert found.step == CONFIG.controller.step
+
+
+def test_the_step_scales_the_gains_that_are_imitated():
+    unit = np.random.default_rng(0).random((20, controller_dimension(CONFIG, SPEC)))
+    one, two = (controller_samples(unit, of_step(step), SPEC, planar_jacobian) for step in (0.05, 0.1))
+    np.testing.assert_allclose(two.gain, 2.0 * one.gain, rtol=1e-12)
+    np.testing.assert_allclose(two.posture_step, 2.0 * one.posture_step, rtol=1e-12)
+    assert train(of_step(0.1), planar_jacobian, SPEC).controller.step == 0.1
 
 
 def test_the_cache_trains_once_for_each_configuration_and_model(tmp_path, networks):
@@ -225,7 +245,7 @@ def test_corrupt_and_foreign_files_are_refused_in_one_line(tmp_path, networks):
         np.savez(path, **{**arrays, name: value})
         with pytest.raises(ValueError, match="is corrupt: "):
             load_networks(path)
-    np.savez(path, format=np.array(FORMAT), format_version=np.array(1))
+    np.savez(path, format=np.array(FORMAT), format_version=np.array(2))
     with pytest.raises(ValueError, match="is corrupt: "):
         load_networks(path)
 
@@ -236,7 +256,7 @@ def test_files_of_another_version_robot_or_configuration_and_missing_ones_are_re
     with pytest.raises(ValueError, match=r"training digest \w+, wanted 00"):
         load_networks(path, digest="00")
     np.savez(path, **{**stored_arrays(path), "format_version": np.array(99)})
-    with pytest.raises(ValueError, match="has format version 99, wanted 1"):
+    with pytest.raises(ValueError, match="has format version 99, wanted 2"):
         load_networks(path)
     with pytest.raises(ValueError, match="does not exist"):
         load_networks(tmp_path / "none.npz")
