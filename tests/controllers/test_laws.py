@@ -47,7 +47,7 @@ def closed_loop(law, lanes):
             state = law.start(look)
         ahead = np.moveaxis(reference[k : k + PREVIEW + 1, lanes], 0, -2)
         state, u = law.command(state, Estimate(J[k, lanes], delay), look, np.ascontiguousarray(ahead))
-        state = law.noted(state, u)
+        state = law.noted(state, u, np.full(np.shape(lanes), False))
         found.append((u, dict(law.diagnostics(state))))
         q = q + 0.9 * u * PERIOD
         past.append(q)

@@ -95,7 +95,7 @@ def test_every_plan_satisfies_the_optimality_conditions_of_the_problem_as_it_is_
     for _ in range(4):
         before = state
         state, velocity = law.command(before, Estimate(J), observation, reference)
-        state = law.noted(state, velocity)
+        state = law.noted(state, velocity, np.full(LANES, False))
         y = observation.feature + np.array([J[i] @ before.sent[i].sum(axis=0) for i in range(LANES)])
         places = (config.delay + BLOCK * np.arange(7)) / period
         for i in np.flatnonzero(state.plan.success):

@@ -27,7 +27,7 @@ from servobench.controllers.networks.samples import (
     unit_points,
 )
 
-TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac_plus", "rbf_pid")]
+TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid")]
 N, M = 3, 2
 SPEC = plant_spec(N, M)
 JACOBIAN = JacobianTraining(centres=40, samples=400)

@@ -88,7 +88,7 @@ class Commanding:
 
     def command(self, estimate, observation, reference):
         state, u = self.law.command(self.state, estimate, observation, reference)
-        self.state = self.law.noted(state, u)
+        self.state = self.law.noted(state, u, np.full(np.shape(u)[:-1], False))
         return u
 
     def diagnostics(self):
