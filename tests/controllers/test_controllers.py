@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kit.toy import plant_spec, seen
+from kit.toy import KNOWLEDGE, networks, plant_spec, seen
 from servobench.controllers import nmpc_calibrated
+from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
@@ -120,7 +121,12 @@ def test_estimator_law_and_servo_report_different_things(entry):
     (_, _, merged), *_ = random_run(controller, knowledge.spec, 3, 0.5)
     assert isinstance(controller, ServoController)
     servo, state = controller.servo, controller.state
-    names += [*servo.estimator.diagnostics(state.estimator), *servo.law.diagnostics(state.law)]
+    estimation, learned = servo.estimation, state.estimation.learned
+    names += [*estimation.estimator.diagnostics(learned.estimator), *servo.law.diagnostics(state.law), "saturated"]
+    if estimation.pairing is not None:
+        names += estimation.pairing.diagnostics(learned.pair)
+    if servo.predictor is not None:
+        names.append("lead")
     assert sorted(names) == sorted(merged)
 
 
@@ -160,7 +166,7 @@ def test_only_the_calibrated_method_needs_the_truth():
 
 
 def test_the_kalman_filter_commands_what_the_unscented_one_does():
-    knowledge, (unscented, kalman) = robot(6, 3, 11), (METHODS["ukf_mfac"], compose("mfac", "kalman"))
+    knowledge, (unscented, kalman) = robot(6, 3, 11), (METHODS["ukf_mfac:published"], compose("mfac", "kalman"))
     sigma_points = dataclasses.replace(unscented.config(), estimator=UkfConfig(form="sigma_points"))
     runs = [
         random_run(entry.build(config, knowledge), knowledge.spec, 5, 0.5, steps=60)
@@ -172,25 +178,45 @@ def test_the_kalman_filter_commands_what_the_unscented_one_does():
 
 
 def test_a_row_of_the_table_may_change_defaults_of_its_law():
-    assert METHODS["calibrated"].config().law.feedforward
-    assert not compose("pid", "true").config().law.feedforward
+    assert METHODS["ukf_mpc:published"].config().law.mode == "constant"
+    assert METHODS["ukf_mpc"].config().law == compose("mpc", "ukf").config().law
+    assert METHODS["map_mfac"].config().law.gain > 5.0 * compose("mfac", "constant").config().law.gain
 
 
-def test_predictive_and_learning_laws_declare_the_stages_that_they_bring():
-    owned = {name: sorted(part.make.owns - {"limit"}) for name, part in LAWS.items()}
-    expected = {
-        "pid": [],
-        "mfac": [],
-        "mpc": ["predict"],
-        "rbfnn": ["posture"],
-        "rbfnn_bridged": ["posture", "predict"],
-    }
-    assert owned == expected
+def test_laws_declare_the_stages_that_they_bring():
+    for name, config, owned in (
+        ("pid", {}, set()),
+        ("mfac", {}, set()),
+        ("mpc", {}, {"limit", "preview"}),
+        ("mpc", {"use_preview": False, "delay": 0.1}, {"limit", "predict"}),
+        ("rbfnn", {}, {"posture", "preview"}),
+        ("rbfnn", {"preview": False}, {"posture"}),
+    ):
+        part = LAWS[name]
+        made = part.make(part.config(**config), KNOWLEDGE, *([networks()] if part.trained else []))
+        assert made.owns == owned
+
+
+def test_published_means_no_aids_and_plain_names_bring_all_that_their_laws_do_not():
+    published = [name for name in METHODS if name.endswith(":published")]
+    assert len(published) == 7
+    for name in published:
+        assert METHODS[name].config().aids == AidsConfig() == compose("pid", "rls").config().aids
+        aids = METHODS[name.removesuffix(":published")].config().aids
+        assert (aids.delay, aids.response, aids.noise, aids.model) == ("identified", "identified", "identified", "map")
+        assert aids.filter
+    assert METHODS["constant"].config().aids == AidsConfig()
+    assert METHODS["calibrated"].config().aids.delay == METHODS["calibrated"].config().aids.response == "given"
 
 
 def test_a_pair_is_called_by_its_parts_and_has_a_training_only_with_networks():
     assert compose("pid", "rls").name == "pid+rls"
-    assert [f.name for f in dataclasses.fields(compose("pid", "rls").config())] == ["estimator", "law", "initial"]
+    assert [f.name for f in dataclasses.fields(compose("pid", "rls").config())] == [
+        "estimator",
+        "law",
+        "initial",
+        "aids",
+    ]
     assert hasattr(compose("pid", "rbf").config(), "training")
 
 

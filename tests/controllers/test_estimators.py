@@ -88,7 +88,7 @@ def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq,
 
 def test_the_first_step_of_least_squares_equals_the_one_computed_by_hand():
     # PΔq = (2, 2), K = (2, 2) / (0.5 + 4), misfit 0.2; P = (2I − (2, 2)(2, 2)ᵀ / 4.5) / 0.5
-    J, P = rls_update(np.array([[0.1, 0.1]]), 2.0 * np.eye(2), np.ones(2), np.array([0.4]), forgetting=0.5)
+    J, P = rls_update(np.array([[0.1, 0.1]]), 2.0 * np.eye(2), np.ones(2), np.array([0.4]), forgetting=np.asarray(0.5))
     np.testing.assert_allclose(J, [[0.1 + 0.4 / 4.5] * 2], atol=1e-15)
     np.testing.assert_allclose(P, 2.0 * (2.0 * np.eye(2) - 4.0 / 4.5), atol=1e-14)
 
@@ -133,7 +133,7 @@ def test_joseph_form_keeps_the_covariance_positive_definite_under_nearly_exact_m
     rng = np.random.default_rng(8)
     for _ in range(2000):
         dq = rng.normal(size=6)
-        J, P = split_update(J, P, dq, rng.normal(size=3), q=0.0, r=1e-10)
+        J, P = split_update(J, P, dq, rng.normal(size=3), q=np.float64(0.0), r=np.float64(1e-10))
         assert (P == P.T).all()
         assert np.linalg.eigvalsh(P).min() > 0.0
 
@@ -186,7 +186,7 @@ def test_recursive_least_squares_equals_weighted_batch_least_squares(forgetting)
     DQ, DY = rng.normal(size=(count, n)), rng.normal(size=(count, m))
     J, P = J0, P0
     for dq, dy in zip(DQ, DY, strict=True):
-        J, P = rls_update(J, P, dq, dy, forgetting=forgetting)
+        J, P = rls_update(J, P, dq, dy, forgetting=np.asarray(forgetting))
     weights = np.sqrt(forgetting ** np.arange(count - 1, -1, -1))[:, None]
     prior = np.sqrt(forgetting**count) * np.diag(1 / np.sqrt(np.diag(P0)))
     A, B = np.vstack([weights * DQ, prior]), np.vstack([weights * DY, prior @ J0.T])

@@ -348,7 +348,7 @@ def test_the_control_rate_changes_neither_the_plan_nor_the_command(mode, period)
         law = MpcLaw(MpcConfig(mode=mode, delay=0.1), RobotKnowledge(spec, len(ramp) - 1))
         state = law.start(observe(spec))
         for _ in range(math.ceil(0.1 / rate)):
-            state = law.noted(state, sent, np.asarray(False))
+            state = law.noted(state, sent, np.False_)
         state, velocity = law.command(state, Estimate(J), observe(spec, feature=y), ramp)
         assert state.plan.moves.shape == (10 if mode == "moves" else 1, 6)
         assert state.plan.active_limits > 0 or mode == "constant"

@@ -61,7 +61,7 @@ def test_an_affine_robot_gets_the_same_command_as_from_the_linear_law():
         reference = offset + rng.normal(scale=0.02, size=(13, 2)) + [0.3, -0.2]
         observation = Observation(0.05 * k, q, J @ q + offset)
         state, linear = law.command(state, Estimate(J), observation, reference)
-        state = law.noted(state, linear, np.asarray(False))
+        state = law.noted(state, linear, np.False_)
         np.testing.assert_allclose(controller.step(observation, reference).joint_velocity, linear, atol=1e-7)
         q = q + 0.05 * linear
 

@@ -36,8 +36,9 @@ def knowledge(n=3, m=2, limit=1e6, preview=PREVIEW):
 
 
 def law(net, limit=1e6, preview=PREVIEW, **config):
-    made = RbfnnLaw(RbfnnConfig(**config), knowledge(net.n, net.m, limit, preview), only_controller(net))
-    return Commanding(made, seen(np.zeros(net.n), np.zeros(net.m)))
+    known = knowledge(net.n, net.m, limit, preview)
+    made = RbfnnLaw(RbfnnConfig(**config), known, only_controller(net))
+    return Commanding(made, seen(np.zeros(net.n), np.zeros(net.m)), known)
 
 
 def case(net, seed=1, horizon=4, limit=1e6):
@@ -218,6 +219,7 @@ def test_weight_norms_are_reported():
     made = law(network(), limit=1e-3)
     made.command(ONES, seen(np.ones(3), np.zeros(2)), np.full((PREVIEW + 1, 2), 5.0))
     found = made.diagnostics()
+    assert made.limited
     assert found["controller_weight_norm"] == pytest.approx(np.linalg.norm(network().weights + made.state.learned))
     assert set(found) >= {"criterion", "step_size", "predicted_error", "learned_weight_norm"}
 

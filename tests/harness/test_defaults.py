@@ -42,19 +42,19 @@ def test_the_defaults_of_every_controller_fit_its_class(name):
 
 
 def test_a_tuned_value_replaces_the_default_of_the_class_and_leaves_the_rest(tuned):
-    tuned("score = 0.5\n[settings.law]\nstep_factor = 0.3\n")
+    tuned("score = 0.5\n[settings.law]\ngain = 3.0\n")
     entry = find_controller("ukf_mfac")
-    expected = dataclasses.replace(entry.config(), law=dataclasses.replace(entry.config().law, step_factor=0.3))
+    expected = dataclasses.replace(entry.config(), law=dataclasses.replace(entry.config().law, gain=3.0))
     assert default_config(entry) == expected
     assert entry.config() != expected
 
 
 def test_what_the_user_sets_wins_and_the_manifest_tells_the_tuned_rest(tuned):
-    tuned("[settings.law]\nstep_factor = 0.3\nstep_weight = 0.05\n")
-    settings = Settings({"ukf_mfac": {"law": {"step_factor": 0.4}}})
+    tuned("[settings.law]\ngain = 3.0\nstep_weight = 0.05\n")
+    settings = Settings({"ukf_mfac": {"law": {"gain": 4.0}}})
     requests = [RunRequest("kinematic", "ukf_mfac", "exp2", "none", 0)]
     manifest = describe_batch(survey(requests), resolve_sections(requests, settings), {})
-    assert manifest["configuration"]["ukf_mfac"]["law.step_factor"] == 0.4
+    assert manifest["configuration"]["ukf_mfac"]["law.gain"] == 4.0
     assert manifest["configuration"]["ukf_mfac"]["law.step_weight"] == 0.05
 
 
@@ -71,8 +71,8 @@ def test_a_controller_without_a_file_keeps_the_defaults_of_its_class(tuned):
         ("[settings\n", "tuned values .*ukf_mfac.toml cannot be read"),
         ("score = 1.0\n", "tuned values .*ukf_mfac.toml cannot be read: 'settings'"),
         ("settings = 3\n", r"\[settings\] must be a table, got 3"),
-        ("[settings.law]\nstep_facto = 0.3\n", "ukf_mfac.law has no setting 'step_facto'"),
-        ("[settings.law]\nstep_factor = 3.0\n", "ukf_mfac.law.step_factor must be .* got 3"),
+        ("[settings.law]\ngai = 0.3\n", "ukf_mfac.law has no setting 'gai'"),
+        ("[settings.law]\ngain = -3.0\n", "ukf_mfac.law.gain must be .* got -3"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(tuned, text, message):

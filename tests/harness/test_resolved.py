@@ -20,11 +20,11 @@ def test_a_resolved_run_can_be_sent_to_another_process(controller):
 
 
 def test_a_resolved_run_holds_what_the_user_set_and_what_the_request_varies():
-    settings = Settings({"run": {"preview": 3}, "circle": {"laps": 1}, "ukf_mfac": {"law": {"step_factor": 0.4}}})
+    settings = Settings({"run": {"preview": 3}, "circle": {"laps": 1}, "ukf_mfac": {"law": {"gain": 4.0}}})
     run = resolve(RunRequest("kinematic", "ukf_mfac", "circle", Mismatch(), 0, latency_periods=2), settings)
     assert run.run == RunSettings(preview=3)
     assert run.task.laps == 1
-    assert run.controller.law.step_factor == 0.4
+    assert run.controller.law.gain == 4.0
     assert run.plant.sensing.latency_periods == 2
 
 

@@ -69,7 +69,7 @@ def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkey
             raise kind(f"the feature is at {observation.feature[..., 0].tolist()}")
         return command(self, state, estimate, observation, reference)
 
-    together = runs("ukf_mfac", ROUGH)
+    together = runs("ukf_mfac:published", ROUGH)
     monkeypatch.setattr(MfacLaw, "command", fragile)
     alone = one_by_one(together)
     assert {"completed"} < {row["status"] for row in alone}
@@ -94,7 +94,7 @@ def test_plug_ins_and_rendered_plants_go_alone():
 
 
 @pytest.mark.parametrize("plant", ["kinematic", "fmu"])
-@pytest.mark.parametrize("controller", ["rbfnn_mfac_plus", "ukf_mpc", "nmpc_calibrated"])
+@pytest.mark.parametrize("controller", ["map_mfac", "rbfnn_mfac", "ukf_mpc", "nmpc_calibrated"])
 def test_a_run_branches_into_futures_that_continue_with_the_same_bits(plant, controller):
     experiment = build(runs(controller, {}, plant=plant)[0])
     world, method, run = experiment.plant, experiment.controller, experiment.run

@@ -5,10 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
+from servobench.controllers.stages.finish import Finish
 from servobench.plant.signals import Observation, PlantSpec
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
@@ -81,14 +83,19 @@ def only_controller(network):
 
 
 class Commanding:
-    """A law with the state of one run, or of several side by side."""
+    """A law, and the last stages where `knowledge` is given, with the state of one run, or of several side by side."""
 
-    def __init__(self, law, observation):
-        self.law, self.state = law, law.start(observation)
+    def __init__(self, law, observation, knowledge=None, **aids):
+        self.law, self.state, self.aids = law, law.start(observation), AidsConfig(**aids)
+        self.finish = knowledge and Finish(self.aids, knowledge, type(law).__name__, law.owns)
+        self.limited = np.full(observation.feature.shape[:-1], False)[()]
 
     def command(self, estimate, observation, reference):
         state, u = self.law.command(self.state, estimate, observation, reference)
-        self.state = self.law.noted(state, u, np.full(np.shape(u)[:-1], False))
+        if self.finish:
+            forward = reference[..., 1, :] - reference[..., 0, :] if self.aids.feedforward else np.zeros(())
+            u, self.limited = self.finish.finish(u, estimate.jacobian, observation.joint_position, forward)
+        self.state = self.law.noted(state, u, self.limited)
         return u
 
     def diagnostics(self):
