@@ -11,7 +11,6 @@ from servobench.harness.analysis.comparison import achievement, column_of, outco
 from servobench.harness.analysis.measures import MEASURES, settling_band
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.tables import CONDITIONS, Tables
-from servobench.harness.run.episode import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
 
 BAND: Final = ("settling_band", "feature_unit")
@@ -40,7 +39,7 @@ def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
 
 def summary_legend(runs: pd.DataFrame) -> str:
     """Return what the words in `summary_tables` mean."""
-    return f"done: reached the last period; {outcome_legend([runs])}; the rest are medians over runs"
+    return f"{outcome_legend([runs])}; over: overshoot; numbers are medians over runs"
 
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
@@ -62,17 +61,15 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
             else:
                 special = {
                     "after\ns": _middle(own, "settling_time_s", 1.0, 2),
-                    "overshoot\n%": _middle(own, "overshoot", 100.0, 0),
+                    "over\n%": _middle(own, "overshoot", 100.0, 0),
                 }
             rows.append(
                 {
                     "controller": str(name),
-                    "done": f"{int((own['status'] == COMPLETED).sum())}/{len(own)}",
                     "outcome": _shares(own),
                     **special,
                     f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
                     f"largest\n{unit}": _middle(own, "max_error", factor, 0),
-                    "path\nratio": _middle(own, "path_length_ratio", 1.0, 2),
                     "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0),
                 }
             )
@@ -80,11 +77,9 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
 
 
 def _shares(runs: pd.DataFrame) -> str:
-    """Return a line for each outcome with its share of the runs, or the outcome of a single run."""
-    counts = outcomes(runs).value_counts()
-    return "\n".join(
-        f"{100.0 * n / len(runs):.0f} % {word}" if len(runs) > 1 else str(word) for word, n in counts.items()
-    )
+    """Return the outcome that all runs have, or a line for each outcome with its share."""
+    shares = 100.0 * outcomes(runs).value_counts(normalize=True)
+    return shares.index[0] if len(shares) == 1 else "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
 
 
 def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:

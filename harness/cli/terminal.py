@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEFT = ("controller", "mismatch", "noise", "latency", "pair", "failures", "outcome")  # columns of words
-WHOLE = ("controller", "pair", "outcome")  # columns whose words are not broken over lines
+WHOLE = ("controller", "pair")  # columns whose words are not broken over lines
+UNBROKEN = ("outcome",)  # columns of which no word is broken
 
 console = Console()
 
@@ -22,9 +23,10 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
     from rich.table import Table
 
     for title, rows in tables:
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
         for name in rows.columns:
-            width = 15 if name == "controller" else None
+            words = [len(word) for cell in rows[name] for word in str(cell).split()] if name in UNBROKEN else []
+            width = max([15 * (name == "controller"), *words]) or None
             table.add_column(name, justify="left" if name in LEFT else "right", no_wrap=name in WHOLE, min_width=width)
         for row in rows.itertuples(index=False):
             table.add_row(*row)

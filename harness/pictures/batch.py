@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.pictures.panels import Styles, add_legend
-from servobench.harness.pictures.tracks import Tracks
+from servobench.harness.pictures.tracks import Track, Tracks, each
 from servobench.harness.run.episode import COMPLETED
 
 EFFORT = (("control_effort_rad", 1.0, "control effort [rad]"), ("saturation_fraction", 100.0, "saturated periods [%]"))
@@ -75,7 +75,8 @@ def draw_step_times(tasks: dict[str, Tracks], styles: Styles) -> Figure | None:
 
 
 def draw_joint_speeds(tracks: Tracks, styles: Styles) -> Figure | None:
-    """Draw the commanded speed of each joint over time; None without values."""
+    """Draw the commanded speed of each joint over time, of a long run at its end; None without values."""
+    tracks = each(Track.closing, tracks)
     known = [[name for name in track.table.columns if name.startswith(COMMAND)] for track in tracks.values()]
     columns = max(known, key=len)
     if not columns:

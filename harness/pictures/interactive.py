@@ -10,7 +10,7 @@ from plotly.offline import get_plotlyjs
 
 from servobench.harness.batch import results
 from servobench.harness.pictures.style import MethodStyle, method_styles
-from servobench.harness.pictures.tracks import Group, Tracks, label_of, load_groups
+from servobench.harness.pictures.tracks import Group, Track, Tracks, each, label_of, load_groups
 
 MOST_POINTS = 250  # of a path; more cannot be told apart
 MOST_VIEWS = 24  # plant, mismatch and task
@@ -45,7 +45,7 @@ def interactive_paths(folder: Path) -> str:
         return ""
     figure, owners = go.Figure(), []
     for number, (_, _, tracks) in enumerate(views):
-        traces = _traces(tracks, styles)
+        traces = _traces(each(Track.for_path, tracks), styles)
         for trace in traces:
             trace.visible = number == 0
         figure.add_traces(traces)

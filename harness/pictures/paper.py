@@ -26,7 +26,7 @@ from servobench.harness.pictures.panels import (
     label_rows,
     panel_grid,
 )
-from servobench.harness.pictures.tracks import Tracks
+from servobench.harness.pictures.tracks import Track, Tracks, each
 
 ROOM_IN_SPACE = (0.0, 0.0, 0.95, 0.95)  # constrained layout ignores 3-D axis labels
 
@@ -40,7 +40,8 @@ def draw_moves(tasks: dict[str, Tracks], styles: Styles) -> Figure:
     panels = figure.subplots(
         rows, columns, sharex="col", sharey="row", squeeze=False, height_ratios=[1.8, *[1.0] * len(features)]
     )
-    for column, (task, tracks) in zip(panels.T, tasks.items(), strict=True):
+    for column, (task, whole) in zip(panels.T, tasks.items(), strict=True):
+        tracks = each(Track.overview, whole)
         draw_error(column[0], tracks, styles)
         for axes, feature in zip(column[1:], features, strict=True):
             draw_feature(axes, tracks, styles, feature)
@@ -62,7 +63,7 @@ def draw_move_paths(tasks: dict[str, Tracks], styles: Styles) -> Figure:
     panels = []
     for i, (task, tracks) in enumerate(tasks.items()):
         axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        draw_path(axes, tracks, styles)
+        draw_path(axes, each(Track.for_path, tracks), styles)
         axes.text2D(0.02, 1.0, task, transform=axes.transAxes, fontweight="bold")
         panels.append(axes)
     add_legend(figure, panels)
@@ -70,16 +71,21 @@ def draw_move_paths(tasks: dict[str, Tracks], styles: Styles) -> Figure:
 
 
 def draw_tracking(tracks: Tracks, styles: Styles) -> Figure:
-    """Draw desired and measured features over time and the error below (figure 6)."""
-    features = _features({"": tracks})
+    """Draw desired and measured features over time and the error below (figure 6).
+
+    Of a long run, features are drawn at its end only.
+    """
+    features, long = _features({"": tracks}), any(track.long for track in tracks.values())
     figure = Figure(figsize=(7.5, 2.6 + 1.4 * len(features)), layout="constrained")
     panels = np.atleast_1d(
-        figure.subplots(len(features) + 1, 1, sharex=True, height_ratios=[*[1.0] * len(features), 1.5])
+        figure.subplots(len(features) + 1, 1, sharex=not long, height_ratios=[*[1.0] * len(features), 1.5])
     )
     for axes, feature in zip(panels, features, strict=False):
-        draw_feature(axes, tracks, styles, feature)
-    draw_error(panels[-1], tracks, styles)
-    panels[-1].set_xlabel("time [s]")
+        draw_feature(axes, each(Track.closing, tracks), styles, feature)
+    draw_error(panels[-1], each(Track.overview, tracks), styles)
+    if long:
+        panels[-2].set_xlabel("time [s], the end of the run")
+    panels[-1].set_xlabel("time [s], each point the root mean square of those around it" if long else "time [s]")
     figure.align_ylabels(panels)
     add_legend(figure, panels)
     return figure
@@ -89,7 +95,7 @@ def draw_tracking_path(tracks: Tracks, styles: Styles) -> Figure:
     """Draw desired and true path in space (figure 7)."""
     figure = Figure(figsize=(7.0, 5.8), layout=ConstrainedLayoutEngine(rect=ROOM_IN_SPACE))
     axes = figure.add_subplot(projection="3d")
-    draw_path(axes, tracks, styles)
+    draw_path(axes, each(Track.for_path, tracks), styles)
     add_legend(figure, [axes])
     return figure
 
@@ -105,7 +111,7 @@ def draw_jacobians(tasks: dict[str, Tracks], styles: Styles) -> Figure | None:
         return None
     figure, panels = panel_grid(len(known), 2.3)
     for axes, (task, tracks) in zip(panels, known.items(), strict=True):
-        draw_jacobian(axes, tracks, styles)
+        draw_jacobian(axes, each(Track.overview, tracks), styles)
         axes.set(title=task, xlabel="time [s]")
     label_rows(panels, panels[0].get_ylabel())
     add_legend(figure, panels)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,13 @@ from servobench.harness.run.episode import COMPLETED
 from servobench.plant.checks import FloatArray
 
 FEATURE = "feature_"
+LONG = 6000  # [rows] of a run that is not drawn row by row
+OVERVIEW = 600  # [rows] about, that stand for a long run
+CLOSING = 400  # [rows] at the end of a long run that are drawn one by one: two laps at the default period
+ROOT_MEAN_SQUARES = (
+    "error_norm",
+    "jacobian_error",
+)  # of which a row of an overview has that of all rows for which it stands
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +68,31 @@ class Track:
     def settling_band(self) -> float:
         """The error within which the run counts as settled [`error_unit`]; NaN if the table does not tell it."""
         return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
+
+    @property
+    def long(self) -> bool:
+        """Whether the run has too many rows to draw them one by one."""
+        return len(self.table) > LONG
+
+    def overview(self) -> Track:
+        """Return the track with few rows; errors are root mean squares over all rows for which one stands."""
+        if not self.long:
+            return self
+        step = len(self.table) // OVERVIEW
+        few = self.table.iloc[::step].reset_index(drop=True)
+        for name in ROOT_MEAN_SQUARES:
+            if name in few:
+                means = (self.table[name] ** 2).groupby(np.arange(len(self.table)) // step).mean()
+                few[name] = np.sqrt(means.to_numpy())
+        return Track(self.row, few)
+
+    def closing(self) -> Track:
+        """Return the end of a long track, row by row."""
+        return Track(self.row, self.table.iloc[-CLOSING:].reset_index(drop=True)) if self.long else self
+
+    def for_path(self) -> Track:
+        """Return the rows that show the path in space: of a curve that is followed for long, the end."""
+        return self.overview() if self.point_to_point else self.closing()
 
     def error(self) -> FloatArray:
         """Return the norm of the true error, (k,) [`error_unit`]."""
@@ -123,6 +155,11 @@ def load_groups(folder: Path) -> Iterator[Group]:
                 table = tables[row["run_id"]].dropna(axis=1, how="all").reset_index(drop=True)
                 tasks.setdefault(row["task"], {})[row["controller"]] = Track({str(k): row[k] for k in row}, table)
         yield Group(str(plant), str(mismatch), int(chosen["seed"].iloc[0]), tasks)
+
+
+def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:
+    """Return the tracks as `Track.overview`, `Track.closing` or `Track.for_path` make them."""
+    return {name: kind(track) for name, track in tracks.items()}
 
 
 def longest(tracks: Tracks) -> Track:

@@ -12,9 +12,10 @@ from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import draw_figures, folder_figures, picture_of
+from servobench.harness.pictures.interactive import interactive_paths
 from servobench.harness.pictures.panels import ENDED
 from servobench.harness.pictures.style import method_styles
-from servobench.harness.pictures.tracks import load_groups
+from servobench.harness.pictures.tracks import Track, load_groups
 
 OTHERS = [f"method_{i}" for i in range(20)]
 
@@ -139,6 +140,28 @@ def test_a_plant_with_other_features_and_joints_is_drawn_under_its_own_names(tmp
             assert "settling band, 0.1 rad" in legend_of(named.figure)
         if named.kind == "paths":
             assert "fewer than three features" in [text.get_text() for text in named.figure.axes[0].texts]
+
+
+def test_half_an_hour_is_drawn_with_few_points(tmp_path):
+    kind, run_id = {"task": "endurance", "task_kind": "curve"}, "kinematic-ukf_mfac-endurance-moderate-0"
+    steps = made_up_steps(run_id, curve=True, periods=36_000)
+    folder = write_folder(tmp_path / "out", [made_up_row(run_id, **kind)], [steps])
+    for _, _, title, figure in folder_figures(folder):
+        lines = [line for axes in figure.axes for line in axes.get_lines()]
+        assert all(len(line.get_xdata()) <= 700 for line in lines), title
+    assert interactive_paths(folder).count(",") < 20_000
+
+
+def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last_rows():
+    steps = made_up_steps("a", curve=True, periods=12_000).assign(error_norm=np.tile([3.0, 4.0], 6000))
+    track = Track(made_up_row("a"), steps)
+    overview, closing = track.overview(), track.closing()
+    assert len(overview.table) == 600
+    np.testing.assert_allclose(overview.error(), 1000.0 * np.sqrt(12.5))
+    assert overview.time[[0, -1]].tolist() == [0.0, 0.05 * 11_980]
+    assert closing.time.tolist() == track.time[-400:].tolist()
+    short = Track(made_up_row("a"), steps.iloc[:6000])
+    assert short.overview() is short.closing() is short.for_path() is short
 
 
 @pytest.mark.parametrize("folder", [sweep, failed_only])

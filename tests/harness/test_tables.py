@@ -110,8 +110,8 @@ def test_a_comparison_ends_with_a_table_for_each_task(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
     titles, tables = zip(*summary_tables(runs), strict=True)
     assert titles == tuple(f"{task} on kinematic, moderate" for task in ("exp1", "exp2", "circle"))
-    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "settled", "1.50", "2", "2.0", "500", "–", "130"]
-    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "1/1", "followed", "–", "–", "2.0", "500", "–", "130"]
+    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "settled", "1.50", "2", "2.0", "500", "130"]
+    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "followed", "–", "–", "2.0", "500", "130"]
 
 
 def test_the_outcomes_of_several_runs_are_shares():

@@ -18,16 +18,17 @@ def made_up_steps(
 ) -> pd.DataFrame:
     """Return steps whose feature comes to the reference within half a second."""
     k = np.arange(periods)
+    decay = np.exp(-np.minimum(k, 600) / 10.0)
     table = pd.DataFrame({"run_id": run_id, "step": k, "time_s": k * 0.05})
     for i, name in enumerate(features):
         reference = 0.2 * np.cos(0.1 * k + i) if curve else np.full(periods, 0.1 * i)
-        deviation = 0.3 * np.exp(-k / 10.0)
+        deviation = 0.3 * decay
         table[f"reference_{name}"] = reference
         table[f"feature_{name}"] = table[f"true_feature_{name}"] = reference + deviation
     for name in ("lift", "turn"):
         table[f"joint_position_{name}_rad"] = 0.01 * k
         table[f"joint_velocity_command_{name}_rad_s"] = 0.2
-    table["error_norm"] = 0.5 * np.exp(-k / 10.0)
+    table["error_norm"] = 0.5 * decay
     table["jacobian_error"] = 0.3
     table["feature_valid"] = True
     table["controller_time_us"] = 100.0 + k
