@@ -18,12 +18,13 @@ from fmpy.fmi2 import FMU2Slave
 
 from measuring import asked_to_be_quick, table
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from servobench.plant.bench import Bench, SensingConfig
+from servobench.plant.bench import Bench
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.lanes import stack
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.sensing import SensingConfig
 from servobench.plant.signals import Command
 
 CALLS = 200
@@ -34,7 +35,7 @@ BARE = "bare calls by ctypes: set, step, get"
 
 def open_plant(runs: int = 0) -> Bench:
     """Return the exported UR5 without anything around it; with `runs`, so many side by side."""
-    config = Ur5FmuConfig(command_delay_periods=0, sensing=SensingConfig(0.0))
+    config = Ur5FmuConfig(command_delay=0.0, sensing=SensingConfig(0.0))
     model, start = nominal_ur5(), np.array(HOME)
     if runs:
         model, start = stack([model] * runs), np.tile(start, (runs, 1))

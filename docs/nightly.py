@@ -35,7 +35,7 @@ METHODS = "rbfnn_mfac,rbf_pid,ukf_mfac,ukf_mpc"
 SWEEPS = {
     "pairs": ("--plants", "kinematic", "--controllers", PAIRS, "--seeds", "500:504"),
     "worse": ("--plants", "fmu", "--controllers", METHODS, "--seeds", SEEDS, "--mismatch", ",".join(MISMATCHES)),
-    "late": ("--plants", "fmu", "--controllers", METHODS, "--seeds", SEEDS, "--latency", "1,2"),
+    "late": ("--plants", "fmu", "--controllers", METHODS, "--seeds", SEEDS, "--latency", "0.05,0.1"),
     "moved": (
         "--plants",
         "fmu",
@@ -84,7 +84,7 @@ def changed_counts(folder: Path) -> Iterator[str]:
     """Yield a line for each count of settled robots that is not the one in docs/methods.md."""
     worse, late, moved = (load_runs(folder / name) for name in ("worse", "late", "moved"))
     worlds = [worse[worse["mismatch"] == mismatch] for mismatch in MISMATCHES]
-    worlds += [late[late["latency_periods"] == periods] for periods in (1, 2)] + [moved]
+    worlds += [late[late["latency_s"] == latency] for latency in (0.05, 0.1)] + [moved]
     header, rows = next(
         (header, rows)
         for _, header, rows in tables(section(read("methods.md"), "Where they break, in numbers"))

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import platformdirs
 
 from servobench.fmus.compile import CompilationFailed, CompilerMissing
 from servobench.fmus.export import ExportOptions, export_fmu, fingerprint
 from servobench.fmus.variables import Actuation, parameters_of
-from servobench.plant.bench import Bench, SensingConfig
+from servobench.plant.bench import Bench
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import FEATURE_NAMES
-from servobench.plant.settings import NonNegative, Periods, Positive, nested, settings
+from servobench.plant.sensing import SensingConfig
+from servobench.plant.settings import NonNegative, Positive, nested, settings
+from servobench.plant.timing import RENAMED_DELAY
 
 
 @settings
@@ -32,10 +35,12 @@ class Ur5FmuConfig:
     """[rad] largest joint position each way; the vendor's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
-    command_delay_periods: Periods = 1
-    """[periods] between a command and its first effect."""
+    command_delay: NonNegative = 0.05
+    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
-    """Noise, latency and lost frames."""
+    """Noise, latency, frame period and lost frames."""
+
+    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
 @cache
@@ -86,7 +91,7 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
         path = cached_fmu(config.fmi_version)
     except (CompilerMissing, CompilationFailed, OSError) as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
-    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay_periods, config.sensing)
+    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing)
 
 
 ENTRY = PlantEntry(

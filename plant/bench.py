@@ -3,18 +3,18 @@
     u(k) = clip(command(k), limits),        the world advances under u(k − d)
     frame(k) = see(k) + σ N(0, 1),          the observation at k holds frame(k − l), or the last valid one if it is lost
 
-with the command delay d and the latency l in control periods. Many runs side by side share one bench: their arrays have
-a leading axis, and each run has random streams of its own.
+with the command delay d and the latency l; where they are no multiples of the control period, the world advances in
+sub-steps (`servobench.plant.timing`). Many runs side by side share one bench: their arrays have a leading axis, and
+each run has random streams of its own.
 """
 
 from __future__ import annotations
 
 import copy
-from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias, TypeVar, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import numpy.typing as npt
@@ -22,98 +22,26 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FeatureLost, RunFault
 from servobench.plant.lanes import take, where
-from servobench.plant.plant import Abilities, ImageArray, Plant, TrueModel
+from servobench.plant.plant import ImageArray, Plant, PlantSetup, TrueModel
 from servobench.plant.seeds import Seeds, Stream
-from servobench.plant.settings import NonNegative, Periods, ShareBelowOne, settings
+from servobench.plant.sensing import SensingConfig
 from servobench.plant.signals import BoolArray, Command, Observation, Truth, trusted_observation
-
-Config = TypeVar("Config")
-Frame: TypeAlias = tuple[FloatArray, BoolArray]
-"""The feature on its way to the controller, (..., m), and whether it will arrive, (...)."""
+from servobench.plant.timing import Timing, common_step
+from servobench.plant.world import World
 
 
-@settings
-class SensingConfig:
-    """Settings of the path from the true feature to the observation."""
+class Frame(NamedTuple):
+    """A frame on its way to the controller.
 
-    feature_noise: NonNegative = 0.001
-    """[unit of the feature] standard deviation of the white noise of each component."""
-    latency_periods: Periods = 0
-    """[periods] between exposure and delivery of the feature."""
-    drop_probability: ShareBelowOne = 0.0
-    """[1] chance that a frame is lost, independently of the others."""
-    noise_factor: NonNegative = 1.0
-    """[1] factor on all noise of the sensor, for studies of noise."""
-
-
-def can_vary_sensing(config: object) -> bool:
-    """Return whether a plant with these settings has a nested section `sensing`."""
-    return isinstance(getattr(config, "sensing", None), SensingConfig)
-
-
-def vary_sensing(config: Config, noise_factor: float, latency_periods: int | None) -> Config:
-    """Return a plant's settings with noise multiplied by a factor and, unless it is None, another latency.
-
-    Raises:
-        ValueError: the plant has no section `sensing`, or a number is out of its bounds.
-    """
-    if not can_vary_sensing(config):
-        raise ValueError("its noise and latency cannot be varied")
-    values: Any = config
-    latency = values.sensing.latency_periods if latency_periods is None else latency_periods
-    factor = noise_factor * values.sensing.noise_factor
-    changed: Config = replace(values, sensing=replace(values.sensing, noise_factor=factor, latency_periods=latency))
-    return changed
-
-
-class World(Abilities):
-    """A robot and its camera, which only advance and see; `Bench` makes a plant of it.
-
-    Arrays that a world returns are never changed again, finite and float64; the bench makes them read-only. Those of a
-    world that carries out runs side by side have the leading axis `lead`.
+    Attributes:
+        due: number of the sub-step after which it is delivered.
+        feature: (..., m).
+        arrives: (...), whether it will arrive.
     """
 
-    lead: tuple[int, ...] = ()
-    """Number of runs side by side, as the shape of the leading axis; () for a single run."""
-
-    def fail(self, lane: int, fault: RunFault) -> None:
-        """Take the fault of a lane, or raise that of a single run; of a lane the first one counts."""
-        if not self.lead:
-            raise fault
-        self.faults = {lane: fault, **self.faults}
-
-    @abstractmethod
-    def reset(self, seed: Any) -> FloatArray:  # noqa: ANN401 - narrowed by worlds that carry out one run only
-        """Go back to the start, at rest, and draw all randomness from `seed`.
-
-        Args:
-            seed: one, or a sequence of one for each of the runs side by side.
-
-        Returns:
-            The joint positions, (..., n) rad.
-        """
-
-    @abstractmethod
-    def advance(self, joint_velocity: FloatArray) -> FloatArray:
-        """Hold a command for one period.
-
-        Args:
-            joint_velocity: (..., n), rad/s, within the limits.
-
-        Returns:
-            The joint positions after it, (..., n) rad, as reported; of a lane that failed, those before.
-
-        Raises:
-            PlantDiverged: they are not finite.
-        """
-
-    @abstractmethod
-    def see(self) -> FloatArray | None:
-        """Return the feature as the sensor sees it now, (..., m); None if a single run's is not found."""
-
-    def why_unseen(self) -> str:
-        """Return why `see` found nothing, with evidence, for an error message."""
-        return "the feature is not visible at the start"
+    due: int
+    feature: FloatArray
+    arrives: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +49,8 @@ class BenchState:
     """A saved state of a bench; it can be pickled if that of its world can.
 
     Attributes:
-        period: number of periods since the reset.
-        commands: commands under way, oldest first.
+        period: number of control periods since the reset.
+        commands: commands under way, oldest first, one a control period.
         frames: frames under way, oldest first.
         held: (..., m), the last valid feature.
         streams: of the noise and of the lost frames.
@@ -141,19 +69,26 @@ class BenchState:
 class Bench(Plant):
     """A plant: a world under clipped and delayed commands, seen through noise, latency and lost frames."""
 
-    def __init__(self, world: World, command_delay_periods: int, sensing: SensingConfig) -> None:
-        """Put a world on the bench, which closes it; `reset` begins a run.
+    def __init__(self, world: World, command_delay: float, sensing: SensingConfig, period: float | None = None) -> None:
+        """Put a world on the bench, which closes it; `reset` begins a run. `build_bench` also builds the world.
 
         Args:
             world: the robot and its camera.
-            command_delay_periods: periods between a command and its first effect, 0 or above.
-            sensing: noise, latency and lost frames.
+            command_delay: between a command and its first effect, s, 0 or above.
+            sensing: noise, latency, frame period and lost frames.
+            period: control period, s; None: that of the world.
+
+        Raises:
+            ValueError: the control period, the delay, the latency or the frame period is no multiple of the world's
+                period.
         """
         self.world = world
-        self._delay, self._sensing = command_delay_periods, sensing
+        self._sensing = sensing
         self._noise_scale = sensing.noise_factor * sensing.feature_noise
-        spec = self.spec = world.spec
-        self._period = spec.period
+        spec = world.spec
+        self._period = spec.period if period is None else period
+        self._timing = Timing.of(self._period, spec.period, command_delay, sensing)
+        self.spec = spec if self._timing.steps == 1 else replace(spec, period=self._period)
         self._lower, self._upper = spec.command.lower, spec.command.upper
         self._k = -1
         self._size_masks()
@@ -162,8 +97,9 @@ class Bench(Plant):
         """Take the leading axis from the world."""
         self._shape = (*self.world.lead, self.spec.n)
         self._all_arrive = np.ones(self.world.lead, dtype=np.bool_)[()]
+        self._none_arrives = np.logical_not(self._all_arrive)
         self._all_valid = np.ones((*self.world.lead, self.spec.m), dtype=np.bool_)
-        for mask in (self._all_arrive, self._all_valid):
+        for mask in (self._all_arrive, self._none_arrives, self._all_valid):
             mask.setflags(write=False)
 
     def reset(self, seed: Seeds) -> Observation:
@@ -185,8 +121,8 @@ class Bench(Plant):
             raise FeatureLost(self.world.why_unseen())
         rest = np.zeros(self._shape)
         rest.setflags(write=False)
-        self._commands = deque([rest] * self._delay)
-        self._frames = deque([(first, self._all_arrive)] * self._sensing.latency_periods)
+        self._commands = deque([rest] * self._timing.delays[0])
+        self._frames = deque(Frame(due, first, self._all_arrive) for due in self._timing.under_way())
         self._held, self._k = first, 0
         return self._observation(joints, first, self._all_arrive)
 
@@ -199,19 +135,32 @@ class Bench(Plant):
             raise ValueError("reset must be called before the first step")
         u: FloatArray = np.minimum(wanted, self._upper)
         np.maximum(u, self._lower, out=u)
-        if self._delay:
-            self._commands.append(u)
-            u = self._commands.popleft()
-        joints = self.world.advance(u)
+        self._commands.append(u)
+        timing = self._timing
+        for i, delay in enumerate(timing.delays, self._k * timing.steps + 1):
+            joints = self.world.advance(self._commands[-1 - delay])
+            if timing.exposes(i):
+                self._frames.append(self._sent(i + timing.latency))
+        self._commands.popleft()
         self._k += 1
-        self._frames.append(self._sent())
-        return self._observation(joints, *self._frames.popleft())
+        return self._observation(joints, *self._delivered(self._k * timing.steps))
+
+    def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
+        """Return the feature of the newest frame that arrived since the last control instant, and where one did."""
+        feature, arrived = self._held, self._none_arrives
+        while self._frames and self._frames[0].due <= now:
+            _, newer, arrives = self._frames.popleft()
+            if arrives is self._all_arrive:
+                feature, arrived = newer, arrives
+            else:
+                feature, arrived = where(arrives, newer, feature), np.logical_or(arrived, arrives)
+        return feature, arrived
 
     def _observation(self, joints: FloatArray, feature: FloatArray, arrives: BoolArray) -> Observation:
-        """Return what is seen at the present period; the feature is held for frames that do not arrive."""
+        """Return what is seen at the present period, of a feature that is held where nothing arrives."""
         time, valid = self._k * self._period, self._all_valid
         if arrives is not self._all_arrive:
-            feature, valid = where(arrives, feature, self._held), np.logical_and(valid, arrives[..., None])
+            valid = np.logical_and(valid, arrives[..., None])
             valid.setflags(write=False)
         joints.setflags(write=False)
         feature.setflags(write=False)
@@ -225,13 +174,13 @@ class Bench(Plant):
             feature = feature + self._noise.next()
         return feature
 
-    def _sent(self) -> Frame:
-        """Return the frame that is exposed now and whether it will arrive."""
+    def _sent(self, due: int) -> Frame:
+        """Return the frame that is exposed now, with whether it will arrive."""
         feature, arrives, probability = self._expose(), self._all_arrive, self._sensing.drop_probability
         if probability > 0.0:
             lost = self._losses.next() < probability
             arrives = np.logical_not(lost) if lost.any() else arrives
-        return (self._held, np.logical_not(self._all_arrive)) if feature is None else (feature, arrives)
+        return Frame(due, self._held, self._none_arrives) if feature is None else Frame(due, feature, arrives)
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""
@@ -293,3 +242,21 @@ class Bench(Plant):
     def close(self) -> None:
         """See `Plant.close`."""
         self.world.close()
+
+
+def build_bench(
+    make: Callable[[PlantSetup], World], setup: PlantSetup, command_delay: float, sensing: SensingConfig
+) -> Bench:
+    """Return a bench around a world that is as fine as the delays need.
+
+    Args:
+        make: builds the world from a setup whose period is the sub-step.
+        setup: of the plant, with the control period.
+        command_delay: between a command and its first effect, s.
+        sensing: noise, latency, frame period and lost frames.
+
+    Raises:
+        ValueError: times without a common sub-step, or whatever `make` refuses.
+    """
+    step = common_step(setup.period, command_delay, sensing)
+    return Bench(make(replace(setup, period=step)), command_delay, sensing, setup.period)

@@ -10,22 +10,26 @@ Delay, noise, latency and lost frames are those of `servobench.plant.bench`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
-from typing import NamedTuple
+from functools import lru_cache, partial
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench import Bench, SensingConfig, World
+from servobench.plant.bench import Bench, build_bench
 from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import PlantDiverged
 from servobench.plant.lanes import take, where
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
 from servobench.plant.seeds import Seeds
-from servobench.plant.settings import NonNegative, Periods, Positive, nested, settings
+from servobench.plant.sensing import SensingConfig
+from servobench.plant.settings import NonNegative, Positive, nested, settings
 from servobench.plant.signals import Truth
+from servobench.plant.timing import RENAMED_DELAY
+from servobench.plant.world import World
 
 
 @settings
@@ -38,10 +42,12 @@ class KinematicConfig:
     """[rad] largest joint position each way; the vendor's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
-    command_delay_periods: Periods = 1
-    """[periods] between a command and its first effect."""
+    command_delay: NonNegative = 0.05
+    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
-    """Noise, latency and lost frames."""
+    """Noise, latency, frame period and lost frames."""
+
+    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
 @lru_cache(maxsize=64)
@@ -98,7 +104,7 @@ class KinematicWorld(World):
         return self._q
 
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
-        """Hold a command for one period; see `World.advance`."""
+        """Hold a command for one period of the world; see `World.advance`."""
         from_v, kept, to_q, to_v = self._coefficients
         q = self._q + from_v * self._v + to_q * joint_velocity
         v = kept * self._v + to_v * joint_velocity
@@ -155,7 +161,7 @@ def build_kinematic(config: KinematicConfig, setup: PlantSetup) -> Bench:
     Raises:
         ValueError: see `KinematicWorld`.
     """
-    return Bench(KinematicWorld(config, setup), config.command_delay_periods, config.sensing)
+    return build_bench(partial(KinematicWorld, config), setup, config.command_delay, config.sensing)
 
 
 ENTRY = PlantEntry(

@@ -18,14 +18,14 @@ ANGLES = np.radians([0.0, 15.0, 30.0, 60.0, 90.0])
 if __name__ == "__main__":
     experiment = build_experiment(REQUEST, Settings())
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
-    desired = experiment.scenario.reference.sampled(run.period, max(KNOCKED_AT) + FUTURE + 1 + run.preview)
+    desired = experiment.scenario.reference.sampled(run.period, max(KNOCKED_AT) + FUTURE + 1 + run.preview_rows)
     pose = experiment.drawn.true.X_BC
 
     def advance(observation, first, last):
         """Go on from `first` to `last` [periods]; return the last observation and the errors [m]."""
         errors = []
         for k in range(first, last):
-            command = controller.step(observation, desired[k : k + 1 + run.preview])
+            command = controller.step(observation, desired[k : k + 1 + run.preview_rows])
             errors.append(np.linalg.norm(desired[k] - plant.truth().feature))
             observation = plant.step(command)
         return observation, np.array(errors)

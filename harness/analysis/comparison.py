@@ -34,7 +34,7 @@ from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, 
 from servobench.plant.checks import FloatArray
 
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
-CONDITION: Final = ("plant", "task", "mismatch", "noise_factor", "latency_periods")
+CONDITION: Final = ("plant", "task", "mismatch", "noise_factor", "latency_s", "period_s")
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
 
 
@@ -66,9 +66,10 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
         words = f"{values['task']} on {values['plant']}, {values['mismatch']}"
         if values.get("noise_factor", 1.0) != 1.0:
             words += f", noise × {values['noise_factor']:g}"
-        latency = float(values.get("latency_periods", float("nan")))
-        if math.isfinite(latency):
-            words += f", latency {latency:g} periods"
+        for name in ("latency", "period"):
+            time = float(values.get(f"{name}_s", float("nan")))
+            if math.isfinite(time):
+                words += f", {name} {1e3 * time:g} ms"
         found.append((words, group))
     return found
 

@@ -25,7 +25,7 @@ SWEEP_COLUMNS: Final = (
     "rms_error_evaluated",
     *BAND,
 )  # what `sweep_tables` and `outcome_legend` read
-SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "controller"]
+SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
 
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
@@ -44,7 +44,7 @@ def summary_legend(runs: pd.DataFrame) -> str:
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
     """Return what the words in `sweep_tables` mean."""
-    return f"{outcome_legend(parts)}; noise: factor; latency: periods, – as configured"
+    return f"{outcome_legend(parts)}; noise: factor; latency, period: ms, – as configured"
 
 
 def summary_tables(runs: pd.DataFrame) -> Tables:
@@ -102,7 +102,10 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
         table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(_percent)
         table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
         word = FOLLOWED if task in curves else SETTLED
-        yield f"{task} on {plant}: {word}, %", table.rename_axis(columns=None).reset_index()
+        shares = table.rename_axis(columns=None).reset_index()
+        if (shares["period"] == MISSING).all():
+            del shares["period"]
+        yield f"{task} on {plant}: {word}, %", shares
         if good.sum() < place["runs"].sum():
             kinds = place.pivot_table(values="runs", index="outcome", columns="controller", aggfunc="sum", sort=False)
             table = (100.0 * kinds / kinds.sum()).map(_percent)
@@ -118,9 +121,14 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     runs = runs.assign(
         outcome=outcomes(runs),
         noise=runs["noise_factor"].map("{:g}".format),
-        latency=[MISSING if pd.isna(value) else f"{value:g}" for value in runs["latency_periods"]],
+        latency=_milliseconds(runs["latency_s"]),
+        period=_milliseconds(runs["period_s"]),
     )
     return runs.groupby([*SWEEP_KEYS, "outcome"], sort=False).size().rename("runs").reset_index()
+
+
+def _milliseconds(times: pd.Series[float]) -> list[str]:
+    return [MISSING if pd.isna(time) else f"{1e3 * time:g}" for time in times]
 
 
 def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:

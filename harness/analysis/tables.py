@@ -38,7 +38,7 @@ from servobench.plant.settings import suggest
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 
 
-SWEPT: Final = ("noise_factor", "latency_periods")  # shown where they vary
+SWEPT: Final = ("noise_factor", "latency_s", "period_s")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
 COSTS: Final = ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
                 "jacobian_error_mean")  # fmt: skip

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from servobench.harness.run.episode import RunResult
     from servobench.plant.plant import ImageArray
 
-SCHEMA_VERSION = "3"
+SCHEMA_VERSION = "4"
+CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s [s]"}  # since an earlier schema
 PARTS = "parts"
 PICTURES = "pictures"
 RUNS = "runs.parquet"
@@ -211,6 +212,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if version != SCHEMA_VERSION:
         raise ConfigurationError(
             f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
+            f"{CHANGES.get(str(version), '')}"
         )
     return dict(manifest)
 

@@ -25,7 +25,7 @@ class Survey:
     mismatches: dict[str, None] = field(default_factory=dict)
     seeds: list[range] = field(default_factory=list)  # in order, without gaps within each
     examples: list[RunRequest] = field(default_factory=list)
-    """With every plant in every condition (mismatch, noise, latency) and with every controller, and every task."""
+    """With every plant in every condition (mismatch, noise, times) and with every controller, and every task."""
     digest: str = ""  # of all runs in their order
 
 
@@ -44,7 +44,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         digest.update(f"{run_id}\n".encode())
         names.append(hash(run_id))
         seeds.add(request.seed)
-        condition = (request.mismatch, request.noise_factor, request.latency_periods)
+        condition = (request.mismatch, request.noise_factor, request.latency, request.period)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
         if kind == last:
             continue

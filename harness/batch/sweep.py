@@ -1,4 +1,4 @@
-"""The runs of a Monte Carlo sweep: mismatches with one axis varied at a time, noise and latency."""
+"""The runs of a Monte Carlo sweep: mismatches with one axis varied at a time, noise, latency and control period."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ class SweepPlan:
     batch: Batch  # plants, controllers, tasks, mismatches and seeds
     variations: tuple[Variation, ...] = ()  # axes with their magnitudes
     noise_factors: tuple[float, ...] = (1.0,)  # on the plants' sensor noise
-    latencies: tuple[int | None, ...] = (None,)  # [periods]; None for what a plant is configured with
+    latencies: tuple[float | None, ...] = (None,)  # [s]; None for what a plant is configured with
+    periods: tuple[float | None, ...] = (None,)  # [s] of control; None for that of the section `run`
 
     def cells(self) -> Grid[Cell]:
         """Return the runs, seeds varying fastest."""
         places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
-        return Grid(_cell, places or [Place()], self.noise_factors, self.latencies, *self.batch.axes())
+        return Grid(_cell, places or [Place()], self.noise_factors, self.latencies, self.periods, *self.batch.axes())
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,6 @@ def parse_variation(text: str) -> Variation:
         raise ConfigurationError(f"--vary: {error}") from error
 
 
-def _cell(place: Place, noise: float, latency: int | None, *names: Any) -> Cell:  # noqa: ANN401 - as `Batch.axes`
+def _cell(place: Place, noise: float, latency: float | None, period: float | None, *names: Any) -> Cell:  # noqa: ANN401 - as `Batch.axes`
     plant, task, mismatch, controller, seed = names
-    return Cell(RunRequest(plant, controller, task, place.vary(mismatch), seed, noise, latency), place.columns)
+    return Cell(RunRequest(plant, controller, task, place.vary(mismatch), seed, noise, latency, period), place.columns)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import typer
 
 from servobench.harness.cli import options
 from servobench.harness.cli.terminal import console, print_tables
-
-Value = TypeVar("Value", int, float)
 
 
 def sweep(
@@ -24,9 +21,8 @@ def sweep(
         typer.Option(help="Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg."),
     ] = None,
     noise: Annotated[str, typer.Option(help="Comma-separated factors on the plants' sensor noise.")] = "1",
-    latency: Annotated[
-        str, typer.Option(help="Comma-separated camera latencies [periods]; default: the plant's.")
-    ] = "",
+    latency: Annotated[str, typer.Option(help="Comma-separated camera latencies [s]; default: the plant's.")] = "",
+    period: Annotated[str, typer.Option(help="Comma-separated control periods [s]; default: run.period.")] = "",
     seeds: options.SeedsOption = "10",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
@@ -48,8 +44,9 @@ def sweep(
             parse_seeds(seeds),
         ),
         tuple(parse_variation(text) for text in vary or []),
-        tuple(_numbers("noise", noise, float)),
-        tuple(_numbers("latency", latency, int)) if latency.strip() else (None,),
+        tuple(_numbers("noise", noise)),
+        _times("latency", latency),
+        _times("period", period),
     )
     campaign = Campaign(plan.cells(), overrides.settings())
     with watching(console, out) as observer:
@@ -59,11 +56,21 @@ def sweep(
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
 
 
-def _numbers(option: str, text: str, kind: Callable[[str], Value]) -> list[Value]:
+def _times(option: str, text: str) -> tuple[float | None, ...]:
+    """Return times, s; numbers from 1 on are refused because they were control periods in version 0.1."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    times = _numbers(option, text) if text.strip() else [None]
+    if max(time or 0.0 for time in times) >= 1.0:
+        raise ConfigurationError(f"--{option} is in seconds, below 1, such as 0.05 for a period of 20 Hz; got {text!r}")
+    return tuple(times)
+
+
+def _numbers(option: str, text: str) -> list[float]:
     from servobench.harness.config.settings import ConfigurationError
 
     try:
-        numbers = [kind(part) for part in text.split(",") if part.strip()]
+        numbers = [float(part) for part in text.split(",") if part.strip()]
     except ValueError as error:
         raise ConfigurationError(f"--{option} must be comma-separated numbers, got {text!r}") from error
     if not numbers or min(numbers) < 0:

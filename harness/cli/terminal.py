@@ -10,7 +10,7 @@ from rich.console import Console
 if TYPE_CHECKING:
     import pandas as pd
 
-LEFT = ("controller", "mismatch", "noise", "latency", "pair", "failures", "outcome")  # columns of words
+LEFT = ("controller", "mismatch", "noise", "latency", "period", "pair", "failures", "outcome")  # columns of words
 WHOLE = ("controller", "pair")  # columns whose words are not broken over lines
 UNBROKEN = ("outcome",)  # columns of which no word is broken
 

@@ -1,4 +1,4 @@
-"""How the share of settled runs changes with what a folder varies: a mismatch's size, the noise, the latency."""
+"""How the share of settled runs changes with what varies: a mismatch's size, noise, latency, control period."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.pictures.panels import Styles, add_legend, draw_places, label_rows, panel_grid
 
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
-NUMBERS = {"noise_factor": "noise factor", "latency_periods": "latency [periods]"}
+NUMBERS = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
 
 
 def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
@@ -40,7 +40,11 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """
     sweeps, none = {}, runs.head(0)
     if "axis" not in runs or (runs["axis"].fillna("") == "").all():
-        sweeps = {label: runs.assign(size=runs[name].astype(float)) for name, label in NUMBERS.items() if name in runs}
+        sweeps = {
+            label: runs.assign(size=factor * runs[name].astype(float))
+            for name, (label, factor) in NUMBERS.items()
+            if name in runs
+        }
         none = runs[runs["mismatch"] == "none"].assign(size=0.0)
         runs = runs.assign(**runs["mismatch"].str.extract(SIZED_AXIS))
     along = runs[runs["axis"].fillna("") != ""]

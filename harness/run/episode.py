@@ -79,7 +79,7 @@ def carry_out(
     status, reason = COMPLETED, ""
     try:
         with _careful():
-            desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview)
+            desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview_rows)
             run_loop(plant, experiment.controller, desired, experiment.loop, resolved.request.seed, log)
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
         status, reason = _ending(error)

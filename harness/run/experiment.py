@@ -77,7 +77,7 @@ def loop_settings(run: RunSettings, duration: float, moved: FloatArray | None) -
     """Return the settings of the loop of a run of `duration` [s], with the camera's pose (..., 4, 4) after a move."""
     periods = run.periods(duration)
     move = None if moved is None else CameraMove(int(run.camera_moves_at * periods), moved)
-    return LoopSettings(periods, run.preview, run.lost_after_periods, move)
+    return LoopSettings(periods, run.preview_rows, run.lost_after_periods, move)
 
 
 def build_experiment(
@@ -193,7 +193,7 @@ def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     """Return what every controller may know."""
     return RobotKnowledge(
         spec=spec,
-        preview=run.preview,
+        preview=run.preview_rows,
         nominal_jacobian=nominal_ur5().jacobian,
         region=(np.array(TRAINING_LOWER), np.array(TRAINING_UPPER)),
     )
@@ -215,7 +215,7 @@ def _build_with_own_robot(
         scenario = _build_scenario(resolved, setting)
         nominal = plant.nominal_jacobian()
         source = None if nominal is None else network_source(nominal, spec, keep, progress)
-        knowledge = RobotKnowledge(spec, run.preview, nominal, train=source)
+        knowledge = RobotKnowledge(spec, run.preview_rows, nominal, train=source)
         controller = _build_controller(request.controller, resolved.controller, knowledge, plant.true_model)
     except BaseException:
         plant.close()

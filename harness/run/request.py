@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.settings import Count, Periods, Positive, ShareBelowOne, settings
+from servobench.plant.settings import NonNegative, Positive, ShareBelowOne, settings
 
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
+TIMES = ("latency", "period")  # fields of a request, which are columns with the suffix _s
 
 
 @settings
@@ -20,18 +22,36 @@ class RunSettings:
 
     period: Positive = 0.05
     """[s] control period"""
-    preview: Periods = 10
-    """future rows of the reference that every controller gets"""
-    lost_after_periods: Count = 20
-    """a run ends after so many periods in a row without a valid feature"""
+    preview_time: NonNegative = 0.5
+    """[s] of the future reference that every controller gets, rounded up to control periods"""
+    lost_after: Positive = 1.0
+    """[s] without a valid feature after which a run ends"""
     camera_moves_at: ShareBelowOne = 0.5
     """share of the run after which a mismatch's `camera_move` happens"""
     full_jacobian: bool = False
     """log every entry of the estimated and the true Jacobian"""
 
+    RENAMED: ClassVar[Mapping[str, str]] = {
+        "preview": "preview_time, in seconds (a period of 20 Hz is 0.05)",
+        "lost_after_periods": "lost_after, in seconds (a period of 20 Hz is 0.05)",
+    }
+
+    @property
+    def preview_rows(self) -> int:
+        """Future rows of the reference that every controller gets."""
+        return self._whole_periods(self.preview_time)
+
+    @property
+    def lost_after_periods(self) -> int:
+        """Control periods in a row without a valid feature after which a run ends."""
+        return self.periods(self.lost_after)
+
     def periods(self, duration: float) -> int:
         """Return how many control periods a run of `duration` [s] has."""
-        return max(1, math.ceil(duration / self.period - 1e-9))
+        return max(1, self._whole_periods(duration))
+
+    def _whole_periods(self, time: float) -> int:
+        return math.ceil(time / self.period - 1e-9)
 
 
 @dataclass(frozen=True)
@@ -48,7 +68,8 @@ class RunRequest:
     mismatch: Mismatch  # how far the true robot may be from the nominal one; its text is read, too
     seed: int  # of everything random in the run
     noise_factor: float = 1.0  # multiplies the sensor noise that the plant is configured with
-    latency_periods: int | None = None  # of the camera; None for what the plant is configured with
+    latency: float | None = None  # [s] of the camera; None for what the plant is configured with
+    period: float | None = None  # [s] of control; None for that of the section `run`
 
     def __post_init__(self) -> None:
         """Read a mismatch that came as text."""
@@ -63,12 +84,13 @@ class RunRequest:
             UNFIT_FOR_FILES.sub("_", str(name)) for name in (self.mismatch, self.plant, self.controller)
         )
         noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
-        latency = "" if self.latency_periods is None else f"-latency{self.latency_periods}"
-        return f"{plant}-{controller}-{self.task}-{mismatch}{noise}{latency}-{self.seed}"
+        times = "".join(f"-{name}{1e3 * value:g}ms" for name in TIMES if (value := getattr(self, name)) is not None)
+        return f"{plant}-{controller}-{self.task}-{mismatch}{noise}{times}-{self.seed}"
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""
-        return {"run_id": self.run_id, **vars(self), "mismatch": str(self.mismatch)}
+        columns = {f"{name}_s" if name in TIMES else name: value for name, value in vars(self).items()}
+        return {"run_id": self.run_id, **columns, "mismatch": str(self.mismatch)}
 
 
 def read_mismatch(text: str) -> Mismatch:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 from servobench.harness.config.defaults import default_config
@@ -11,12 +12,12 @@ from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS, find_task
-from servobench.plant.bench import vary_sensing
+from servobench.plant.sensing import vary_sensing
 
 
 @dataclass(frozen=True)
 class ResolvedRun:
-    """All that a run depends on; it can be pickled. The plant's settings include noise and latency of the request."""
+    """All that a run depends on; it can be pickled. Plant and run have noise, latency and period of the request."""
 
     request: RunRequest
     run: RunSettings
@@ -54,15 +55,31 @@ def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:
     """Return `request` with its settings out of those that `resolve_sections` returned.
 
     Raises:
-        ConfigurationError: a noise factor or latency for a plant that has no such setting.
+        ConfigurationError: a noise factor or latency for a plant that has no such setting, or a number that is out of
+            its bounds.
     """
-    plant = sections[request.plant]
-    if request.noise_factor != 1.0 or request.latency_periods is not None:
+    plant, run = sections[request.plant], sections["run"]
+    if request.noise_factor != 1.0 or request.latency is not None:
         try:
-            plant = vary_sensing(plant, request.noise_factor, request.latency_periods)
+            plant = vary_sensing(plant, request.noise_factor, request.latency)
         except ValueError as error:
             raise ConfigurationError(f"plant {request.plant}: {error}") from error
-    return ResolvedRun(request, sections["run"], plant, sections[request.controller], sections[request.task])
+    if request.period is not None:
+        run = _with_period(run, request.period)
+    return ResolvedRun(request, run, plant, sections[request.controller], sections[request.task])
+
+
+@lru_cache
+def _with_period(run: RunSettings, period: float) -> RunSettings:
+    """Return the same object for all runs of a period [s], so that they can advance together.
+
+    Raises:
+        ConfigurationError: a period that is not positive.
+    """
+    try:
+        return replace(run, period=period)
+    except ValueError as error:
+        raise ConfigurationError(f"run: {error}") from error
 
 
 def known_sections() -> list[str]:

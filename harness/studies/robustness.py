@@ -57,8 +57,8 @@ def _cell(place: Place, request: RunRequest) -> Cell:
     if place.magnitude is None or place.axis not in (LATENCY, NOISE):
         return Cell(replace(request, mismatch=place.vary(request.mismatch)), place.columns)
     number = place.magnitude.number
-    varied = {"latency_periods": int(number)} if place.axis == LATENCY else {"noise_factor": number}
-    return Cell(replace(request, **varied), place.columns)
+    late = replace(request, latency=number / 1000.0) if place.axis == LATENCY else None
+    return Cell(late or replace(request, noise_factor=number), place.columns)
 
 
 LINES: Final = (
@@ -66,7 +66,7 @@ LINES: Final = (
     Line("links", "link lengths wrong by up to, %", parse_magnitudes("links", "0:30:10%")),
     Line("joint_offsets", "joint zeros wrong by up to, °", parse_magnitudes("joint_offsets", "0:20:5deg")),
     Line("tool", "tool wrong by up to, mm", parse_magnitudes("tool", "0:100:25mm")),
-    Line(LATENCY, "camera latency, periods of 50 ms", tuple(Magnitude(float(n), "periods") for n in range(6))),
+    Line(LATENCY, "camera latency, ms", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
     Line(NOISE, "sensor noise, times the usual", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
     Line(MOVE, "camera moved half-way through the run, °", parse_magnitudes(MOVE, "0:180:45deg")),
 )

@@ -15,12 +15,14 @@ from __future__ import annotations
 import copy
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from functools import partial
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from servobench.plant.bench import Bench, SensingConfig, World
+from servobench.plant.bench import Bench, build_bench
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.faults import PlantDiverged
@@ -29,8 +31,11 @@ from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.seeds import named_generator
-from servobench.plant.settings import Count, NonNegative, Periods, Positive, settings
+from servobench.plant.sensing import SensingConfig
+from servobench.plant.settings import Count, NonNegative, Positive, settings
 from servobench.plant.signals import Truth
+from servobench.plant.timing import RENAMED_DELAY
+from servobench.plant.world import World
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import Scene
@@ -48,9 +53,9 @@ class BulletConfig:
     """[rad] largest joint position each way; the vendor's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
-    command_delay_periods: Periods = 0
-    """[periods] between a command and its first effect."""
-    sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 1, 0.002))
+    command_delay: NonNegative = 0.0
+    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
+    sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 0.05, 0.002))
     """Latency, lost frames, noise on top of the depth noise; `noise_factor` scales both."""
     width: Count = 320
     """[px] width of the image."""
@@ -72,6 +77,8 @@ class BulletConfig:
     """Draw the table and the floor; without them a frame costs a fifth."""
     view: bool = False
     """Open PyBullet's window and run in real time."""
+
+    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
     def camera(self) -> PinholeCamera:
         """Return the camera's intrinsics."""
@@ -254,7 +261,7 @@ def build_bullet(config: BulletConfig, setup: PlantSetup) -> Bench:
     Raises:
         ValueError: see `BulletWorld`.
     """
-    return Bench(BulletWorld(config, setup), config.command_delay_periods, config.sensing)
+    return build_bench(partial(BulletWorld, config), setup, config.command_delay, config.sensing)
 
 
 ENTRY = PlantEntry(

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import ClassVar
 
-from servobench.plant.bench import Bench, SensingConfig
+from servobench.plant.bench import Bench, build_bench
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.plant import PlantEntry, PlantSetup
-from servobench.plant.settings import Periods, nested, settings
+from servobench.plant.sensing import SensingConfig
+from servobench.plant.settings import NonNegative, nested, settings
+from servobench.plant.timing import RENAMED_DELAY
 
 
 @settings
 class FmuConfig:
     """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
 
-    command_delay_periods: Periods = 1
-    """[periods] between a command and its first effect."""
+    command_delay: NonNegative = 0.05
+    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
-    """Noise, latency and lost frames."""
+    """Noise, latency, frame period and lost frames."""
+
+    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
-def build_fmu(mapping: FmuMapping, setup: PlantSetup, command_delay_periods: int, sensing: SensingConfig) -> Bench:
+def build_fmu(mapping: FmuMapping, setup: PlantSetup, command_delay: float, sensing: SensingConfig) -> Bench:
     """Return the plant of an FMU, for a registry.
 
     Raises:
@@ -30,7 +36,7 @@ def build_fmu(mapping: FmuMapping, setup: PlantSetup, command_delay_periods: int
     """
     try:
         start = mapping.start if setup.start is None else setup.start
-        return Bench(FmuWorld(mapping, start, setup.period), command_delay_periods, sensing)
+        return build_bench(lambda own: FmuWorld(mapping, start, own.period), setup, command_delay, sensing)
     except FmuError as error:
         raise ValueError(str(error)) from error
 
@@ -44,7 +50,7 @@ def mapped_entry(path: Path) -> PlantEntry:
     mapping = read_mapping(path)
 
     def build(config: FmuConfig, setup: PlantSetup) -> Bench:
-        return build_fmu(mapping, setup, config.command_delay_periods, config.sensing)
+        return build_fmu(mapping, setup, config.command_delay, config.sensing)
 
     summary = f"the FMU {mapping.file.name}, as mapped by {path.name}"
     return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True)

@@ -1,7 +1,7 @@
 """Any FMI 2 or FMI 3 co-simulation FMU as a world.
 
 An `FmuMapping` says which variables are commands, joints and features; names are looked up once, at construction. The
-FMU is stepped with its own period, which divides the control period; commands are held meanwhile.
+FMU is stepped with its own period, which divides that of the world; commands are held meanwhile.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench import World
 from servobench.plant.checks import FloatArray, as_array, is_finite, whole_steps
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
@@ -29,6 +28,7 @@ from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.seeds import Seeds
 from servobench.plant.settings import Names
 from servobench.plant.signals import Truth
+from servobench.plant.world import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class FmuWorld(World):
             mapping: the roles of its variables; values of parameters may have leading axes.
             start: (..., n), rad, joint positions at time 0, for an FMU with a home or without joints; None: the FMU's
                 own home, or 0. Its leading axis says how many runs there are.
-            period: control period, s.
+            period: of `advance`, s.
 
         Raises:
             ValueError: an FMU that cannot be used, or a name or size that does not fit.
@@ -150,7 +150,7 @@ class FmuWorld(World):
         self._at_start = True
 
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
-        """Hold a command for one period; see `World.advance`.
+        """Hold a command for one period of the world; see `World.advance`.
 
         Raises:
             FmuError: the FMU of a single run failed, or a result is not finite.

@@ -36,15 +36,15 @@ ALL_OFF = dataclasses.replace(
 
 
 def row(controller, task, mismatch, seed, *settings, latency=None):
-    request = RunRequest("kinematic", controller, task, mismatch, seed, latency_periods=latency)
+    request = RunRequest("kinematic", controller, task, mismatch, seed, latency=latency)
     return run_experiment(request, read_settings(None, settings)).row
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_turned_and_late_camera_is_no_obstacle_where_it_stops_the_paper_s_method(seed):
     mismatch = "moderate+camera_rotation=120deg"
-    assert row(PLUS, "random", mismatch, seed, latency=2)["settling_time_s"] < 5.0
-    assert np.isnan(row(PAPER, "random", mismatch, seed, latency=2)["settling_time_s"])
+    assert row(PLUS, "random", mismatch, seed, latency=0.1)["settling_time_s"] < 5.0
+    assert np.isnan(row(PAPER, "random", mismatch, seed, latency=0.1)["settling_time_s"])
 
 
 @pytest.mark.parametrize("seed", range(3))

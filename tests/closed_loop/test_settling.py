@@ -45,7 +45,7 @@ def true_errors(entry, config, degrees=15.0, periods=160, **plant_settings):
 
 
 @pytest.mark.parametrize("entry", PRESETS, ids=lambda entry: entry.name)
-@pytest.mark.parametrize("settings", [{}, {"latency_periods": 1, "drop_probability": 0.1}], ids=["default", "late"])
+@pytest.mark.parametrize("settings", [{}, {"latency": 0.05, "drop_probability": 0.1}], ids=["default", "late"])
 def test_a_preset_settles_within_5_mm(entry, settings):
     errors = true_errors(entry, default_config(entry), **settings)
     assert errors[0] > 0.1

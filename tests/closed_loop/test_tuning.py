@@ -104,8 +104,8 @@ def test_tuned_files_do_not_matter_to_a_trial():
 def test_the_set_has_both_delays_equally_often_and_every_run_a_robot_of_its_own():
     runs = TuningSet(seeds=8, offset=100).runs()
     for task, count in ((MOVE, 8), (CURVE, 4)):
-        delays = [run.latency_periods for run in runs if run.task == task]
-        assert sorted(delays) == [0] * (count // 2) + [1] * (count // 2)
+        delays = [run.latency for run in runs if run.task == task]
+        assert sorted(delays) == [0.0] * (count // 2) + [0.05] * (count // 2)
     seeds = [run.seed for run in runs]
     assert seeds == list(range(TUNING.start + 100, TUNING.start + 112))
     twice = TuningSet(("kinematic", "bullet"), 8).runs()
@@ -116,7 +116,7 @@ def test_the_set_has_both_delays_equally_often_and_every_run_a_robot_of_its_own(
 def test_the_checked_subset_has_both_tasks_with_both_delays():
     whole = TuningSet(("kinematic", "bullet"), 8)
     checked = [whole.runs()[index] for index in whole.checked()]
-    assert [(run.task, run.latency_periods) for run in checked] == [(MOVE, 0), (MOVE, 1), (CURVE, 0), (CURVE, 1)]
+    assert [(run.task, run.latency) for run in checked] == [(MOVE, 0.0), (MOVE, 0.05), (CURVE, 0.0), (CURVE, 0.05)]
     assert {run.plant for run in checked} == {"kinematic"}
 
 
@@ -153,7 +153,7 @@ def test_a_better_tuned_controller_has_the_better_score():
 def test_the_delay_of_the_set_reaches_the_plant():
     entry = find_tunable("calibrated")
     trial = Trial("calibrated", apply_settings(entry, {"law": {"proportional_gain": 6.0}}))
-    prompt, late = (replace(SMALL.runs()[0], latency_periods=periods) for periods in (0, 1))
+    prompt, late = (replace(SMALL.runs()[0], latency=latency) for latency in (0.0, 0.05))
     costs = {run: cost for _, run, cost in evaluate([trial], [prompt, late], Workers())}
     assert costs[0] < costs[1]
 

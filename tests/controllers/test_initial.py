@@ -43,13 +43,13 @@ def probe(plant, seed=0, **settings):
 
 
 def test_probing_finds_the_true_jacobian_through_lag_delay_and_latency():
-    J, _ = probe(kinematic(feature_noise=0.0, latency_periods=1), probe_step=0.002)
+    J, _ = probe(kinematic(feature_noise=0.0, latency=0.05), probe_step=0.002)
     np.testing.assert_allclose(J, nominal_ur5().jacobian(START), atol=0.006)
 
 
 def test_probing_through_default_noise_is_as_good_as_the_averaged_noise_allows():
     truth = nominal_ur5().jacobian(START)
-    errors = [probe(kinematic(latency_periods=1), seed)[0] - truth for seed in range(20)]
+    errors = [probe(kinematic(latency=0.05), seed)[0] - truth for seed in range(20)]
     # each column: √(2 / 3) mm of averaged noise over 0.03 rad = 0.027 m/rad an entry, besides the arm's curvature
     assert np.sqrt(np.mean(np.square(errors))) < 0.04
 

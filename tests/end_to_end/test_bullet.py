@@ -30,7 +30,7 @@ IDEAL = configure(
     lag=0.0,
     depth_noise="none",
     depth_quantisation=0.0,
-    latency_periods=0,
+    latency=0.0,
     drop_probability=0.0,
 )
 MODEL = ur5.nominal_ur5()

@@ -13,7 +13,7 @@ import pytest
 
 from kit.foreign_fmu import build_crane, describe_with
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from servobench.plant.bench import Bench, SensingConfig
+from servobench.plant.bench import Bench
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.fmu_plant import FmuConfig, mapped_entry
@@ -21,6 +21,7 @@ from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, Trut
 from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.sensing import SensingConfig
 from servobench.plant.signals import Command
 
 QUIET = FmuConfig(0, SensingConfig(0.0))
@@ -67,7 +68,7 @@ def cache(tmp_path, monkeypatch) -> Path:
 def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> Bench:
     path = build_crane(tmp_path / "crane.fmu", version)
     arguments = {"file": path, "limits": JointLimits(2.0), **NAMES[version], **changes}
-    plant = Bench(FmuWorld(FmuMapping(**arguments), START, PERIOD), config.command_delay_periods, config.sensing)
+    plant = Bench(FmuWorld(FmuMapping(**arguments), START, PERIOD), config.command_delay, config.sensing)
     plant.reset(0)
     return plant
 

@@ -35,7 +35,7 @@ COMMANDS.setflags(write=False)
 @cache
 def oracle(mismatch: str):
     """Return joint positions and true features after each step, (STEPS, 9), by numpy."""
-    config = configure(KinematicConfig, feature_noise=0.0, command_delay_periods=0)
+    config = configure(KinematicConfig, feature_noise=0.0, command_delay=0.0)
     plant = build_kinematic(config, PlantSetup(mismatched(mismatch), np.array(HOME), PERIOD))
     plant.reset(0)
     rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in COMMANDS]

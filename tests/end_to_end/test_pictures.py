@@ -174,7 +174,7 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     moves, _ = split_tasks(results.load_runs(sweep(tmp_path / "out")))
     figure = draw_conditions(moves, method_styles(CONTROLLERS))
     labels = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
-    assert labels == ["latency [periods]", "camera rotation [deg]"]
+    assert labels == ["latency [ms]", "camera rotation [deg]"]
     share = np.asarray(figure.axes[1].containers[0].lines[0].get_ydata(), dtype=float)
     np.testing.assert_allclose(share, [100.0, 100 * 4 / 6, 50.0])
     moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "same")))

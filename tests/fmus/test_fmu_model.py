@@ -74,7 +74,7 @@ class Opened:
 @pytest.mark.parametrize("mismatch", ["none", "severe", "factory"])
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_fmu_agrees_with_the_kinematic_plant_over_a_thousand_random_steps(version, mismatch):
-    common = {"feature_noise": 0.002, "latency_periods": 1, "drop_probability": 0.1, "joint_range": 2.9}
+    common = {"feature_noise": 0.002, "latency": 0.05, "drop_probability": 0.1, "joint_range": 2.9}
     plant = ENTRY.build(configure(Ur5FmuConfig, fmi_version=version, max_joint_speed=2.0, **common), setup(mismatch))
     oracle = build_kinematic(configure(KinematicConfig, max_joint_speed=2.0, **common), setup(mismatch))
     assert plant.spec.joint_names == oracle.spec.joint_names
@@ -96,7 +96,7 @@ def test_the_fmu_agrees_with_the_kinematic_plant_over_a_thousand_random_steps(ve
 
 @pytest.mark.parametrize("lag", [0.0, 1e-4, 10.0])
 def test_any_lag_is_solved_exactly(lag):
-    quiet = {"lag": lag, "feature_noise": 0.0, "command_delay_periods": 0}
+    quiet = {"lag": lag, "feature_noise": 0.0, "command_delay": 0.0}
     plant, oracle = (entry.build(configure(entry.config, **quiet), setup()) for entry in (ENTRY, KINEMATIC))
     plant.reset(0), oracle.reset(0)
     for _ in range(20):
@@ -183,11 +183,11 @@ CONTINUE = """
 import pickle, sys
 import numpy as np
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
-from servobench.plant.bench import SensingConfig
+from servobench.plant.sensing import SensingConfig
 from servobench.plant.plant import PlantSetup
 from servobench.plant.signals import Command
 version, setup, state = pickle.load(sys.stdin.buffer)
-sensing = SensingConfig(latency_periods=2, drop_probability=0.1)
+sensing = SensingConfig(latency=0.1, drop_probability=0.1)
 plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, sensing=sensing), setup)
 plant.restore(state)
 generator = np.random.default_rng(2)
@@ -199,7 +199,7 @@ plant.close()
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_restored_state_gives_the_same_bits_here_and_in_another_process(version):
-    config = configure(Ur5FmuConfig, fmi_version=version, latency_periods=2, drop_probability=0.1)
+    config = configure(Ur5FmuConfig, fmi_version=version, latency=0.1, drop_probability=0.1)
     plant = ENTRY.build(config, setup("severe"))
     plant.reset(4)
     run(plant, 20, 1)

@@ -70,7 +70,7 @@ def request(path: Path, controller: str) -> RunRequest:
 
 
 def quiet(path: Path) -> Settings:
-    plant = {"sensing": {"feature_noise": 0.0}, "command_delay_periods": 1}
+    plant = {"sensing": {"feature_noise": 0.0}, "command_delay": 0.05}
     bound = {"delay": 0.05}  # the crane has no lag; the default bridges that of the UR5 as well
     return Settings({"target": TARGET, f"fmu:{path}": plant, "nmpc_calibrated": bound})
 

@@ -119,11 +119,11 @@ def test_the_manifest_is_json_for_every_reader(tmp_path):
 
 def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(folder):
     for index, latency in enumerate((None, 2, None)):
-        results.write_part(folder, index, [RunResult({"run_id": f"run{index}", "latency_periods": latency}, None)])
+        results.write_part(folder, index, [RunResult({"run_id": f"run{index}", "latency_s": latency}, None)])
     before = results.load_runs(folder)
     results.collect(folder)
     pd.testing.assert_frame_equal(results.load_runs(folder), before)
-    assert before["latency_periods"].tolist() == pytest.approx([np.nan, 2.0, np.nan], nan_ok=True)
+    assert before["latency_s"].tolist() == pytest.approx([np.nan, 2.0, np.nan], nan_ok=True)
 
 
 def test_a_part_of_several_runs_says_which_runs_are_there(folder):

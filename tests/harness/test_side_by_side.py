@@ -13,13 +13,13 @@ from servobench.harness.run.resolved import resolve
 from servobench.harness.run.together import side_by_side_key
 from servobench.plant.faults import FilterDiverged
 
-ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency_periods": 1}}, "random": {"duration": 2.5}}
+ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}}, "random": {"duration": 2.5}}
 PROBED = {"mfac+rls": {"initial": {"source": "probe", "settle_periods": 3, "average_periods": 1}}}
 
 
 def lossy(probability, periods):
     sensing = {"kinematic": {"sensing": {"drop_probability": probability}}}
-    return {**sensing, "run": {"lost_after_periods": periods}, "random": {"duration": 2.5}}
+    return {**sensing, "run": {"lost_after": 0.05 * periods}, "random": {"duration": 2.5}}
 
 
 SEEDS = (40001, 40002, 40003, 40004, 40005)
@@ -98,13 +98,13 @@ def test_plug_ins_and_rendered_plants_go_alone():
 def test_a_run_branches_into_futures_that_continue_with_the_same_bits(plant, controller):
     experiment = build(runs(controller, {}, plant=plant)[0])
     world, method, run = experiment.plant, experiment.controller, experiment.run
-    desired = experiment.scenario.reference.sampled(run.period, 40 + run.preview)
+    desired = experiment.scenario.reference.sampled(run.period, 40 + run.preview_rows)
     seen = world.reset(1)
     method.reset(seen, 1)
 
     def advance(observation, first, last):
         for k in range(first, last):
-            observation = world.step(method.step(observation, desired[k : k + 1 + run.preview]))
+            observation = world.step(method.step(observation, desired[k : k + 1 + run.preview_rows]))
         return observation
 
     at = advance(seen, 0, 15)

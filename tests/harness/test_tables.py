@@ -34,7 +34,7 @@ def runs() -> pd.DataFrame:
             rows.append(
                 {
                     "run_id": f"{name}-{seed}", "plant": "kinematic", "controller": name, "task": "random",
-                    "mismatch": "moderate", "seed": seed, "noise_factor": 1.0, "latency_periods": None,
+                    "mismatch": "moderate", "seed": seed, "noise_factor": 1.0, "latency_s": None, "period_s": None,
                     "status": "feature_lost" if lost else "completed",
                     "settling_time_s": np.nan if name == "slow" and seed < 4 else time,
                     "task_kind": "point_to_point", "feature_unit": "m",
@@ -84,10 +84,10 @@ def test_an_unknown_metric_is_told_in_one_line(runs):
 
 
 def test_conditions_are_told_apart_in_words(runs):
-    loud = runs.assign(noise_factor=2.0, latency_periods=3)
+    loud = runs.assign(noise_factor=2.0, latency_s=0.15)
     assert [words for words, _ in split_conditions(pd.concat([runs, loud]))] == [
         "random on kinematic, moderate",
-        "random on kinematic, moderate, noise × 2, latency 3 periods",
+        "random on kinematic, moderate, noise × 2, latency 150 ms",
     ]
 
 
@@ -143,7 +143,7 @@ def test_the_legend_tells_the_band_of_the_feature(runs):
 
 def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path):
     runs = results.load_runs(sweep(tmp_path / "out"))
-    wanted = runs[runs["run_id"] != "someone_elses-60-0"].assign(latency_periods=None)
+    wanted = runs[runs["run_id"] != "someone_elses-60-0"].assign(latency_s=None)
     (title, table), (second, kinds) = sweep_tables([wanted.iloc[:7], wanted.iloc[7:]])
     assert second == "random on kinematic: what came of the runs, %"
     assert kinds.values.tolist() == [
@@ -175,7 +175,7 @@ def test_moves_and_curves_are_told_apart_and_tasks_that_nobody_began_are_neither
 
 def test_only_conditions_that_vary_get_a_column(tmp_path):
     table = settling_table(results.load_runs(sweep(tmp_path / "out")))
-    assert "latency_periods" in table
+    assert "latency_s" in table
     assert "noise_factor" not in table
     assert len(table) == 3 * 3 * 2
 

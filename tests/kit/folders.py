@@ -80,7 +80,8 @@ def sweep(folder: Path) -> Path:
                 rows.append(
                     made_up_row(
                         f"{controller}-{degrees}-{seed}", controller=controller, task="random", seed=seed,
-                        mismatch=f"camera_rotation={degrees}deg", noise_factor=1.0, latency_periods=seed % 2,
+                        mismatch=f"camera_rotation={degrees}deg", noise_factor=1.0, latency_s=0.05 * (seed % 2),
+                        period_s=None,
                         status="feature_lost" if lost else "completed",
                         reason="no valid feature for 20 periods" if lost else "",
                     )

@@ -4,10 +4,10 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from servobench.plant.bench import SensingConfig
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.sensing import SensingConfig
 
 
 def mismatched(text, seed=3):

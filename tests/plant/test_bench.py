@@ -7,10 +7,12 @@ import pickle
 import numpy as np
 import pytest
 
-from servobench.plant.bench import Bench, SensingConfig, World, can_vary_sensing, vary_sensing
+from servobench.plant.bench import Bench
 from servobench.plant.faults import FeatureLost
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.sensing import SensingConfig, can_vary_sensing, vary_sensing
 from servobench.plant.signals import Command, PlantSpec, Truth
+from servobench.plant.world import World
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), [1.0, 0.5], [-9.0, -9.0], [9.0, 9.0], 0.1)
 QUIET = SensingConfig(0.0)
@@ -58,12 +60,12 @@ def test_commands_are_clipped_to_the_limits_of_each_joint():
 
 
 def test_a_command_arrives_after_its_delay_and_the_arm_rests_until_then():
-    moved = [o.joint_position[0] for o in walk(bench(delay=2), np.full((4, 2), 0.5))]
+    moved = [o.joint_position[0] for o in walk(bench(delay=0.2), np.full((4, 2), 0.5))]
     np.testing.assert_allclose(moved, [0.0, 0.0, 0.05, 0.1], atol=1e-15)
 
 
 def test_a_feature_arrives_after_its_latency():
-    late, prompt = walk(bench(sensing=SensingConfig(0.0, 3))), walk(bench())
+    late, prompt = walk(bench(sensing=SensingConfig(0.0, 0.3))), walk(bench())
     assert [o.feature[0] for o in late] == [0.0, 0.0, 0.0, *(o.feature[0] for o in prompt[:-3])]
 
 
@@ -87,7 +89,7 @@ def test_a_lost_frame_is_not_valid_and_the_last_feature_is_held():
 
 
 def test_a_frame_without_the_feature_comes_out_late_as_well():
-    seen = walk(bench(sensing=SensingConfig(0.0, 1), hidden=(2,)), np.full((4, 2), 0.5))
+    seen = walk(bench(sensing=SensingConfig(0.0, 0.1), hidden=(2,)), np.full((4, 2), 0.5))
     assert [o.feature_valid for o in seen] == [True, True, False, True]
     np.testing.assert_allclose([o.feature[0] for o in seen], [0.0, 0.05, 0.05, 0.15], atol=1e-15)
 
@@ -103,7 +105,7 @@ def test_a_run_begins_with_a_reset():
 
 
 def test_a_saved_state_restores_delay_latency_noise_and_lost_frames():
-    plant = bench(2, SensingConfig(0.01, 2, 0.3), seed=5)
+    plant = bench(0.2, SensingConfig(0.01, 0.2, 0.3), seed=5)
     walk(plant)
     state = plant.save()
     first = walk(plant)
@@ -122,9 +124,9 @@ def test_closing_closes_the_world():
 
 
 def test_noise_and_latency_are_varied_in_the_section_sensing_alone():
-    config = KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 1))
-    varied = vary_sensing(vary_sensing(config, 2.0, None), 3.0, 4)
-    assert varied == KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 4, noise_factor=6.0))
+    config = KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 0.05))
+    varied = vary_sensing(vary_sensing(config, 2.0, None), 3.0, 0.2)
+    assert varied == KinematicConfig(lag=0.1, sensing=SensingConfig(0.002, 0.2, noise_factor=6.0))
     assert can_vary_sensing(config)
     with pytest.raises(ValueError, match="cannot be varied"):
         vary_sensing(object(), 2.0, None)

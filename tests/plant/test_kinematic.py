@@ -13,7 +13,7 @@ from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command
 
 START = np.array(HOME)
-QUIET = {"feature_noise": 0.0, "command_delay_periods": 0}
+QUIET = {"feature_noise": 0.0, "command_delay": 0.0}
 
 
 def make(period: float = 0.05, **settings) -> Bench:
@@ -59,5 +59,5 @@ def test_a_joint_stops_at_its_range():
 
 
 def test_a_period_must_be_positive():
-    with pytest.raises(ValueError, match="period must be positive"):
+    with pytest.raises(ValueError, match="period must be above 0"):
         make(period=0.0)

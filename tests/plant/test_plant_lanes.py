@@ -24,18 +24,20 @@ STARTS = np.array(HOME) + np.random.default_rng(0).uniform(-0.3, 0.3, (3, 6))
 PERIODS, MOVE = 70, 40  # further than one block of random numbers
 COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (PERIODS, 3, 6))
 MOVED = np.array([mismatched("camera_rotation=40deg", seed).X_BC for seed in SEEDS])
-WORST = {"command_delay_periods": 3, "latency_periods": 2, "drop_probability": 0.2}
+WORST = {"command_delay": 0.15, "latency": 0.1, "drop_probability": 0.2}
+FINE = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3}  # sub-steps of 10 ms
 
 
-@pytest.fixture(params=["kinematic", "fmu"])
+@pytest.fixture(params=[("kinematic", WORST), ("fmu", WORST), ("kinematic", FINE), ("fmu", FINE)])
 def build(request):
     """Return a function that builds a plant for one lane or for an array of lanes, under bad sensing."""
-    entry, opened = find_plant(request.param), []
+    name, settings = request.param
+    entry, opened = find_plant(name), []
     assert entry.side_by_side
 
     def made(chosen):
         model = MODELS[chosen] if np.ndim(chosen) == 0 else lanes.stack([MODELS[lane] for lane in chosen])
-        opened.append(entry.build(configure(entry.config, **WORST), PlantSetup(model, STARTS[chosen], 0.05)))
+        opened.append(entry.build(configure(entry.config, **settings), PlantSetup(model, STARTS[chosen], 0.05)))
         opened[-1].reset(SEEDS[chosen] if np.ndim(chosen) == 0 else [SEEDS[lane] for lane in chosen])
         return opened[-1]
 

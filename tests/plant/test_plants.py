@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from servobench.harness.config.registry import find_plant, plant_names
-from servobench.plant.bench import vary_sensing
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.sensing import vary_sensing
 from servobench.plant.signals import Command
 
 PERIOD = 0.05
@@ -162,7 +162,7 @@ def test_noise_and_latency_can_be_varied(entry):
     model = nominal_ur5()
 
     def spread(factor: float) -> float:
-        plant = entry.build(vary_sensing(entry.config(), factor, 3), PlantSetup(model, np.array(HOME), PERIOD))
+        plant = entry.build(vary_sensing(entry.config(), factor, 3 * PERIOD), PlantSetup(model, np.array(HOME), PERIOD))
         try:
             seen = [plant.reset(4).feature, *(plant.step(Command(np.zeros(6))).feature for _ in range(30))]
             return float(np.std(seen, axis=0).max())
@@ -179,7 +179,7 @@ START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the po
 
 def test_latency_shows_a_moved_camera_late(entry):
     model, sample = sample_mismatch(Mismatch.parse("camera_move=20deg"), nominal_ur5(), 1)
-    plant = entry.build(vary_sensing(entry.config(), 0.0, 3), PlantSetup(model, START, PERIOD))
+    plant = entry.build(vary_sensing(entry.config(), 0.0, 3 * PERIOD), PlantSetup(model, START, PERIOD))
     first = plant.reset(0).feature
     plant.move_camera(sample.moved(model).X_BC)
     seen = [np.linalg.norm(plant.step(Command(np.zeros(6))).feature - first) for _ in range(6)]

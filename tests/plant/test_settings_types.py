@@ -10,10 +10,10 @@ from typing import ClassVar, Literal
 
 import pytest
 
-from servobench.plant.bench import SensingConfig
 from servobench.plant.bullet.bullet_plant import BulletConfig
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
+from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import Count, Number, Periods, Positive, Share, nested, override, settings
 
 
@@ -104,7 +104,8 @@ def test_settings_of_another_class_are_refused():
     ("kind", "name", "value", "wanted"),
     [
         (SensingConfig, "feature_noise", -0.001, "at least 0"),
-        (SensingConfig, "latency_periods", -1, "at least 0"),
+        (SensingConfig, "latency", -0.1, "at least 0"),
+        (SensingConfig, "frame_period", -0.1, "at least 0"),
         (SensingConfig, "drop_probability", 1.0, "below 1"),
         (SensingConfig, "noise_factor", -1.0, "at least 0"),
         (PinholeCamera, "near", 0.0, "above 0"),
@@ -124,7 +125,7 @@ def test_settings_of_another_class_are_refused():
         *((kind, "joint_range", 0.0, "above 0") for kind in (KinematicConfig, BulletConfig)),
         *((kind, "lag", -0.1, "at least 0") for kind in (KinematicConfig, BulletConfig)),
         *((kind, "lag", float("nan"), "finite") for kind in (KinematicConfig, BulletConfig)),
-        *((kind, "command_delay_periods", -1, "at least 0") for kind in (KinematicConfig, BulletConfig)),
+        *((kind, "command_delay", -0.1, "at least 0") for kind in (KinematicConfig, BulletConfig)),
     ],
 )
 def test_a_setting_of_a_plant_out_of_its_bounds_is_refused(kind, name, value, wanted):

@@ -1,7 +1,7 @@
 """What tuning minimises, and the runs that it is measured on.
 
 For each plant, `seeds` moves of the task `random` and half as many runs of the task `circle`, every one on another
-robot of `moderate` mismatch. Every other run has a camera latency of one period, as the rendered plant has.
+robot of `moderate` mismatch. Every other run has a camera latency of 50 ms, as the rendered plant has.
 
     score = mean over random of c_random + mean over circle of c_circle         (0 is perfect, 4 the worst)
 
@@ -31,13 +31,13 @@ from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
 from servobench.harness.run.tasks import find_task
 from servobench.harness.run.together import side_by_side_key
-from servobench.plant.bench import can_vary_sensing
+from servobench.plant.sensing import can_vary_sensing
 from servobench.plant.settings import Periods, settings
 
 MOVE: Final = "random"
 CURVE: Final = "circle"
 MISMATCH: Final = "moderate"
-LATENCIES: Final = (0, 1)  # [periods] between exposure and delivery of the feature, in turn
+LATENCIES: Final = (0.0, 0.05)  # [s] between exposure and delivery of the feature, in turn
 RMS_SATURATION: Final = 0.05  # [m] on the circle; the cost saturates at 1 here
 FAULT_PENALTY: Final = 1.0  # added to the cost 1 of a run that did not complete
 CHECKED: Final = len(LATENCIES)  # runs of each task in the subset that a test scores again
@@ -73,7 +73,7 @@ class TuningSet:
         seeds = tuning_seeds(self.seeds + self.seeds // 2, self.offset)
         tasks = [MOVE] * self.seeds + [CURVE] * (self.seeds // 2)
         return [
-            RunRequest(plant, "", task, read_mismatch(MISMATCH), seed, latency_periods=latency)
+            RunRequest(plant, "", task, read_mismatch(MISMATCH), seed, latency=latency)
             for plant in self.plants
             for task, seed, latency in zip(tasks, seeds, cycle(LATENCIES), strict=False)
         ]

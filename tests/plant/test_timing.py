@@ -1,0 +1,169 @@
+"""Physical time: the same world at every control rate, with features late by exactly the latency."""
+
+from __future__ import annotations
+
+import pickle
+import re
+
+import numpy as np
+import pytest
+
+from kit.plants import configure, setup
+from servobench.harness.config.registry import find_plant
+from servobench.plant.bench import Bench
+from servobench.plant.kinematic import KinematicConfig, KinematicWorld
+from servobench.plant.sensing import SensingConfig
+from servobench.plant.signals import Command
+from servobench.plant.timing import common_step
+
+RATES = (10, 20, 50, 125, 250)  # [Hz]
+DURATION = 1.0  # [s]
+COMMON = 0.2  # [s] multiples of it are control instants at every rate
+QUIET = {"feature_noise": 0.0}
+
+
+def wanted(time):
+    """Return a command that changes at multiples of `COMMON` only, (6,) rad/s."""
+    return 0.5 * np.sin(1.0 + round(time // COMMON) + np.arange(6.0))
+
+
+def run(plant, rate):
+    """Return the observations of a run, the first one included."""
+    seen = [plant.reset(3)]
+    for k in range(round(DURATION * rate)):
+        seen.append(plant.step(Command(wanted(k / rate + 1e-9))))
+    return seen
+
+
+@pytest.fixture(params=["kinematic", "fmu"])
+def build(request):
+    """Return a function that builds a plant for a control rate; plants are closed at the end."""
+    entry, opened = find_plant(request.param), []
+
+    def made(rate, **settings):
+        config = configure(entry.config, **{**QUIET, **settings})
+        opened.append(entry.build(config, setup("moderate", 1.0 / rate)))
+        return opened[-1]
+
+    yield made
+    for plant in opened:
+        plant.close()
+
+
+def every(seen, rate):
+    """Return joints and features at multiples of `COMMON`."""
+    step = round(COMMON * rate)
+    return [np.array([getattr(o, name) for o in seen[::step]]) for name in ("joint_position", "feature")]
+
+
+@pytest.mark.parametrize("command_delay", [0.0, 0.05, 0.07])
+def test_the_physical_world_is_the_same_at_every_rate(build, command_delay):
+    settings = {"command_delay": command_delay, "latency": 0.07}
+    walks = {rate: every(run(build(rate, **settings), rate), rate) for rate in RATES}
+    assert np.ptp(walks[250][0], axis=0).max() > 0.05
+    for joints, features in walks.values():
+        np.testing.assert_allclose(joints, walks[250][0], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(features, walks[250][1], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_a_feature_is_late_by_exactly_the_latency(build, rate):
+    late, fine = (
+        [o.feature for o in run(build(own, latency=latency), own)] for own, latency in ((rate, 0.033), (1000, 0.0))
+    )
+    instants = [round(1000 * k / rate) for k in range(len(late))]
+    np.testing.assert_allclose(late, [fine[max(0, ms - 33)] for ms in instants], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_a_slow_camera_shows_frames_of_its_own_clock_and_the_feature_is_held_between(build, rate):
+    seen = run(build(rate, latency=0.02, frame_period=0.04), rate)
+    fine = [o.feature for o in run(build(1000), 1000)]
+    held, last = fine[0], 0
+    for k, observation in enumerate(seen[1:], 1):
+        newest = (round(1000 * k / rate) - 20) // 40  # number of the newest frame that is delivered
+        assert observation.feature_valid == (newest > last or (newest == 0 and (k - 1) / rate < 0.02 <= k / rate))
+        held, last = fine[40 * newest] if newest > 0 else held, max(newest, last)
+        np.testing.assert_allclose(observation.feature, held, rtol=0.0, atol=1e-9)
+
+
+def test_a_camera_of_the_control_period_is_the_default_camera(build):
+    first, second = (run(build(20, latency=0.1, frame_period=period), 20) for period in (0.0, 0.05))
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.feature, other.feature)
+        assert one.feature_valid
+        assert other.feature_valid
+
+
+def test_lost_frames_are_frames_of_the_camera():
+    config = configure(KinematicConfig, drop_probability=0.5, frame_period=0.1, **QUIET)
+    seen = run(find_plant("kinematic").build(config, setup(period=0.02)), 50)
+    assert not any(o.feature_valid for k, o in enumerate(seen) if k % 5)
+    assert 1 < sum(o.feature_valid for o in seen) < 10
+
+
+def test_a_saved_state_continues_with_the_same_bits_in_a_finer_world(build):
+    settings = {"command_delay": 0.05, "latency": 0.033, "frame_period": 0.025, "drop_probability": 0.3}
+    plant = build(50, **settings)
+    run(plant, 50)
+    state = plant.save()
+    walks = []
+    for saved in (state, pickle.loads(pickle.dumps(state))):
+        plant.restore(saved)
+        walks.append([plant.step(Command(wanted(COMMON * k))) for k in range(20)])
+    for one, other in zip(*walks, strict=True):
+        for name in ("time", "joint_position", "feature", "feature_valid"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_no_frame_is_taken_that_is_not_exposed(monkeypatch):
+    taken, see = [], KinematicWorld.see
+    monkeypatch.setattr(KinematicWorld, "see", lambda world: taken.append(1) or see(world))
+    config = configure(KinematicConfig, command_delay=0.001, latency=0.033, **QUIET)
+    run(find_plant("kinematic").build(config, setup(period=0.05)), 20)
+    assert len(taken) == 1 + 20
+
+
+@pytest.mark.parametrize(
+    ("period", "delay", "sensing", "step"),
+    [
+        (0.05, 0.05, SensingConfig(), 0.05),
+        (1 / 240, 0.05, SensingConfig(), 1 / 240),
+        (0.05, 0.0, SensingConfig(latency=0.15), 0.05),
+        (0.1, 0.05, SensingConfig(), 0.05),
+        (0.02, 0.05, SensingConfig(), 0.01),
+        (0.008, 0.05, SensingConfig(latency=0.1), 0.002),
+        (0.004, 0.05, SensingConfig(frame_period=0.033), 0.001),
+    ],
+)
+def test_the_sub_step_is_the_greatest_common_divisor(period, delay, sensing, step):
+    assert common_step(period, delay, sensing) == step
+
+
+@pytest.mark.parametrize(
+    ("period", "delay", "sensing", "message"),
+    [
+        (0.05, 0.0, SensingConfig(latency=0.0205), "latency must be a whole number of milliseconds"),
+        (1 / 240, 0.051, SensingConfig(), "period must be a whole number of milliseconds, because command_delay is no"),
+        (0.05, 0.05, SensingConfig(frame_period=1 / 30), "frame_period must be a whole number of milliseconds"),
+        (0.0, 0.05, SensingConfig(), "period must be above 0, got 0.0"),
+    ],
+)
+def test_times_without_a_common_sub_step_are_refused(period, delay, sensing, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        common_step(period, delay, sensing)
+
+
+def test_a_bench_refuses_a_world_that_is_too_coarse():
+    world = KinematicWorld(KinematicConfig(), setup(period=0.05))
+    with pytest.raises(ValueError, match=r"latency must be a multiple of the world's period of 0\.05 s, got 0\.02 s"):
+        Bench(world, 0.05, SensingConfig(latency=0.02))
+
+
+@pytest.mark.parametrize("name", ["kinematic", "fmu", "bullet"])
+def test_earlier_keys_are_refused_with_the_new_ones(name):
+    kind = find_plant(name).config
+    with pytest.raises(ValueError, match="no setting 'command_delay_periods' any more: it is now command_delay, in s"):
+        kind(command_delay_periods=1)
+    with pytest.raises(ValueError, match="no setting 'latency_periods' any more: it is now latency, in seconds"):
+        SensingConfig(latency_periods=1)
