@@ -26,24 +26,24 @@ Tree = TypeVar("Tree")
 Lanes = Any  # an index of the leading axes
 
 
-def _map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  # noqa: ANN401 - any tree
+def map_arrays(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  # noqa: ANN401 - any tree
     """Return the tree with `function` applied to its arrays, and to those at the same place of the other trees."""
     if isinstance(tree, (np.ndarray, np.generic)):  # numpy makes numbers of arrays without axes
         return function(tree, *others)
     if isinstance(tree, tuple):
-        entries = [_map(function, *each) for each in zip(tree, *others, strict=True)]
+        entries = [map_arrays(function, *each) for each in zip(tree, *others, strict=True)]
         return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
     if is_dataclass(tree) and not isinstance(tree, type):
         new = object.__new__(type(tree))
         for name in (field.name for field in fields(tree)):
-            object.__setattr__(new, name, _map(function, *(getattr(each, name) for each in (tree, *others))))
+            object.__setattr__(new, name, map_arrays(function, *(getattr(each, name) for each in (tree, *others))))
         return new
     return tree
 
 
 def take(tree: Tree, lanes: Lanes) -> Tree:
     """Return a tree with the lanes that an index names; a single number gives the tree of a single run."""
-    taken: Tree = _map(lambda array: array[lanes], tree)
+    taken: Tree = map_arrays(lambda array: array[lanes], tree)
     return taken
 
 
@@ -57,13 +57,13 @@ def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
         new[lanes] = values
         return new
 
-    changed: Tree = _map(replaced, tree, part, before)
+    changed: Tree = map_arrays(replaced, tree, part, before)
     return changed
 
 
 def stack(trees: Sequence[Tree]) -> Tree:
     """Return the trees of single runs as one tree with a leading axis; what is no array is that of the first one."""
-    stacked: Tree = _map(lambda *arrays: np.stack(arrays), *trees)
+    stacked: Tree = map_arrays(lambda *arrays: np.stack(arrays), *trees)
     return stacked
 
 

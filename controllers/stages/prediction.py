@@ -10,6 +10,8 @@ that is still to come (`joint_response`). Both halves can be left out.
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from typing import NamedTuple, final
 
 import numpy as np
@@ -92,6 +94,12 @@ class Predictor:
         self._aids, self._period, self._delays = aids, period, delays
         self.span = max(1, periods_in(MOTION_TIME, period))
         self._length = max(1, periods_in(aids.response_length, period * self.span))
+
+    def frozen(self) -> Predictor:
+        """Return a stage that goes on from a state of this one and identifies nothing more."""
+        aids, other = self._aids, copy.copy(self)
+        other._aids = replace(aids, response=aids.response if aids.response == "ignored" else "given", noise="given")
+        return other
 
     def start(self, observation: Observation) -> PredictorState:
         """Return the state of an arm at rest."""

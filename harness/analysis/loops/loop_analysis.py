@@ -1,0 +1,163 @@
+"""The loop of one controller analysed: linearised where it is composed, identified from logged data where it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from servobench.controllers.servo import ServoController
+from servobench.harness.analysis.loops.arm import ArmModel
+from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Source, Warm, linear_controller, warm_up
+from servobench.harness.analysis.loops.identification import (
+    SmallMotions,
+    controller_response,
+    excite,
+    simulated_step,
+    step_responses,
+)
+from servobench.harness.analysis.loops.margins import LoopResponse, Margins, frequencies
+from servobench.harness.analysis.loops.matrices import StateSpace, closed_loop, is_stable
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.tasks import RandomTask
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import RunFault
+from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.mismatch import Mismatch
+
+STEP_DURATION = 4.0  # [s] of the step responses
+
+
+@dataclass(frozen=True, eq=False)
+class LoopAnalysis:
+    """The loop around a rest.
+
+    Attributes:
+        name: of the controller.
+        model: "linearised" or "identified".
+        stable: whether the loop is stable as it is.
+        margins: of the loop.
+        response: the frequency response of controller and loop.
+        step: each feature after a unit step of its own reference, (periods, m).
+        system: the closed loop from the references to what the controller measures; None for an identified one.
+    """
+
+    name: str
+    model: str
+    stable: bool
+    margins: Margins
+    response: LoopResponse
+    step: FloatArray
+    system: StateSpace | None
+
+    @property
+    def arm(self) -> ArmModel:
+        """The linear model of arm and camera."""
+        return self.response.arm
+
+    @property
+    def latency_limit(self) -> float:
+        """The largest latency of the camera at which the loop is predicted to be stable [s]; 0 if it is not now."""
+        return self.arm.latency + self.margins.delay if self.stable else 0.0
+
+    def gain_limits(self, latencies: Sequence[float]) -> FloatArray:
+        """Return the least factor on the command at which the loop becomes unstable, at each latency [s]."""
+        at = [replace(self.response, arm=replace(self.arm, latency=each)) for each in latencies]
+        return np.array([each.gain_limit() for each in at])
+
+    def sensitivity_peaks(self, factors: FloatArray, latencies: Sequence[float]) -> FloatArray:
+        """Return M_s with the command multiplied by each factor, at each latency [s], (factors, latencies)."""
+        peaks = np.full((len(factors), len(latencies)), np.inf)
+        every = max(1, len(self.response.frequency) // 128)
+        frequency, controller = self.response.frequency[::-every][::-1], self.response.controller[::-every][::-1]
+        limits = self.gain_limits(latencies)
+        for j, latency in enumerate(latencies):
+            arm = replace(self.arm, latency=latency)
+            for i in np.flatnonzero(factors < limits[j]):
+                L = LoopResponse(frequency, factors[i] * controller, arm).at_feature()
+                S = np.linalg.inv(np.eye(L.shape[-1]) + L)
+                peaks[i, j] = np.linalg.norm(S, ord=2, axis=(-2, -1)).max()
+        return peaks
+
+
+def analyse_loop(resolved: ResolvedRun, source: Source = "true", *, identify: bool = False) -> LoopAnalysis:
+    """Analyse the loop of a controller on the kinematic plant.
+
+    Args:
+        resolved: the run whose begin warms the controller up.
+        source: the Jacobian at which the estimator of a composed controller is frozen.
+        identify: identify a composed controller as any other, from logged data, while its estimator goes on learning.
+
+    Raises:
+        ConfigurationError: a name or a setting that cannot be used.
+        RunFault: the controller cannot go on, or an unstable loop whose controller has to be identified.
+    """
+    warm, name = warm_up(resolved), resolved.request.controller
+    if isinstance(warm.controller, ServoController) and not identify:
+        return _linearised(name, warm, source)
+    return _identified(name, warm)
+
+
+def delay_margin(
+    config: Any,  # noqa: ANN401 - the settings of any composed controller
+    name: str,
+    run: RunSettings | None = None,
+    plant: KinematicConfig | None = None,
+    seed: int = 0,
+) -> float:
+    """Return by how much later the camera may be before the loop of a composed controller is unstable, s.
+
+    The estimator is frozen at the true Jacobian of the nominal robot, where a move of the warm-up ended. It takes some
+    30 ms.
+
+    Args:
+        config: settings of the controller.
+        name: of the controller.
+        run: period and preview; default: those of a run.
+        plant: lag, delays and noise; default: those of the kinematic plant.
+        seed: of the move.
+
+    Returns:
+        0 for a loop that is unstable without any addition, or whose controller cannot go on.
+
+    Raises:
+        TypeError: a controller that is not composed.
+        ConfigurationError: a name or a setting that cannot be used.
+    """
+    request = RunRequest(PLANT, name, TASK, Mismatch(), seed)
+    resolved = ResolvedRun(request, run or RunSettings(), plant or KinematicConfig(), config, RandomTask())
+    try:
+        warm = warm_up(resolved)
+        controller = linear_controller(warm, "true")
+    except RunFault:
+        return 0.0
+    if not is_stable(closed_loop(warm.arm.matrices(), controller).A):
+        return 0.0
+    return linear_response(controller, warm.arm).delay_margin()
+
+
+def linear_response(controller: StateSpace, arm: ArmModel) -> LoopResponse:
+    """Return the frequency response of a linear controller on an arm."""
+    axis, measured = frequencies(arm.period), sum(arm.jacobian.shape)
+    return LoopResponse(axis, controller.response(np.exp(1j * axis * arm.period))[:, :, :measured], arm)
+
+
+def _linearised(name: str, warm: Warm, source: Source) -> LoopAnalysis:
+    controller, arm = linear_controller(warm, source), warm.arm
+    closed, response = closed_loop(arm.matrices(), controller), linear_response(controller, arm)
+    periods = round(STEP_DURATION / arm.period)
+    step = simulated_step(closed, len(arm.jacobian), arm.period, periods)
+    return LoopAnalysis(name, "linearised", is_stable(closed.A), response.margins(), response, step, closed)
+
+
+def _identified(name: str, warm: Warm) -> LoopAnalysis:
+    arm = warm.arm
+    m, n = arm.jacobian.shape
+    loop = SmallMotions(warm.controller, arm, warm.rest)
+    frequency, controller = controller_response(excite(loop, m + n), arm.period)
+    response = LoopResponse(frequency, controller, arm)
+    step = step_responses(loop, m, n, round(STEP_DURATION / arm.period))
+    return LoopAnalysis(name, "identified", True, response.margins(), response, step, None)
