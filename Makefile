@@ -3,9 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 UNIT := tests/plant tests/controllers tests/fmus tests/harness
-NIGHTLY ?= results/nightly
+RUNS ?= results/pages
 
-.PHONY: run check test nightly lint format docs figures benchmark lock clean
+.PHONY: run check test results nightly lint format docs benchmark lock clean
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
@@ -19,9 +19,14 @@ check: lint
 test: lint
 	$(BIN)/python -m pytest -n auto
 
-# Too long for every change: hours. The same call goes on after an interruption; docs/experiments.md names its last figures.
+# Renew every measured table and picture of the pages: a night. The same call goes on after an interruption;
+# ONLY=held_out,rates renews these, RUNS is the folder of the runs. docs/experiments.md lists the studies.
+results: $(VENV)/ready
+	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
+
+# Too long for every change: whether the stored figures of these studies come out again; writes nothing into the pages.
 nightly: $(VENV)/ready
-	PYTHONPATH=tests $(BIN)/python docs/nightly.py $(NIGHTLY)
+	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 
 lint: $(VENV)/ready
 	$(BIN)/ruff format --check .
@@ -33,13 +38,9 @@ format: $(VENV)/ready
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Write the generated tables of the pages anew from the code.
+# Write the generated tables of the pages anew from the code and from docs/tables.
 docs: $(VENV)/ready
 	$(BIN)/python docs/generated_tables.py
-
-# Draw the README's pictures anew from committed seeds: the comparison on rendered images takes most of the minutes.
-figures: $(VENV)/ready
-	$(BIN)/python docs/readme_pictures.py docs/pictures
 
 # Write docs/performance.md and its pictures: a quarter of an hour on two quiet processors. AGAINST="0.1.0=/path" adds a checkout.
 benchmark: $(VENV)/ready

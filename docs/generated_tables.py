@@ -1,4 +1,4 @@
-"""Writes the generated tables of the documentation: settings, and the variables of the exported FMU.
+"""Writes the generated parts of the pages: settings, the variables of the exported FMU, and measured tables.
 
     make docs
 
@@ -6,9 +6,12 @@ A generated part of a page is everything between two comments, of which the firs
 
     <!-- settings: controllers/laws/mfac.py:MfacConfig -->
     <!-- variables: ur5_mismatched -->
+    <!-- table: worlds -->
+    <!-- studies: docs/page_studies -->
     <!-- end -->
 
 The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
+A measured table is that of docs/tables, which `make results` writes; until it is there the part stays as it is.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import dataclasses
 import importlib
 import inspect
 import json
+import os
 import re
 import sys
 import textwrap
@@ -27,11 +31,13 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import stored_tables
+from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
-PART = re.compile(r"(<!-- (settings|variables): (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
+PART = re.compile(r"(<!-- (settings|variables|table|studies): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # what a string below a field begins with
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -39,13 +45,42 @@ SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 def main() -> None:
     """Write every generated part of every page anew."""
     for page in PAGES:
-        page.write_text(renewed(page.read_text(encoding="utf-8")), encoding="utf-8")
+        page.write_text(renewed(page), encoding="utf-8")
 
 
-def renewed(text: str) -> str:
-    """Return the page `text` with its generated parts made anew from the code."""
-    make = {"settings": lambda place: settings_table(find(place)), "variables": lambda _: variables_table()}
-    return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part[3])}\n\n{part[4]}", text)
+def renewed(page: Path) -> str:
+    """Return the text of a page with its generated parts made anew from the code and the stored tables."""
+    make = {
+        "settings": lambda part: settings_table(find(part[3])),
+        "variables": lambda _: variables_table(),
+        "studies": lambda _: studies_table(),
+        "table": lambda part: measured_table(part[3], page.parent) or part[4].strip("\n"),
+    }
+    text = page.read_text(encoding="utf-8")
+    return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part)}\n\n{part[5]}", text)
+
+
+def studies_table() -> str:
+    """Return the table of the studies behind the measured tables and pictures."""
+    rows = [(f"`{study.name}`", study.purpose, f"{study.minutes:g}") for study in STUDIES.values()]
+    return table(("study", "what it measures", "minutes on two processors"), rows)
+
+
+def measured_table(name: str, folder: Path) -> str:
+    """Return a table of docs/tables with a line that says when it was made; nothing if it is not there.
+
+    Args:
+        name: of the table.
+        folder: of the page, from which its links go.
+    """
+    path = stored_tables.FOLDER / f"{name}.csv"
+    if not path.exists():
+        return ""
+    stamp, rows = stored_tables.read(path)
+    place = Path(os.path.relpath(path, folder)).as_posix()
+    made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
+    cells = [tuple(row) for row in rows.itertuples(index=False)]
+    return f"{table(tuple(rows.columns), cells)}\n\n`make results ONLY={stamp['study']}`: {made}; [commands]({place})"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name

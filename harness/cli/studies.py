@@ -50,22 +50,24 @@ def claims(
     out: options.FolderOption,
     plants: options.NamesOption = "kinematic,fmu",
     seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 500,
+    division: Annotated[str, typer.Option(help="How methods are equipped: equipped, published or both.")] = "equipped",
     running: options.Running = options.RUNNING,
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
+    from servobench.harness.studies.claims.studies import find_divisions
     from servobench.harness.studies.claims.table import ANSWERS, differences, read_answers
 
     names = options.split_plants(plants)
+    divisions = find_divisions(division)
     wanted = None if check is None else read_answers(check)
     with watching(console, out) as observer:
-        answers = reproduce(out, names, seeds, running.execution(observer))
+        answers = reproduce(out, names, seeds, running.execution(observer), divisions)
     for answer in answers:
-        console.print(
-            f"[bold]{answer.title} on {answer.plant}: {answer.verdict}[/bold]", soft_wrap=True, highlight=False
-        )
+        title = f"{answer.title} on {answer.plant}, {answer.division}"
+        console.print(f"[bold]{title}: {answer.verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
     console.print(f"answers in {out / ANSWERS}, figures in {out / FIGURES}", soft_wrap=True)
     if wanted is not None:

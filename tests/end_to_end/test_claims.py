@@ -136,12 +136,27 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
     wanted = read_answers(tmp_path / "answers.csv")
     assert differences(answers, wanted) == []
     (line,) = differences([replace(answers[0], verdict=REPRODUCED), *answers[1:]], wanted)
-    assert line.startswith("claim 1 on kinematic: now reproduced: faster in")
+    assert line.startswith("claim 1 on kinematic, best equipped: now reproduced: faster in")
     (line,) = differences([replace(answers[0], evidence=answers[0].evidence.replace("faster", "slower"))], wanted)
     assert "slower" in line
-    assert differences([replace(answers[0], plant="bullet")], wanted) == ["claim 1 on bullet: not in the table"]
+    assert differences([replace(answers[0], plant="bullet")], wanted) == [
+        "claim 1 on bullet, best equipped: not in the table"
+    ]
     with pytest.raises(ConfigurationError, match="is not a table of answers"):
         read_answers(tmp_path / "nothing.csv")
+
+
+def test_the_methods_as_published_are_answered_for_under_their_plain_names():
+    made = {
+        name: runs.assign(controller=runs["controller"] + ":published")
+        for name, runs in tables(settling_time_s=proposed(-0.5)).items()
+    }
+    answers = answer_all(made, "kinematic", "as published")
+    assert {answer.division for answer in answers} == {"as published"}
+    usual = answer_all(tables(settling_time_s=proposed(-0.5)), "kinematic")
+    assert [(a.verdict, a.evidence) for a in answers] == [(a.verdict, a.evidence) for a in usual]
+    names = {cell.request.controller for study in studies(["kinematic"], 6, "as published") for cell in study.cells}
+    assert names == {f"{name}:published" for name in METHODS}
 
 
 def test_every_answer_is_in_the_tables_and_has_a_figure(tmp_path):
@@ -166,7 +181,7 @@ def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch,
     short = ("claims", "--plants", "kinematic", "--seeds", "6", "--workers", "1")
     assert servobench(monkeypatch, *short, "--out", str(tmp_path / "first")) == 0
     shown = capsys.readouterr().out
-    assert "1: converges faster than the other three on kinematic" in shown
+    assert "1: converges faster than the other three on kinematic, best equipped" in shown
     wanted = tmp_path / "wanted.csv"
     wanted.write_text((tmp_path / "first" / "answers.csv").read_text())
     again = (*short, "--out", str(tmp_path / "first"), "--resume", "--check", str(wanted))
@@ -174,7 +189,7 @@ def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch,
     assert "the same answers as in" in capsys.readouterr().out
     wanted.write_text(wanted.read_text().replace("faster in", "faster by far in"))
     assert servobench(monkeypatch, *again) == 1
-    assert "claim 1 on kinematic: now" in capsys.readouterr().out
+    assert "claim 1 on kinematic, best equipped: now" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -182,6 +197,7 @@ def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch,
     [
         (("--seeds", "3"), "--seeds must be at least 6"),
         (("--check", "nowhere.csv"), "nowhere.csv is not a table of answers"),
+        (("--division", "none"), "--division must be one of both, equipped, published, got 'none'"),
         (("--plants", "moon"), "unknown plant 'moon'"),
         (("--resume", "--scheduler", "nowhere"), "--scheduler needs an address"),
     ],

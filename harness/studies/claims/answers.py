@@ -19,6 +19,7 @@ settles counts as its whole duration.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import pandas as pd
@@ -52,6 +53,7 @@ from servobench.harness.studies.claims.studies import (
     PROPOSED,
     STAYING,
     TIMED,
+    plain_names,
 )
 
 ALIKE_SHARE: Final = 0.10  # of the median settling time
@@ -62,20 +64,25 @@ MIN_CIRCLE_SHARE: Final = 0.8
 Tables = Mapping[str, pd.DataFrame]
 
 
-def answer_all(tables: Tables, plant: str) -> list[Answer]:
-    """Return the answers for one plant.
+def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> list[Answer]:
+    """Return the answers for one plant and division.
 
     Args:
         tables: tables of runs by name of the study.
         plant: name of the plant.
+        division: how the methods were equipped, a key of `DIVISIONS`.
     """
-    own = {name: table[table["plant"] == plant].reset_index(drop=True) for name, table in tables.items()}
+    own = {
+        name: table[table["plant"] == plant].reset_index(drop=True).replace({"controller": plain_names(division)})
+        for name, table in tables.items()
+    }
     rules = (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)
-    return [
+    answers = [
         *(rule(own, plant) for rule in rules),
         _reading(own, plant, NO_EPSILON, "ε = 0", "reading: both step sizes without ε, as printed"),
         _reading(own, plant, ENTRIES, "entries", "reading: controller network fitted entry by entry"),
     ]
+    return [replace(answer, division=division) for answer in answers]
 
 
 def _faster(tables: Tables, plant: str) -> Answer:

@@ -20,7 +20,7 @@ MAX_LABEL = 28  # characters of an ordinate's label on one line
 
 
 def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
-    """Draw a figure for each claim, a column a plant and a row a measurement; return the files, PNG and PDF."""
+    """Draw a figure for each claim, a column a plant and division, a row a measurement; return all files."""
     files = []
     for claim in dict.fromkeys(answer.claim for answer in answers):
         figure = _draw([answer for answer in answers if answer.claim == claim])
@@ -35,7 +35,7 @@ def _draw(answers: Sequence[Answer]) -> Figure:
     for column, answer in enumerate(answers):
         for row, panel in enumerate(panels):
             _draw_panel(grid[row, column], [m for m in answer.measurements if m.panel == panel])
-        grid[0, column].set_title(f"{answer.plant}: {answer.verdict}")
+        grid[0, column].set_title(f"{answer.plant}, {answer.division}:\n{answer.verdict}")
     for row, panel in enumerate(panels):
         grid[row, 0].set_ylabel(panel if len(panel) < MAX_LABEL else panel.replace(", ", ",\n", 1))
     figure.suptitle(answers[0].title)

@@ -55,6 +55,7 @@ class Answer:
         verdict: reproduced, not reproduced, or depends on what.
         evidence: one line.
         measurements: the numbers, for the table and the figure.
+        division: how the methods were equipped.
     """
 
     claim: str
@@ -63,6 +64,7 @@ class Answer:
     verdict: str
     evidence: str
     measurements: tuple[Measurement, ...]
+    division: str = "best equipped"
 
     @property
     def title(self) -> str:

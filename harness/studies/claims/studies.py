@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import ConfigurationError, Settings
 
 PROPOSED: Final = "rbfnn_mfac"
 MPC: Final = "ukf_mpc"
@@ -17,6 +17,10 @@ LEAVING: Final = ("exp1", "exp4")  # start or target lie outside the region in w
 STAYING: Final = ("exp2", "exp3")
 CIRCLE: Final = "circle"
 MISMATCH: Final = "moderate"
+DIVISIONS: Final[Mapping[str, str]] = {  # how the methods are equipped -> what follows their names
+    "best equipped": "",
+    "as published": ":published",
+}
 FIRST_SEED: Final = 30_000  # far from the seeds that methods are tuned on
 
 MAIN: Final = "main"
@@ -33,6 +37,23 @@ READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 
 
+def find_divisions(text: str) -> tuple[str, ...]:
+    """Return the divisions that a user named: `equipped`, `published` or `both`.
+
+    Raises:
+        ConfigurationError: none of these.
+    """
+    words = {"both": tuple(DIVISIONS)} | {name.split()[-1]: (name,) for name in DIVISIONS}
+    if text not in words:
+        raise ConfigurationError(f"--division must be one of {', '.join(sorted(words))}, got {text!r}")
+    return words[text]
+
+
+def plain_names(division: str) -> dict[str, str]:
+    """Return the four methods without their division, by the names that they have in it."""
+    return {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
+
+
 class Study(NamedTuple):
     """Runs with common settings."""
 
@@ -42,14 +63,22 @@ class Study(NamedTuple):
     timed: bool = False  # each run goes by itself, so that its steps have times
 
 
-def studies(plants: Sequence[str], seeds: int) -> list[Study]:
-    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle."""
+def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") -> list[Study]:
+    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle.
+
+    Args:
+        plants: names.
+        seeds: number of robots.
+        division: a key of `DIVISIONS`.
+    """
+    suffix = DIVISIONS[division]
     rendered = {"bullet": {"scenery": False}}  # the same observations, bit for bit, for a fifth of the time
     robots = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
     some = robots[: max(2, 2 * seeds // 5)]
 
     def cells(controllers: tuple[str, ...], tasks: tuple[str, ...], chosen: tuple[int, ...]) -> tuple[Cell, ...]:
-        batch = Batch(tuple(plants), controllers, tasks, (MISMATCH,), chosen)
+        names = tuple(name + suffix for name in controllers)
+        batch = Batch(tuple(plants), names, tasks, (MISMATCH,), chosen)
         return tuple(Cell(request) for request in batch.requests())
 
     four = (PROPOSED, *OTHERS)
@@ -59,5 +88,5 @@ def studies(plants: Sequence[str], seeds: int) -> list[Study]:
     return [
         main,
         Study(TIMED, Settings(rendered), both, timed=True),
-        *(Study(name, Settings({**rendered, PROPOSED: reading}), own) for name, reading in READINGS.items()),
+        *(Study(name, Settings({**rendered, PROPOSED + suffix: reading}), own) for name, reading in READINGS.items()),
     ]

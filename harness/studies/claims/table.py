@@ -19,14 +19,15 @@ MEASUREMENTS: Final = "measurements.csv"
 NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
 RELATIVE, ABSOLUTE = 0.1, 0.051  # tolerances of the numbers in the evidence: a tenth and a period
 
-Answers: TypeAlias = Mapping[tuple[str, str], tuple[str, str]]
+Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]  # claim, plant, division -> verdict, evidence
 
 
 def write_tables(answers: Sequence[Answer], folder: Path) -> None:
-    """Write a row for each claim and plant, and a row for each number behind the answers."""
+    """Write a row for each claim, plant and division, and a row for each number behind the answers."""
     pd.DataFrame(answers).drop(columns="measurements").to_csv(folder / ANSWERS, index=False)
     rows = [
-        {"claim": answer.claim, "plant": answer.plant, "measured": m.panel, "place": m.place, "label": m.label,
+        {"claim": answer.claim, "plant": answer.plant, "division": answer.division,
+         "measured": m.panel, "place": m.place, "label": m.label,
          **asdict(m.estimate), "holds": m.holds}
         for answer in answers
         for m in answer.measurements
@@ -35,15 +36,17 @@ def write_tables(answers: Sequence[Answer], folder: Path) -> None:
 
 
 def read_answers(path: Path) -> Answers:
-    """Return verdict and evidence by claim and plant from a table of answers.
+    """Return verdict and evidence by claim, plant and division from a table of answers.
+
+    Lines that begin with `#` are left out: the tables of docs/tables begin with how they were made.
 
     Raises:
         ConfigurationError: the file is not a table of answers.
     """
     try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
-        rows = table[["claim", "plant", "verdict", "evidence"]].itertuples(index=False)
-        return {(claim, plant): (verdict, evidence) for claim, plant, verdict, evidence in rows}
+        table = pd.read_csv(path, dtype=str, keep_default_na=False, comment="#")
+        rows = table[["claim", "plant", "division", "verdict", "evidence"]].itertuples(index=False)
+        return {tuple(key): (verdict, evidence) for *key, verdict, evidence in rows}
     except (OSError, ValueError, KeyError) as error:
         raise ConfigurationError(f"{path} is not a table of answers: {' '.join(str(error).split())}") from error
 
@@ -56,7 +59,8 @@ def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
     """
     lines = []
     for answer in answers:
-        name, key = f"claim {answer.claim} on {answer.plant}", (answer.claim, answer.plant)
+        name = f"claim {answer.claim} on {answer.plant}, {answer.division}"
+        key = answer.claim, answer.plant, answer.division
         if key not in wanted:
             lines.append(f"{name}: not in the table")
         elif wanted[key][0] != answer.verdict or not _agree(answer.evidence, wanted[key][1]):
@@ -72,6 +76,6 @@ def _agree(found: str, wanted: str) -> bool:
 
 def markdown_table(answers: Sequence[Answer]) -> str:
     """Return the answers as a table in Markdown."""
-    lines = ["| claim | plant | verdict | evidence |", "|---|---|---|---|"]
-    lines += [f"| {a.title} | {a.plant} | **{a.verdict}** | {a.evidence} |" for a in answers]
+    lines = ["| claim | plant | division | verdict | evidence |", "|---|---|---|---|---|"]
+    lines += [f"| {a.title} | {a.plant} | {a.division} | **{a.verdict}** | {a.evidence} |" for a in answers]
     return "\n".join(lines) + "\n"

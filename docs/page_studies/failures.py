@@ -1,19 +1,16 @@
 """How often methods fail in ten million control periods, and what their failures have in common.
 
-    servobench sweep --plants kinematic --controllers ... --seeds 100000:150000 --out results/rates
-    python docs/failure_rates.py results/rates docs/pictures    # prints the table, draws three pictures
-
 A run fails if it ends early or has not settled at its end. What it may depend on is compared between failed and other
 runs: the angle by which the camera was turned, the distance from start to target, the largest condition number of the
 true Jacobian on the way, and the error in the last second. The rank statistic is the chance that a failed run has the
-larger value, 0.5 if it says nothing.
+larger value, 0.5 if it says nothing. At last the failed runs are repeated, with one thing changed at a time.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +18,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
+from page_studies.methods import FIVE, by_method, quoted, settled
+from page_studies.study import Study, Words, sweep
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import success_rate
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.harness.run.episode import COMPLETED
 from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve_sections, select
@@ -39,17 +39,48 @@ CAUSES = {
 SHARES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # of runs, where bins of causes end
 
 
-def main(folder: Path, pictures: Path) -> None:
-    """Print the two tables of a sweep and draw its three pictures."""
-    runs = judged(load_runs(folder))
-    print("\n".join([*rate_table(runs), "", *cause_table(runs)]))  # noqa: T201 - the output of the command
-    pictures.mkdir(parents=True, exist_ok=True)
+FAILED = "of the failed runs settle"
+RUNS = "runs"  # the part of which failures are repeated
+CHANGES = {
+    "with 20 s": ("--set", "random.duration=20"),
+    "with 60 s": ("--set", "random.duration=60"),
+    "without noise": ("--noise", "0"),
+    "at 40 Hz": ("--set", "run.period=0.025"),
+}
+
+
+def tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the rates of failure, what failed runs have in common, and how many settle with one thing changed."""
+    runs = judged(load_runs(folder / RUNS))
+    return {
+        "failures": pd.DataFrame(rate_rows(runs)),
+        "failure_causes": pd.DataFrame(cause_rows(runs)),
+        "failures_changed": pd.DataFrame(changed_rows(runs, folder), columns=[FAILED, *CHANGES]),
+    }
+
+
+def pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Yield the three pictures."""
+    runs = judged(load_runs(folder / RUNS))
     for name, figure in (
         ("final_errors", exceedance(runs)),
         ("failures_by_condition", by_cause(runs, "jacobian_condition_max")),
         ("failures_by_target", by_target(runs)),
     ):
-        figure.savefig(pictures / f"{name}.png", dpi=110)
+        stream = io.BytesIO()
+        figure.savefig(stream, format="png", dpi=110)
+        yield f"pictures/{name}.png", stream.getvalue()
+
+
+def repeated(options: Words) -> Callable[[Path], Words]:
+    """Return what makes the command that repeats the robots on which any method failed, with `options`."""
+
+    def command(folder: Path) -> Words:
+        runs = load_runs(folder / RUNS)
+        seeds = sorted(set(runs.loc[settling_times(runs).isna(), "seed"]))
+        return sweep("kinematic", FIVE, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
+
+    return command
 
 
 def judged(runs: pd.DataFrame) -> pd.DataFrame:
@@ -75,39 +106,52 @@ def robots(runs: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance", "x", "y"])
 
 
-def rate_table(runs: pd.DataFrame) -> Iterator[str]:
+def rate_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield the rows of the table of failure rates with 95 % Wilson intervals."""
-    yield "| method | runs | periods | ended early | not settled | failure rate [95 % interval] |"
-    yield "|---|---|---|---|---|---|"
-    for method, own in runs.groupby("controller", sort=False):
-        early = own["status"] != "completed"
+    for method, own in by_method(runs):
+        early = own["status"] != COMPLETED
         kinds = ", ".join(f"{count} {kind}" for kind, count in own.loc[early, "status"].value_counts().items())
-        rate = success_rate(int(own["failed"].sum()), len(own))
-        cells = (
-            f"{len(own):,}",
-            f"{own['periods'].sum():,}",
-            kinds or "0",
-            f"{(own['failed'] & ~early).sum():,}",
-            f"{rate:.1e}",
-        )
-        yield f"| `{method}` | {' | '.join(cells)} |"
+        yield {
+            "method": quoted(method),
+            "runs": f"{len(own):,}",
+            "periods": f"{own['periods'].sum():,}",
+            "ended early": kinds or "0",
+            "not settled": f"{(own['failed'] & ~early).sum():,}",
+            "failure rate [95 % interval]": f"{success_rate(int(own['failed'].sum()), len(own)):.1e}",
+        }
 
 
-def cause_table(runs: pd.DataFrame) -> Iterator[str]:
+def cause_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield the rows of the table of causes: medians of failed and other runs, and the rank statistic."""
-    yield f"| method | {' | '.join(CAUSES.values())} |"
-    yield f"|---|{'---|' * len(CAUSES)}"
-    for method, own in runs.groupby("controller", sort=False):
+    for method, own in by_method(runs):
         failed = own["failed"].to_numpy()
-        if failed.all() or not failed.any():
-            continue
-        cells = []
-        for cause in CAUSES:
-            values = own[cause].to_numpy()
-            ranks, count = rankdata(values), failed.sum()
-            larger = (ranks[failed].sum() - count * (count + 1) / 2) / (count * (~failed).sum())
-            cells.append(f"{np.median(values[failed]):.3g} / {np.median(values[~failed]):.3g} ({larger:.2f})")
-        yield f"| `{method}` | {' | '.join(cells)} |"
+        row = {"method": quoted(method)}
+        for cause, title in CAUSES.items():
+            values, count = own[cause].to_numpy(), failed.sum()
+            if failed.all() or not failed.any():
+                row[title] = "none failed" if not count else "all failed"
+                continue
+            larger = (rankdata(values)[failed].sum() - count * (count + 1) / 2) / (count * (~failed).sum())
+            row[title] = f"{np.median(values[failed]):.3g} / {np.median(values[~failed]):.3g} ({larger:.2f})"
+        yield row
+
+
+def changed_rows(runs: pd.DataFrame, folder: Path) -> Iterator[dict[str, str]]:
+    """Yield for each method how many of its failed runs settle with one thing changed."""
+    for method, own in by_method(runs):
+        seeds = set(own.loc[own["failed"], "seed"])
+        if seeds:
+            row = {FAILED: f"{quoted(method)}, of {len(seeds)}"}
+            for title in CHANGES:
+                again = load_runs(folder / part_of(title))
+                chosen = (again["controller"] == method) & again["seed"].isin(seeds)
+                row[title] = str(settled(again[chosen]))
+            yield row
+
+
+def part_of(title: str) -> str:
+    """Return the part in which one thing is changed."""
+    return title.replace(" ", "_")
 
 
 def exceedance(runs: pd.DataFrame) -> Figure:
@@ -140,7 +184,12 @@ def by_cause(runs: pd.DataFrame, cause: str) -> Figure:
             look = {"color": style.colour, "linestyle": style.line, "marker": style.marker, "markersize": 4.5}
             label = method if seen else f"{method}: none"
             axes.errorbar(x, y, yerr=reach, label=label, linewidth=1.4, capsize=2.0, **look)
-        axes.set(xlabel=CAUSES[cause], ylabel="failure rate", xscale="log", yscale="log")
+        axes.set(
+            xlabel=CAUSES[cause],
+            ylabel="failure rate",
+            xscale="log",
+            yscale="log" if runs["failed"].any() else "linear",
+        )
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return figure
 
@@ -161,5 +210,12 @@ def by_target(runs: pd.DataFrame) -> Figure:
         return figure
 
 
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+FAILURES = Study(
+    "failures",
+    "how often methods fail in ten million periods, and why",
+    25,
+    {RUNS: sweep("kinematic", FIVE, "random", "100000:150000")}
+    | {part_of(title): repeated(options) for title, options in CHANGES.items()},
+    tables,
+    pictures,
+)

@@ -1,0 +1,11 @@
+"""The studies behind the measured tables and pictures of the pages, by name."""
+
+from __future__ import annotations
+
+from page_studies.claims import CLAIMS
+from page_studies.failures import FAILURES
+from page_studies.performance import PERFORMANCE
+from page_studies.readme import README
+from page_studies.worlds import MAP, PAIRS_STUDY, WORLDS
+
+STUDIES = {study.name: study for study in (CLAIMS, WORLDS, PAIRS_STUDY, MAP, README, FAILURES, PERFORMANCE)}

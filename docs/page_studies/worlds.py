@@ -1,0 +1,96 @@
+"""Where methods break: worse worlds one by one, every pair of law and estimator, and the robustness map."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import pandas as pd
+from PIL import Image
+
+from page_studies.methods import BOTH, FIVE, by_method, quoted, settled
+from page_studies.study import Study, sweep
+from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.harness.batch.results import load_runs
+from servobench.harness.run.episode import COMPLETED
+
+SEEDS = "500:600"
+MISMATCHES = (
+    "severe",
+    "moderate+camera_rotation=60deg",
+    "moderate+camera_rotation=120deg",
+    "moderate+links=20%+tool=60mm",
+)
+MOVED = "moderate+camera_move=45deg"
+PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
+COLOURS = 128  # of a picture's palette
+
+
+def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return how many of 100 robots settle in each world, a row a method."""
+    parts = [load_runs(folder / part) for part in WORLDS.commands]
+    worlds = {
+        title: own
+        for part in parts
+        for (mismatch, latency), own in part.groupby(["mismatch", "latency_periods"], sort=False, dropna=False)
+        for title in [f"`{mismatch}`" + ("" if pd.isna(latency) else f", latency of {latency:g}")]
+    }
+    methods = dict.fromkeys(name for part in parts for name in part["controller"])
+    rows = [
+        {"method": quoted(name)}
+        | {title: str(settled(own[own["controller"] == name])) for title, own in worlds.items()}
+        for name in methods
+    ]
+    return {"worlds": pd.DataFrame(rows)}
+
+
+def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return how the runs of every pair of law and estimator ended."""
+    rows = []
+    for name, own in by_method(load_runs(folder / "pairs")):
+        early = own.loc[own["status"] != COMPLETED, "status"].value_counts()
+        ends = ", ".join(f"{count} {kind}" for kind, count in early.items())
+        rows.append({"pair": quoted(name), "runs": str(len(own)), "settled": str(settled(own)), "ended early": ends})
+    return {"pairs": pd.DataFrame(rows)}
+
+
+def map_pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
+    """Yield the two pictures of the robustness map."""
+    for path in sorted((folder / "map" / "figures").glob("*.png")):
+        with Image.open(path) as picture:
+            yield f"pictures/{path.name}", small(picture)
+
+
+def small(picture: Image.Image) -> bytes:
+    """Return a picture as PNG with a palette."""
+    stream = io.BytesIO()
+    picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+    return stream.getvalue()
+
+
+WORLDS = Study(
+    "worlds",
+    "how many of 100 robots settle in worse worlds",
+    4,
+    {
+        "worse": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", ",".join(MISMATCHES)),
+        "late": sweep("fmu", BOTH, "random", SEEDS, "--latency", "1,2"),
+        "moved": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", MOVED, "--set", "random.duration=16"),
+    },
+    worlds_table,
+)
+PAIRS_STUDY = Study(
+    "pairs",
+    "how the runs of every pair of law and estimator end",
+    1,
+    {"pairs": sweep("kinematic", PAIRS, "random", "500:504")},
+    pairs_table,
+)
+MAP = Study(
+    "robustness",
+    "the robustness map: its two pictures",
+    2,
+    {"map": ("robustness", "--plant", "fmu", "--controllers", ",".join(FIVE), "--seeds", "50000:50030")},
+    files=map_pictures,
+)

@@ -1,0 +1,178 @@
+"""`make results`: studies carried out, gone on with, tried with few robots, stored and compared with what is stored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from PIL import Image
+
+import generated_tables
+import renewal
+import stored_tables
+from kit.command import servobench
+from kit.documents import ROOT
+from page_studies import STUDIES, readme
+from page_studies.study import Study, sweep
+from servobench.harness.batch import results
+from servobench.harness.batch.compare import TUNING, parse_seeds
+from servobench.harness.studies import robustness
+
+TRIED = ("--set", "random.duration=0.5")
+
+
+def settled_counts(folder: Path) -> dict[str, pd.DataFrame]:
+    runs = results.load_runs(folder / "moves")
+    counts = runs.groupby("controller").size()
+    return {"counts": pd.DataFrame({"method": counts.index, "runs": counts.astype(str).to_numpy()})}
+
+
+MOVES = Study(
+    "toy",
+    "how many runs there are",
+    1,
+    {"moves": sweep("kinematic", ["constant"], "random", "500:503")},
+    settled_counts,
+)
+
+
+@pytest.fixture
+def toy(monkeypatch, tmp_path):
+    """A study of few runs, and a folder that stands for docs."""
+    monkeypatch.setattr(renewal, "STUDIES", {"toy": MOVES})
+    monkeypatch.setattr(stored_tables, "FOLDER", tmp_path / "docs" / "tables")
+    return tmp_path
+
+
+def call(folder: Path, *options: str) -> int:
+    return renewal.main(["toy", "--runs", str(folder / "runs"), "--into", str(folder / "docs"), *TRIED, *options])
+
+
+def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
+    assert call(toy) == 0
+    stored = stored_tables.read(toy / "docs" / "tables" / "counts.csv")
+    assert stored.table.to_dict("records") == [{"method": "constant", "runs": "3"}]
+    assert stored.stamp["study"] == "toy"
+    assert stored.stamp["command"].startswith("servobench sweep --plants kinematic --controllers constant")
+    assert len(stored.stamp["commit"]) >= 40
+    page = toy / "docs" / "page.md"
+    page.write_text("<!-- table: counts -->\nold\n<!-- end -->\n")
+    shown = generated_tables.renewed(page)
+    assert "| method | runs |\n| --- | --- |\n| constant | 3 |" in shown
+    assert f"commit {stored.stamp['commit'][:12]}, {stored.stamp['date']}" in shown
+    assert "(tables/counts.csv)" in shown
+    page.write_text(shown)
+    assert generated_tables.renewed(page) == shown
+
+
+def test_a_study_that_was_interrupted_goes_on_and_one_of_other_code_begins_anew(toy, monkeypatch):
+    carried_out = []
+    monkeypatch.setattr(renewal, "run", lambda words, out: carried_out.append((out.name, list(words))) or "line")
+    study = replace(MOVES, commands={"first": ("sweep", "--seeds", "0:9"), "second": lambda _: ("sweep",), "none": ()})
+    folder = renewal.carry_out(study, toy, 2, ["--x"], keep=False)
+    assert carried_out == [("first", ["sweep", "--seeds", "0:2", "--x"]), ("second", ["sweep", "--x"])]
+    (folder / "second.done").unlink()
+    renewal.carry_out(study, toy, None, [], keep=False)
+    assert carried_out[2:] == [("second", ["sweep"])]
+    (folder / renewal.DIGEST).write_text("other code")
+    renewal.carry_out(study, toy, None, [], keep=True)
+    assert len(carried_out) == 3
+    (folder / renewal.DIGEST).write_text("other code")
+    renewal.carry_out(study, toy, None, [], keep=False)
+    assert [name for name, _ in carried_out[3:]] == ["first", "second"]
+
+
+def test_a_command_that_fails_ends_the_call_with_one_line(toy):
+    with pytest.raises(SystemExit, match="ended with exit code 2; the same call goes on"):
+        call(toy, "--set", "nonsense=1")
+
+
+def test_a_check_names_each_figure_that_does_not_come_out_again(toy, capfd):
+    assert call(toy, "--check") == 1
+    assert "counts: not stored; call make results ONLY=toy" in capfd.readouterr().out
+    assert call(toy) == 0
+    assert call(toy, "--check") == 0
+    assert "every stored figure comes out again" in capfd.readouterr().out
+    path = toy / "docs" / "tables" / "counts.csv"
+    path.write_text(path.read_text().replace("constant,3", "constant,9"))
+    assert call(toy, "--check") == 1
+    assert "counts: constant, runs: 3, stored is 9" in capfd.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("found", "wanted", "same"),
+    [
+        ("0.75 [0.70, 0.80]", "0.80 [0.75, 0.80]", True),
+        ("0.75", "0.86", False),
+        ("38 of 40", "36 of 40", True),
+        ("38 of 40", "30 of 40", False),
+        ("1.2e-04", "1.5e-04", True),
+        ("1.2e-04", "2.2e-04", False),
+        ("−0.45", "−0.50", True),
+        ("-0.45", "+0.45", False),
+        ("faster", "slower", False),
+    ],
+)
+def test_cells_may_differ_as_rounding_makes_them(found, wanted, same):
+    assert stored_tables.alike(found, wanted) == same
+
+
+def test_an_unknown_study_is_one_line_that_names_them_all():
+    with pytest.raises(SystemExit, match="no study is called nonsense; there are claims, "):
+        renewal.main(["nonsense"])
+
+
+def test_all_tables_of_pages_belong_to_a_study_and_all_stored_ones_are_on_a_page():
+    parts = [part for page in generated_tables.PAGES for part in generated_tables.PART.findall(page.read_text())]
+    shown = {place for _, kind, place, *_ in parts if kind == "table"}
+    stored = {path.stem: stored_tables.read(path).stamp["study"] for path in stored_tables.FOLDER.glob("*.csv")}
+    assert set(stored) <= shown
+    assert set(stored.values()) <= set(STUDIES)
+    source = "".join(path.read_text() for path in (ROOT / "docs" / "page_studies").glob("*.py"))
+    assert [name for name in shown if f'"{name}"' not in source] == []
+
+
+def test_no_study_judges_on_seeds_that_methods_were_tuned_on_and_names_are_those_of_the_folders():
+    for name, study in STUDIES.items():
+        assert study.name == name
+        for command in study.commands.values():
+            words = () if callable(command) else command
+            if "--seeds" in words:
+                assert not set(parse_seeds(words[words.index("--seeds") + 1])) & set(TUNING)
+
+
+def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
+    short = (
+        "compare", "--plants", "kinematic", "--controllers", "calibrated", "--tasks", "exp2,circle", "--mismatch",
+        "none", "--seeds", "0:1", "--no-report", "--workers", "1",
+    )  # fmt: skip
+    folder = renewal.carry_out(replace(readme.README, commands={"batch": short}), tmp_path, None, [], keep=False)
+    for name, content in readme.pictures(folder):
+        path = tmp_path / Path(name).name
+        path.write_bytes(content)
+        assert path.stat().st_size < 300e3
+        with Image.open(path) as picture:
+            assert picture.size[0] >= 450
+    assert {path.name for path in tmp_path.glob("*.png")} == {"bench.png", "errors.png", "paths.png", "circle.png"}
+
+
+def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(
+        robustness, "LINES", [replace(robustness.LINES[4], places=robustness.LINES[4].places[:2]), robustness.LINES[-1]]
+    )
+    out = tmp_path / "robustness" / "map"
+    arguments = (
+        "robustness", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1",
+        "--set", "random.duration=1", "--out", str(out),
+    )  # fmt: skip
+    assert servobench(monkeypatch, *arguments) == 0
+    assert "the map is in" in capsys.readouterr().out
+    assert len(results.load_runs(out / "moved")) == 5
+    assert {path.name for path in (out / "figures").iterdir()} == {
+        "robustness.png", "robustness.pdf", "robustness_settling.png", "robustness_settling.pdf",
+    }  # fmt: skip
+    shown = dict(STUDIES["robustness"].files(out.parent))
+    assert set(shown) == {"pictures/robustness.png", "pictures/robustness_settling.png"}
+    assert all(len(content) < 300e3 for content in shown.values())
