@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
 
 import pandas as pd
 
-from page_studies.methods import PUBLISHED
 from page_studies.study import Study
 from servobench.harness.studies.claims.table import ANSWERS
-
-DIVISION: Final = ("--division", "both" if PUBLISHED else "equipped")
 
 
 def claims_tables(folder: Path) -> dict[str, pd.DataFrame]:
@@ -32,8 +28,8 @@ CLAIMS = Study(
     "the paper's seven claims, for the methods best equipped and as published",
     40,
     {
-        "exact": ("claims", "--plants", "kinematic,fmu", "--seeds", "500", *DIVISION),
-        "rendered": ("claims", "--plants", "bullet", "--seeds", "10", *DIVISION),
+        "exact": ("claims", "--plants", "kinematic,fmu", "--seeds", "500"),
+        "rendered": ("claims", "--plants", "bullet", "--seeds", "10"),
     },
     claims_tables,
 )

@@ -8,31 +8,20 @@ from typing import Final
 import pandas as pd
 
 from servobench.controllers.methods import METHODS
+from servobench.controllers.methods import PUBLISHED as SUFFIX
 from servobench.harness.analysis.comparison import Comparison, column_of, compare_pairs, settled_share, settling_times
 from servobench.harness.analysis.statistics import MISSING, Estimate, median_with_interval, tail_mean
-from servobench.harness.config.registry import find_controller
-from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import COMPLETED
 
-SUFFIX: Final = ":published"  # of the name of a method without any aid
-BETTER: Final = "rbfnn_mfac_plus"
+BETTER: Final = "map_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper
 FIVE: Final = (BETTER, *FOUR)
 TAIL: Final = 0.95
 MOVE: Final = 10.0  # [s] duration of a move, which a run that never settles counts as
 
 
-def _divided() -> Iterator[str]:
-    for name in METHODS:
-        try:
-            find_controller(name + SUFFIX)
-        except ConfigurationError:
-            continue
-        yield name + SUFFIX
-
-
-EQUIPPED: Final = tuple(METHODS)  # every composed method with the aids that help it
-PUBLISHED: Final = tuple(_divided())  # the same without any aid
+PUBLISHED: Final = tuple(name for name in METHODS if name.endswith(SUFFIX))  # without any aid, the law as printed
+EQUIPPED: Final = tuple(name for name in METHODS if name not in PUBLISHED)  # with all aids that help it
 BOTH: Final = EQUIPPED + PUBLISHED
 
 

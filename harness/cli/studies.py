@@ -50,7 +50,7 @@ def claims(
     out: options.FolderOption,
     plants: options.NamesOption = "kinematic,fmu",
     seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 500,
-    division: Annotated[str, typer.Option(help="How methods are equipped: equipped, published or both.")] = "equipped",
+    division: Annotated[str, typer.Option(help="How methods are equipped: equipped, published or both.")] = "both",
     running: options.Running = options.RUNNING,
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
+from servobench.controllers.methods import PUBLISHED
 from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -19,7 +20,7 @@ CIRCLE: Final = "circle"
 MISMATCH: Final = "moderate"
 DIVISIONS: Final[Mapping[str, str]] = {  # how the methods are equipped -> what follows their names
     "best equipped": "",
-    "as published": ":published",
+    "as published": PUBLISHED,
 }
 FIRST_SEED: Final = 30_000  # far from the seeds that methods are tuned on
 
