@@ -45,7 +45,7 @@ CHANGES = {
     "with 20 s": ("--set", "random.duration=20"),
     "with 60 s": ("--set", "random.duration=60"),
     "without noise": ("--noise", "0"),
-    "at 40 Hz": ("--set", "run.period=0.025"),
+    "at 40 Hz": ("--period", "0.025"),
 }
 
 

@@ -33,8 +33,8 @@ def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
     worlds = {
         title: own
         for part in parts
-        for (mismatch, latency), own in part.groupby(["mismatch", "latency_periods"], sort=False, dropna=False)
-        for title in [f"`{mismatch}`" + ("" if pd.isna(latency) else f", latency of {latency:g}")]
+        for (mismatch, latency), own in part.groupby(["mismatch", "latency_s"], sort=False, dropna=False)
+        for title in [f"`{mismatch}`" + ("" if pd.isna(latency) else f", latency of {1e3 * latency:g} ms")]
     }
     methods = dict.fromkeys(name for part in parts for name in part["controller"])
     rows = [
@@ -75,7 +75,7 @@ WORLDS = Study(
     4,
     {
         "worse": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", ",".join(MISMATCHES)),
-        "late": sweep("fmu", BOTH, "random", SEEDS, "--latency", "1,2"),
+        "late": sweep("fmu", BOTH, "random", SEEDS, "--latency", "0.05,0.1"),
         "moved": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", MOVED, "--set", "random.duration=16"),
     },
     worlds_table,
