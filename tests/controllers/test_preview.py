@@ -10,12 +10,12 @@ from servobench.controllers.laws.preview import check_preview, in_periods, sampl
 
 @given(
     st.integers(1, 8),
-    st.lists(st.floats(0.0, 1.0), min_size=1, max_size=6),
+    st.lists(st.integers(0, 1000), min_size=1, max_size=6),
     st.lists(st.integers(1, 3), max_size=2),
     st.integers(0, 99),
 )
 def test_samples_are_those_of_linear_interpolation(count, shares, lead, seed):
-    rows, places = np.random.default_rng(seed).normal(size=(*lead, count, 2)), np.array(shares) * (count - 1)
+    rows, places = np.random.default_rng(seed).normal(size=(*lead, count, 2)), np.array(shares) * (count - 1) / 1000
     wanted = np.apply_along_axis(lambda line: np.interp(places, np.arange(count), line), -2, rows)
     np.testing.assert_allclose(sampled(rows, places), wanted, atol=1e-12)
 
