@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kit.plants import configure, setup
 from servobench.controllers.laws.mfac import mfac_step
 from servobench.controllers.servo import ServoController
 from servobench.controllers.stages.inverses import damped_inverse
 from servobench.harness.analysis.loops.arm import ArmModel
-from servobench.harness.analysis.loops.equilibrium import at_rest, linear_controller, warm_up
+from servobench.harness.analysis.loops.equilibrium import arm_model, at_rest, linear_controller, warm_up
 from servobench.harness.analysis.loops.identification import SmallMotions, controller_response, excite
 from servobench.harness.analysis.loops.loop_analysis import analyse_loop, delay_margin, linear_response
 from servobench.harness.analysis.loops.margins import LoopResponse, frequencies, gain_crossings, phase_crossings
@@ -18,6 +19,8 @@ from servobench.harness.analysis.loops.matrices import StateSpace, closed_loop, 
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
+from servobench.plant.kinematic import KinematicConfig, build_kinematic
+from servobench.plant.signals import Command
 
 PERIOD = 0.05
 JACOBIAN = np.random.default_rng(0).normal(size=(3, 6))
@@ -45,6 +48,21 @@ def test_the_arm_is_the_same_at_a_finer_period(delay, latency):
         for _ in range(5):
             x_fine = fine.A @ x_fine + fine.B @ u
         np.testing.assert_allclose(whole.C @ x, fine.C @ x_fine, atol=1e-13)
+
+
+@pytest.mark.parametrize(("delay", "latency"), [(0.05, 0.0), (0.02, 0.03), (0.07, 0.12)])
+def test_the_arm_is_the_kinematic_plant_in_small_motions(delay, latency):
+    config = configure(KinematicConfig, command_delay=delay, latency=latency, feature_noise=0.0)
+    plant, small = build_kinematic(config, setup()), 1e-5
+    first = plant.reset(0)
+    arm = arm_model(config, plant.truth().jacobian, PERIOD).matrices()
+    x, random = np.zeros(len(arm.A)), np.random.default_rng(1)
+    for _ in range(20):
+        u = random.normal(size=6)
+        seen = plant.step(Command(small * u))
+        x = arm.A @ x + arm.B @ u
+        moved = np.concatenate([seen.feature - first.feature, seen.joint_position - first.joint_position]) / small
+        np.testing.assert_allclose(arm.C @ x, moved, atol=1e-4)
 
 
 @pytest.mark.parametrize("latency", [0.0, 0.02, 0.1])

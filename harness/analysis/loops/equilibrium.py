@@ -61,23 +61,21 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
     if truth.jacobian is None or model is None:
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
-    rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview)
+    rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)
     return Warm(controller, model, rest, arm)
 
 
 def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> ArmModel:
-    """Return the linear model of the kinematic plant with these settings and a Jacobian (m, n)."""
-    return ArmModel(
-        jacobian,
-        period,
-        config.lag,
-        config.command_delay_periods * period,
-        config.sensing.latency_periods * period,
-    )
+    """Return the linear model of the kinematic plant with these settings and a Jacobian (m, n).
+
+    Frames that come less often than commands count as later by their mean additional age.
+    """
+    age = max(config.sensing.frame_period - period, 0.0) / 2.0
+    return ArmModel(jacobian, period, config.lag, config.command_delay, config.sensing.latency + age)
 
 
 def _run(experiment: Experiment, periods: int, seed: int) -> Observation:
-    plant, controller, preview = experiment.plant, experiment.controller, experiment.run.preview
+    plant, controller, preview = experiment.plant, experiment.controller, experiment.run.preview_rows
     desired = experiment.scenario.reference.sampled(plant.spec.period, periods + preview + 1)
     observation = plant.reset(seed)
     controller.reset(observation, seed)

@@ -12,7 +12,6 @@ import numpy as np
 
 from servobench.harness.analysis.loops.equilibrium import Warm, at_rest
 from servobench.harness.analysis.loops.linearise import frozen
-from servobench.plant.bench import SensingConfig
 from servobench.plant.checks import FloatArray
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import Plant, PlantSetup
@@ -24,6 +23,7 @@ WINDOWS = 4  # of the run; a stable one has a smaller error in the last than in 
 DURATION = 20.0  # [s]
 MOST_LATE = 3.0  # [s] largest latency that is tried
 MOST_GAIN = 32.0  # largest factor that is tried
+TIME_DIGITS = 3  # of a latency [s], as worlds advance in whole milliseconds
 PRECISION = 0.02  # [1] of the limit of the gain
 
 
@@ -75,7 +75,9 @@ class SmallLoop:
 
     def _plant(self, latency: float | None) -> Plant:
         late = self.latency if latency is None else latency
-        sensing = SensingConfig(feature_noise=0.0, latency_periods=round(late / self._period))
+        sensing = replace(
+            self._config.sensing, feature_noise=0.0, drop_probability=0.0, latency=round(late, TIME_DIGITS)
+        )
         setup = PlantSetup(self._model, self._rest.joint_position, self._period)
         return build_kinematic(replace(self._config, sensing=sensing), setup)
 
