@@ -41,7 +41,7 @@ class SmallLoop:
         servo, state, self._rest = at_rest(warm, "true")
         self._servo, self._state = frozen(servo, state, model.jacobian)
         self._model, self._config, self._period = model, config, warm.arm.period
-        self.latency = warm.arm.latency
+        self.latency = config.sensing.latency
 
     def is_stable(self, factor: float = 1.0, latency: float | None = None) -> bool:
         """Return whether small motions die out.
