@@ -11,6 +11,7 @@ that belongs to the feature's motion Δy, its prediction x by the model, the map
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -88,8 +89,9 @@ class Estimation:
         self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
         self._nominal = None if estimator.brings_model else knowledge.nominal_jacobian
         self._adds = aids.model != "own" and not estimator.brings_model
-        self._shortest = max(1, periods_in(MOTION_TIME, knowledge.spec.period)) - 0.5
+        self._shortest = (max(1, periods_in(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
         self.pairing = Pairing(aids, knowledge.spec, delays.latency) if aids.looks_back else None
+        self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * knowledge.spec.period
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:
         """Return the state of one that has seen nothing and starts from Ĵ₀, (..., m, n), at rest."""
@@ -116,9 +118,10 @@ class Estimation:
         learned, seen, q = state.learned, state.seen, observation.joint_position
         if self.pairing is not None:
             learned = learned._replace(pair=self.pairing.advance(learned.pair, q))
-        early = observation.time - seen.time < self._shortest * self._spec.period
-        due = observation.feature_valid & ~early
-        learned = branch(due & (seen.time < observation.time), self._learn, learned, seen, observation, desired)
+        duration = observation.time - seen.time
+        due = observation.feature_valid & ~(duration < self._shortest)  # also the first one, of unknown duration
+        known = due & (duration > 0.0) & (duration < self._longest)
+        learned = branch(known, self._learn, learned, seen, observation, desired)
         pair, own = learned.pair, self.estimator.jacobian(learned.estimator, q)
         jacobian = own
         if pair is not None:
@@ -138,7 +141,7 @@ class Estimation:
         return np.asarray(self._nominal(joint_position), dtype=np.float64)
 
     def _learn(self, learned: Learned, seen: Seen, observation: Observation, desired: FloatArray) -> Learned:
-        dy, error, duration = observation.feature - seen.feature, desired - observation.feature, None
+        dy, error = observation.feature - seen.feature, desired - observation.feature
         duration = observation.time - seen.time
         if self.pairing is None:
             q = seen.joint_position

@@ -95,6 +95,7 @@ class Pairing:
 
     Attributes:
         delays: the candidates, (D,), periods.
+        gap: the longest motion, from one valid feature to the next, of which the past is remembered, periods.
     """
 
     def __init__(self, aids: AidsConfig, spec: PlantSpec, latency: float) -> None:
@@ -112,8 +113,8 @@ class Pairing:
         given = periods_in(latency, spec.period) if aids.delay == "given" else 0
         candidates = np.arange(0, longest + 1, spacing) if aids.delay == "identified" else np.array([given])
         self.delays: npt.NDArray[np.int_] = candidates
-        self._gap = MAX_GAP * motion
-        self._rows = int(candidates[-1]) + self._gap + 2
+        self.gap = MAX_GAP * motion
+        self._rows = int(candidates[-1]) + self.gap + 2
         self._aligns = aids.model == "map"
         self._learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
         self._eye = np.eye(spec.m)
@@ -169,9 +170,9 @@ class Pairing:
         Args:
             state: with the arm's present position.
             feature_step: Δy, (..., m).
-            duration: that it took, (...), s.
+            duration: that it took, (...), s, at most `gap` periods.
         """
-        n, periods = self._n, np.minimum(np.rint(duration / self._period).astype(np.int_), self._gap)
+        n, periods = self._n, np.rint(duration / self._period).astype(np.int_)
         end = self.delays
         begin = pick(state.past, end + periods[..., None], axes=1)
         passed = state.past[..., end, :] - begin
