@@ -1,8 +1,9 @@
 """What a period of the `bullet` plant costs over the render and physics calls it needs, and over a plain loop.
 
-All are measured in the same run, in turns: a whole `Bench.step`; the same number of motor and physics steps plus one
-`getCameraImage` of the same camera in a world like it; and a loop as environments of Gymnasium are often written, with
-a call for each motor, all outputs of the renderer and the mean of the red points as the feature.
+All are measured in the same run, in turns: a whole `Bench.step`; the calls of PyBullet in it, which are inertia and
+torques of the arm in every physics step, contact, and one `getCameraImage` of the same camera; and a loop as
+environments of Gymnasium are often written, with a call for each motor, all outputs of the renderer and the mean of the
+red points as the feature.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import numpy as np
 import pybullet
 
 from measuring import asked_to_be_quick, table
-from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig, build_bullet
+from servobench.plant.bullet.bullet_plant import CONTACT_STEPS, BulletConfig, build_bullet
+from servobench.plant.bullet.drives import PHYSICS_STEP
+from servobench.plant.bullet.mechanics import Mechanics
 from servobench.plant.bullet.scene import Scene
 from servobench.plant.checks import FloatArray, whole_steps
 from servobench.plant.plant import PlantSetup
@@ -34,6 +37,7 @@ class PlainEnvironment:
     def __init__(self, scene: Scene, config: BulletConfig, X_BC: FloatArray) -> None:
         """Take the scene and the camera's pose."""
         self._arm, self._client, camera = scene._arm, scene._client, config.camera()
+        pybullet.setPhysicsEngineParameter(fixedTimeStep=PHYSICS_STEP, physicsClientId=self._client)
         self._size = camera.width, camera.height
         self._matrices = [matrix.T.ravel().tolist() for matrix in (view_matrix(X_BC), camera.projection_matrix())]
 
@@ -72,24 +76,32 @@ def measure(config: BulletConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
     model = nominal_ur5()
     plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
-    scenes = [Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=False) for _ in range(2)]
+    scenes = [Scene(model.arm, scenery=config.scenery, window=False) for _ in range(2)]
+    mechanics = Mechanics(model.arm, payload=config.drives.payload, assumed_payload=config.drives.assumed_payload)
     camera, environment = config.camera(), PlainEnvironment(scenes[1], config, model.X_BC)
     plant.reset(0)
     for scene in scenes:
         scene.place(HOME)
     steps, times = whole_steps(PERIOD, PHYSICS_STEP), np.empty((3, repeats))
 
-    def bare(targets: list[list[float]]) -> None:
-        scenes[0].advance(targets)
+    def bare() -> None:
+        client, arm, theta, rest = mechanics._client, mechanics._arm, list(ur5.HOME), [0.0] * 6
+        for step in range(steps):
+            pybullet.calculateMassMatrix(arm, theta, physicsClientId=client)
+            for _ in range(2):
+                pybullet.calculateInverseDynamics(arm, theta, rest, rest, physicsClientId=client)
+            if step % CONTACT_STEPS == 0:
+                mechanics.contact(HOME)
         scenes[0].render(camera, model.X_BC)
 
     for k in range(repeats):
         speed = 0.2 * np.sin(0.3 * k) * np.ones(6)
-        targets, command = [speed.tolist()] * steps, Command(speed)
-        times[0, k] = milliseconds(partial(bare, targets))
+        command = Command(speed)
+        times[0, k] = milliseconds(bare)
         times[1, k] = milliseconds(partial(plant.step, command))
         times[2, k] = milliseconds(partial(environment.step, speed))
     plant.close()
+    mechanics.close()
     for scene in scenes:
         scene.close()
     return times

@@ -2,6 +2,7 @@
 
     RunFault                    fault
     ├── PlantDiverged           plant_diverged
+    ├── Collision               collision
     ├── FeatureLost             feature_lost
     ├── FmuError                fmu_error
     ├── ControllerDiverged      controller_diverged
@@ -26,6 +27,12 @@ class PlantDiverged(RunFault):
     """The plant's state left the finite numbers."""
 
     status: ClassVar[str] = "plant_diverged"
+
+
+class Collision(RunFault):
+    """The arm met itself or something in the room."""
+
+    status: ClassVar[str] = "collision"
 
 
 class FeatureLost(RunFault):

@@ -18,7 +18,7 @@ import pandas as pd
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
-from servobench.plant.bullet.bullet_plant import PHYSICS_STEP, BulletConfig
+from servobench.plant.bullet.bullet_plant import BulletConfig
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
@@ -121,7 +121,7 @@ class Replay:
         from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet prints a banner when it is imported
 
         self._run, self._fineness = run, fineness
-        self._scene: Scene = Scene(run.model.arm, physics_step=PHYSICS_STEP, scenery=True, window=False)
+        self._scene: Scene = Scene(run.model.arm, scenery=True, window=False)
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]

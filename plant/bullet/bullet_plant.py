@@ -1,13 +1,10 @@
 """The rendered plant: a UR5 with dynamics in PyBullet, seen by an RGB-D camera in whose image the ball is found.
 
-At every physics step h = 1/240 s the joints' velocity motors get the target of a first-order lag, discretised exactly,
-
-    v₊ = v + (1 − exp(−h/τ)) (u − v),        θ̇_target = g ⊙ v,
-
-because PyBullet's motors alone reach any target within a step. Controllers see and command reported positions q, which
-are (θ − o)/g of the simulator's angles θ. The feature is the ball's centre as fitted to noisy depths; it is missing
-where the ball is hidden, out of sight or cut by the image's border. Delay, latency and lost frames are those of
-`servobench.plant.bench`.
+The drives of `servobench.plant.bullet.drives` turn joints that have inertia, load and friction, at 1 kHz. Controllers
+see and command reported positions q, which are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link
+that meets another one, the table, the floor or an obstacle ends the run. The feature is the ball's centre as fitted to
+noisy depths; it is missing where the ball is hidden, out of sight or cut by the image's border. Delay, latency and lost
+frames are those of `servobench.plant.bench`.
 """
 
 from __future__ import annotations
@@ -18,29 +15,34 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Len
 
 from servobench.plant.bench import Bench, build_bench
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.bullet.drives import PHYSICS_STEP, DriveConfig, Drives, DriveState
+from servobench.plant.bullet.urdf import Box
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
-from servobench.plant.faults import PlantDiverged
+from servobench.plant.faults import Collision, PlantDiverged
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.seeds import named_generator
 from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import Count, NonNegative, Positive, settings
+from servobench.plant.settings import Count, NonNegative, Number, Positive, nested, settings
 from servobench.plant.signals import Truth
 from servobench.plant.timing import RENAMED_DELAY
 from servobench.plant.world import World
 
 if TYPE_CHECKING:
+    from servobench.plant.bullet.mechanics import Mechanics
     from servobench.plant.bullet.scene import Scene
 
-PHYSICS_STEP = 1.0 / 240.0  # s
+CONTACT_STEPS = 10  # physics steps between two looks for contact, 10 mm at 1 m/s; and at the end of a period
+BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
 
 
 @settings
@@ -52,7 +54,17 @@ class BulletConfig:
     joint_range: Positive = 2 * math.pi
     """[rad] largest joint position each way; the vendor's range."""
     lag: NonNegative = 0.05
-    """[s] τ, time constant of the joints' velocity loops; 0 means none."""
+    """[s] τ, by which the drives smooth the commanded velocity; 0 means none."""
+    drives: DriveConfig = nested(DriveConfig)
+    """Loops, torque limits, friction and load of the joints."""
+    encoder_resolution: NonNegative = 2 * math.pi / 2**17
+    """[rad] step of reported positions, 0 for none; 17 bits, 0.04 mm at the reach of 0.85 m, below the UR5's 0.1 mm."""
+    room_contact: bool = True
+    """End the run, as `collision`, when the arm meets the table, the floor or an obstacle."""
+    self_contact: bool = False
+    """The same when the arm meets itself; off, as the task `circle` leads the wrist 70 mm into the upper arm."""
+    obstacles: tuple[BoxNumbers, ...] = ()
+    """[m] boxes that hide the ball and stand in the way: x, y, z of the centre in the base frame, and three sides."""
     command_delay: NonNegative = 0.0
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = field(default_factory=lambda: SensingConfig(0.0, 0.05, 0.002))
@@ -80,6 +92,12 @@ class BulletConfig:
 
     RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
+    def boxes(self) -> tuple[Box, ...]:
+        """Return the obstacles."""
+        return tuple(
+            Box(f"obstacle {k}", (x, y, z), (dx, dy, dz)) for k, (x, y, z, dx, dy, dz) in enumerate(self.obstacles, 1)
+        )
+
     def camera(self) -> PinholeCamera:
         """Return the camera's intrinsics."""
         return PinholeCamera(self.width, self.height, self.vertical_fov)
@@ -96,98 +114,110 @@ class BulletConfig:
         )
 
 
-def velocity_targets(
-    v: FloatArray, u: FloatArray, decay: float, steps: int, room: tuple[FloatArray, FloatArray]
-) -> FloatArray:
-    """Return the joints' target velocities for the physics steps of a period.
-
-    Args:
-        v: (n,), rad/s, velocity at the start.
-        u: (n,), rad/s, commanded velocity.
-        decay: exp(−h/τ), what is left of a deviation after a physics step; 0 = no lag.
-        steps: number of physics steps.
-        room: (n,) and (n,), rad, how far the joints may move down (≤ 0) and up (≥ 0).
-
-    Returns:
-        (steps, n), rad/s; a joint that would leave its range stops at the limit.
-    """
-    with np.errstate(under="ignore"):  # under a short lag nothing is left
-        left = decay ** np.arange(1, steps + 1)[:, None]
-        targets = u + left * (v - u)
-    moved = PHYSICS_STEP * np.cumsum(targets, axis=0)
-    if (moved < room[0]).any() or (moved > room[1]).any():
-        moved = np.clip(moved, *room)
-        targets = np.diff(moved, axis=0, prepend=np.zeros((1, len(u)))) / PHYSICS_STEP
-    return np.asarray(targets)
-
-
 @dataclass(frozen=True, eq=False)
 class BulletState:
     """A saved state of the world, without handles: any world with the same robot and settings can restore it.
 
     Attributes:
-        angles: (n,), rad, of the simulator.
-        speeds: (n,), rad/s, of the simulator.
-        v: (n,), rad/s, present target of the motors.
+        joints: angles, speeds and loops of the joints.
+        periods: number of periods since the reset.
         X_BC: (4, 4), pose of the camera.
         noise: generator of the depth noise.
     """
 
-    angles: FloatArray
-    speeds: FloatArray
-    v: FloatArray
+    joints: DriveState
+    periods: int
     X_BC: FloatArray
     noise: np.random.Generator
 
 
 class BulletWorld(World):
-    """A UR5 in PyBullet under a fixed RGB-D camera: v₊ = v + (1 − e^(−h/τ))(u − v), y = centre of the ball it sees."""
+    """A UR5 with drives under a fixed RGB-D camera; y = centre of the ball it sees."""
 
     def __init__(self, config: BulletConfig, setup: PlantSetup) -> None:
-        """Open a world of its own and load the arm.
+        """Open worlds of its own and load the arm.
 
         Raises:
             ValueError: a start of the wrong size, a period that physics steps do not divide, an arm that is not like a
                 UR5, a gear ratio of 0, or a window without a display.
         """
-        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet prints a banner when it is imported
+        # PyBullet prints a banner when it is imported.
+        from servobench.plant.bullet.mechanics import Mechanics  # noqa: PLC0415
+        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415
 
         model, start = setup.robot()
-        self._config, self._model = config, model
+        self._config, self._model, arm = config, model, model.arm
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
         self._start = as_vector("start", start, self.spec.n)
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
-        if not model.arm.gear_ratio.all():
-            raise ValueError(f"gear_ratio must not be zero, got {model.arm.gear_ratio.tolist()}")
-        self._decay = math.exp(-PHYSICS_STEP / config.lag) if config.lag > 0.0 else 0.0
+        if not arm.gear_ratio.all():
+            raise ValueError(f"gear_ratio must not be zero, got {arm.gear_ratio.tolist()}")
         self._camera, self._depth_noise = config.camera(), config.noise()
         self._X_BC = model.X_BC
-        self._scene: Scene = Scene(model.arm, physics_step=PHYSICS_STEP, scenery=config.scenery, window=config.view)
+        boxes, load = config.boxes(), config.drives
+        self._scene: Scene = Scene(arm, scenery=config.scenery, window=config.view, boxes=boxes)
+        try:
+            self._mechanics: Mechanics = Mechanics(
+                arm, payload=load.payload, assumed_payload=load.assumed_payload, boxes=boxes
+            )
+        except BaseException:
+            self._scene.close()
+            raise
+        stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
+        assumed = self._mechanics.assumed_inertia(arm.joint_angle(self._start))
+        self._drives = Drives(load, config.lag, assumed, (np.minimum(*stops), np.maximum(*stops)))
 
     def reset(self, seed: int) -> FloatArray:
-        """Go back to the start at rest; the depth noise gets a random stream of its own. See `World.reset`."""
+        """Go back to the start at rest; the depth noise gets a random stream of its own. See `World.reset`.
+
+        Raises:
+            Collision: the arm overlaps with itself or the room at the start.
+        """
         self._noise = named_generator(seed, "depth_noise")
         self.move_camera(self._X_BC)
-        self._v = np.zeros(self.spec.n)
         self._periods = 0
-        self._scene.place(self._model.arm.joint_angle(self._start))
+        angle = self._model.arm.joint_angle(self._start)
+        self._joints = self._drives.start(angle, self._mechanics.body(angle, np.zeros(self.spec.n)))
+        self._scene.place(angle)
+        self._check_contact(0)
         self._started = time.perf_counter()
-        return self._joint_position()
+        return self._reported()
 
     def advance(self, joint_velocity: FloatArray) -> FloatArray:
-        """Hold a command for one period; see `World.advance`."""
-        q = self._joint_position()
-        room = np.minimum(self.spec.joint_lower - q, 0.0), np.maximum(self.spec.joint_upper - q, 0.0)
-        targets = velocity_targets(self._v, joint_velocity, self._decay, self._steps, room)
-        self._v = targets[-1]
-        self._scene.advance((targets * self._model.arm.gear_ratio).tolist())
-        q = self._joint_position()
-        if not np.isfinite(q).all():
-            raise PlantDiverged(f"joint positions are not finite: {q.tolist()}")
+        """Hold a command for one period; see `World.advance`.
+
+        Raises:
+            Collision: the arm has met itself or the room.
+        """
+        speed = self._model.arm.gear_ratio * joint_velocity
+        for step in range(1, self._steps + 1):
+            self._joints = self._turn(self._drives.follow(self._joints, speed))
+            if step % CONTACT_STEPS == 0 or step == self._steps:
+                self._check_state(step)
+        self._scene.place(self._joints.angle)
         self._periods += 1
         if self._config.view:
             self._keep_pace()
-        return q
+        return self._reported()
+
+    def _turn(self, joints: DriveState) -> DriveState:
+        """Return the joints one physics step later."""
+        if not self._config.drives.dynamics:
+            return self._drives.track(joints)
+        return self._drives.drive(joints, self._mechanics.body(joints.angle, joints.speed))
+
+    def _check_state(self, step: int) -> None:
+        """Raise the fault of joints that are not finite or of an arm that touches something, at a physics step."""
+        if not np.isfinite(self._joints.angle).all():
+            raise PlantDiverged(f"joint positions are not finite: {self._joints.angle.tolist()}")
+        self._check_contact(step)
+
+    def _check_contact(self, step: int) -> None:
+        room, own = self._config.room_contact, self._config.self_contact
+        touching = self._mechanics.contact(self._joints.angle, room=room, own=own) if room or own else None
+        if touching is not None:
+            seconds = self._periods * self.spec.period + step * PHYSICS_STEP
+            raise Collision(f"{touching[0]} meets {touching[1]} at {seconds:.3f} s")
 
     def see(self) -> FloatArray | None:
         """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
@@ -209,14 +239,14 @@ class BulletWorld(World):
 
     def save(self) -> BulletState:
         """See `Plant.save`; measured: joints, detections and images continue with the same bits."""
-        angles, speeds = self._scene.joint_state()
-        return BulletState(angles, speeds, self._v, self._model.X_BC, copy.deepcopy(self._noise))
+        return BulletState(self._joints, self._periods, self._model.X_BC, copy.deepcopy(self._noise))
 
     def restore(self, state: BulletState) -> None:
         """See `Plant.restore`."""
-        self._scene.place(state.angles, state.speeds)
+        self._joints, self._periods = state.joints, state.periods
+        self._scene.place(state.joints.angle)
         self.move_camera(state.X_BC)
-        self._v, self._noise = state.v, copy.deepcopy(state.noise)
+        self._noise = copy.deepcopy(state.noise)
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -234,15 +264,20 @@ class BulletWorld(World):
         return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
 
     def close(self) -> None:
-        """Leave PyBullet's world."""
+        """Leave PyBullet's worlds."""
         self._scene.close()
+        self._mechanics.close()
 
     def _joint_position(self) -> FloatArray:
-        """Return the reported joint positions q = (θ − o)/g, (n,) rad."""
+        """Return the exact joint positions q = (θ − o)/g, (n,) rad."""
         arm = self._model.arm
-        q: FloatArray = (self._scene.joint_state()[0] - arm.joint_offset) / arm.gear_ratio
-        q.setflags(write=False)
+        q: FloatArray = (self._joints.angle - arm.joint_offset) / arm.gear_ratio
         return q
+
+    def _reported(self) -> FloatArray:
+        """Return the joint positions in steps of the encoders, (n,) rad."""
+        q, resolution = self._joint_position(), self._config.encoder_resolution
+        return np.asarray(np.round(q / resolution) * resolution) if resolution > 0.0 else q
 
     def _render(self) -> tuple[ByteArray, FloatArray]:
         return self._scene.render(self._camera, self._model.X_BC)

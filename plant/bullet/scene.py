@@ -1,7 +1,6 @@
-"""The simulated scene: the one module that calls PyBullet.
+"""What a camera sees of the arm on its table: a PyBullet world that is only looked at.
 
-An arm with velocity motors on a table, in a physics world of its own, and what a camera sees of it. The world frame W
-is the arm's base frame B.
+The world frame W is the arm's base frame B. Masses and contact are in `servobench.plant.bullet.mechanics`.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ import numpy as np
 import pybullet
 
 from servobench.plant.bullet.meshes import sphere_obj
-from servobench.plant.bullet.urdf import arm_urdf, bench_files
-from servobench.plant.robot import ur5
+from servobench.plant.bullet.urdf import Box, arm_urdf, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
 
 if TYPE_CHECKING:
@@ -25,7 +23,6 @@ if TYPE_CHECKING:
     from servobench.plant.checks import FloatArray
     from servobench.plant.robot.arm import SerialArm
 
-GRAVITY = 9.81  # m/s²
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 BALL_MESH = "ball.obj"
 
@@ -33,14 +30,14 @@ BALL_MESH = "ball.obj"
 class Scene:
     """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
 
-    def __init__(self, arm: SerialArm, *, physics_step: float, scenery: bool, window: bool) -> None:
+    def __init__(self, arm: SerialArm, *, scenery: bool, window: bool, boxes: tuple[Box, ...] = ()) -> None:
         """Open a world and load the arm.
 
         Args:
             arm: the true kinematics of an arm like the UR5.
-            physics_step: s.
             scenery: whether to load the table and the floor.
             window: whether to open PyBullet's window.
+            boxes: what else is in the room.
 
         Raises:
             ValueError: another number of joints, or a window is wanted where there is no display.
@@ -52,7 +49,7 @@ class Scene:
         if self._client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
-            self._load(arm, physics_step, scenery=scenery)
+            self._load(arm, boxes, scenery=scenery)
             if window:
                 self._aim_window()
         except BaseException:
@@ -62,17 +59,15 @@ class Scene:
         self._joints = list(range(n))
         self._ball_link = n + 1
 
-    def _load(self, arm: SerialArm, physics_step: float, *, scenery: bool) -> None:
+    def _load(self, arm: SerialArm, boxes: tuple[Box, ...], *, scenery: bool) -> None:
         client = self._client
-        # With the default residual threshold the solver stops early, and gravity makes a motor at rest creep by
-        # 1 mrad/s. With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=physics_step, solverResidualThreshold=0.0, enableFileCaching=0, physicsClientId=client
-        )
-        pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+        # With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
         files = {"arm.urdf": arm_urdf(arm, BALL_MESH), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
         if scenery:
             files |= bench_files()
+        if boxes:
+            files["boxes.urdf"] = boxes_urdf(boxes)
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
             for name, text in files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")
@@ -94,24 +89,10 @@ class Scene:
         pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
         pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
 
-    def place(self, theta: FloatArray, speed: FloatArray | None = None) -> None:
-        """Put the arm at joint angles `theta` (n,) rad with `speed` (n,) rad/s, or at rest without it."""
-        speeds = np.zeros(len(theta)) if speed is None else speed
-        for joint, angle, velocity in zip(self._joints, theta.tolist(), speeds.tolist(), strict=True):
-            pybullet.resetJointState(self._arm, joint, angle, velocity, physicsClientId=self._client)
-
-    def advance(self, velocities: list[list[float]]) -> None:
-        """Take a physics step for each row of target joint velocities, (n,) rad/s, under the motors' torque limits."""
-        arm, client, joints = self._arm, self._client, self._joints
-        control, step, mode = pybullet.setJointMotorControlArray, pybullet.stepSimulation, pybullet.VELOCITY_CONTROL
-        for row in velocities:
-            control(arm, joints, mode, targetVelocities=row, forces=ur5.MAX_TORQUE, physicsClientId=client)
-            step(physicsClientId=client)
-
-    def joint_state(self) -> tuple[FloatArray, FloatArray]:
-        """Return the joint angles θ, (n,) rad, and their speeds, (n,) rad/s."""
-        states = pybullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
-        return np.array([state[0] for state in states]), np.array([state[1] for state in states])
+    def place(self, theta: FloatArray) -> None:
+        """Put the arm at joint angles `theta` (n,) rad."""
+        for joint, angle in zip(self._joints, theta.tolist(), strict=True):
+            pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._client)
 
     def ball_position(self) -> FloatArray:
         """Return the ball's centre in the base frame, (3,) m, from the simulator's own link state."""

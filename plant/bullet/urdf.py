@@ -3,12 +3,13 @@
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
 
-No link has a collision shape: parts of a mismatched arm may overlap at rest, and the contact solver would push them
-apart. Numbers are written with `repr`, so that none loses a digit.
+The rendered arm has looks and no collision shapes, the simulated one the same cylinders and spheres as collision shapes
+and no looks. Numbers are written with `repr`, so that none loses a digit.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -30,9 +31,24 @@ TABLE_TOP = (0.86, 0.85, 0.82, 1.0)
 TABLE_RIM = (0.48, 0.50, 0.53, 1.0)
 FLOOR_A, FLOOR_B = (0.55, 0.59, 0.63, 1.0), (0.51, 0.55, 0.59, 1.0)
 TABLE = (-0.32, -0.75, 1.15, 0.75)  # [m] x and y of two opposite corners
+TABLE_THICKNESS = 0.04  # [m] of its top as an obstacle
 FLOOR_DROP, TILE = 0.75, 0.4  # [m] floor below the table's top; side of a floor tile
 LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBullet's default is 1 kg
 BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
+
+
+class Box(NamedTuple):
+    """A box in the room, parallel to the axes of the base frame.
+
+    Attributes:
+        name: in error messages.
+        centre: (3,) [m], base frame.
+        size: (3,) [m], its three sides.
+    """
+
+    name: str
+    centre: tuple[float, float, float]
+    size: tuple[float, float, float]
 
 
 def arm_urdf(arm: SerialArm, ball_mesh: str) -> str:
@@ -48,6 +64,62 @@ def arm_urdf(arm: SerialArm, ball_mesh: str) -> str:
     Raises:
         ValueError: the arm has another number of joints than the UR5.
     """
+    return _text(_arm(arm, ball_mesh))
+
+
+def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool) -> str:
+    """Return the URDF of an arm without looks, with a point load at the ball.
+
+    Args:
+        arm: the kinematics, mismatch included.
+        payload: kg.
+        shapes: whether the parts that `arm_urdf` draws are collision shapes.
+
+    Raises:
+        ValueError: the arm has another number of joints than the UR5.
+    """
+    robot = _arm(arm, "")
+    for link in robot.iter("link"):
+        for visual in link.findall("visual"):
+            if not shapes:
+                link.remove(visual)
+                continue
+            visual.tag = "collision"
+            for material in visual.findall("material"):
+                visual.remove(material)
+            for mesh in visual.findall("geometry/mesh"):
+                mesh.tag, mesh.attrib = "sphere", {"radius": repr(ur5.BALL_RADIUS)}
+        mass = link.find("inertial/mass")
+        if link.get("name") == BALL_LINK and mass is not None:
+            mass.set("value", repr(LIGHT_PART[0] + payload))
+    return _text(robot)
+
+
+def room_boxes() -> tuple[Box, Box]:
+    """Return the table's top and the floor as obstacles."""
+    x0, y0, x1, y1 = TABLE
+    table = (x0 + x1) / 2, (y0 + y1) / 2, -TABLE_THICKNESS / 2
+    return (
+        Box("table", table, (x1 - x0, y1 - y0, TABLE_THICKNESS)),
+        Box("floor", (0.0, 0.0, -FLOOR_DROP - 0.5), (10.0, 10.0, 1.0)),
+    )
+
+
+def boxes_urdf(boxes: tuple[Box, ...]) -> str:
+    """Return the URDF of a body that consists of boxes, each of which is both drawn and a collision shape."""
+    robot = ET.Element("robot", name="boxes")
+    body = _add_link(robot, "boxes", *BASE_PART)
+    for box in boxes:
+        shapes = [_add_visual(body, DARK_GREY, box.centre, np.zeros(3))]
+        collision = ET.SubElement(body, "collision")
+        ET.SubElement(collision, "origin", xyz=_numbers(box.centre), rpy=_numbers(np.zeros(3)))
+        for geometry in (*shapes, ET.SubElement(collision, "geometry")):
+            ET.SubElement(geometry, "box", size=_numbers(box.size))
+    return _text(robot)
+
+
+def _arm(arm: SerialArm, ball_mesh: str) -> ET.Element:
+    """Return the tree of `arm_urdf`."""
     if arm.n != len(ur5.MASS):
         raise ValueError(f"arm must have {len(ur5.MASS)} joints like the UR5, got {arm.n}")
     robot = ET.Element("robot", name="arm")
@@ -66,7 +138,7 @@ def arm_urdf(arm: SerialArm, ball_mesh: str) -> str:
     _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool)
     _add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
     _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ur5.BALL_RADIUS)
-    return _text(robot)
+    return robot
 
 
 def bench_files() -> dict[str, str]:

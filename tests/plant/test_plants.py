@@ -38,7 +38,7 @@ def test_a_run_begins_at_its_start_at_time_zero_and_time_counts_periods(plant):
     observation = plant.reset(0)
     assert (observation.time, plant.spec.period) == (0.0, PERIOD)
     assert observation.feature.shape == (plant.spec.m,)
-    np.testing.assert_allclose(observation.joint_position, HOME, atol=1e-6)
+    np.testing.assert_allclose(observation.joint_position, HOME, atol=3e-5)  # half a step of the encoders
     assert [plant.step(Command(u)).time for u in COMMANDS] == [(k + 1) * PERIOD for k in range(len(COMMANDS))]
 
 
@@ -151,8 +151,8 @@ def test_a_moved_camera_shows_the_ball_elsewhere_until_the_reset(plant):
         observation = plant.step(Command(np.zeros(6)))
     after = plant.truth()
     assert np.linalg.norm(after.feature - before.feature) > 0.005
-    np.testing.assert_allclose(after.feature, moved.feature(observation.joint_position), atol=1e-6)
-    np.testing.assert_allclose(after.jacobian, moved.jacobian(observation.joint_position), atol=1e-6)
+    np.testing.assert_allclose(after.feature, moved.feature(observation.joint_position), atol=5e-5)
+    np.testing.assert_allclose(after.jacobian, moved.jacobian(observation.joint_position), atol=5e-5)
     assert np.linalg.norm(observation.feature - after.feature) < 0.01
     plant.reset(0)
     np.testing.assert_allclose(plant.truth().feature, before.feature, atol=1e-9)

@@ -5,7 +5,7 @@ import pybullet
 import pytest
 
 from servobench.plant.bullet.meshes import rectangles_obj, sphere_obj
-from servobench.plant.bullet.urdf import arm_urdf, bench_files, rpy_along
+from servobench.plant.bullet.urdf import arm_mechanics, arm_urdf, bench_files, rpy_along
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 
@@ -98,8 +98,22 @@ def test_numbers_in_the_urdf_lose_no_digit():
     np.testing.assert_array_equal(written, np.vstack([arm.translation, arm.tool]))
 
 
-def test_nothing_collides():
-    assert "<collision" not in arm_urdf(ur5.ur5_arm(), "ball.obj") + bench_files()["bench.urdf"]
+def shapes(urdf, kind) -> list[tuple[str, str, str]]:
+    """Link, place and geometry of all parts of a kind, the ball as its radius."""
+    parts = []
+    for link in ET.fromstring(urdf).iter("link"):
+        for part in link.findall(kind):
+            geometry = part.find("geometry")[0]
+            what = dict(geometry.attrib) if geometry.tag != "mesh" else {"radius": geometry.get("scale").split()[0]}
+            parts.append((link.get("name"), str(part.find("origin").attrib), str(what)))
+    return parts
+
+
+def test_what_is_drawn_is_what_collides(arm):
+    drawn, solid = arm_urdf(arm, "ball.obj"), arm_mechanics(arm, 1.0, shapes=True)
+    assert shapes(drawn, "visual") == shapes(solid, "collision")
+    assert shapes(drawn, "collision") == shapes(solid, "visual") == []
+    assert shapes(arm_mechanics(arm, 1.0, shapes=False), "collision") == []
 
 
 def test_nothing_but_the_ball_is_reddish():
