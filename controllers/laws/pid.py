@@ -1,16 +1,18 @@
 """Resolved-rate control with a discrete PID on the error (eq. 43 of the paper, extended).
 
-    v(k) = K_p e(k) + K_i I(k) + K_d d(k),      u(k) = Ĵᵀ (ĴĴᵀ + δ²I)⁻¹ v(k)
+    v(k) = γ/dt e(k) + K_i I(k) + K_d d(k),      u(k) = Ĵᵀ (ĴĴᵀ + δ²I)⁻¹ v(k),      γ = 1 − exp(−K_p dt)
 
 with e = y_ref − y (..., m), its integral I and its filtered derivative d:
 
     I(k) = I(k−1) + dt e(k),   d(k) = (τ d(k−1) + e(k) − e(k−1)) / (τ + dt)
 
-K_i = K_d = 0 and δ = 0 is eq. 43 (and eq. 9), whose minus sign belongs to the paper's error y − y_ref.
+γ/dt tends to K_p at fast rates; so the error decays as exp(−K_p t) at every rate. K_i = K_d = 0 and δ = 0 is eq. 43
+(and eq. 9), whose minus sign belongs to the paper's error y − y_ref.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import ClassVar, NamedTuple, final
 
@@ -33,7 +35,7 @@ class PidConfig:
     RENAMED: ClassVar[Mapping[str, str]] = {"feedforward": "aids.feedforward"}
 
     proportional_gain: Positive = 2.5
-    """[1/s] K_p; a share K_p dt = 0.125 of the error per period, as fast as the default of `mfac`."""
+    """[1/s] K_p; a share of 0.12 of the error per period of 0.05 s."""
     integral_gain: NonNegative = 0.0
     """[1/s²] K_i; 0 as in the paper."""
     derivative_gain: NonNegative = 0.0
@@ -74,6 +76,7 @@ class PidLaw(Law[PidState]):
         """Take settings and period."""
         self._config = config
         self._dt = knowledge.spec.period
+        self._rate = -math.expm1(-config.proportional_gain * self._dt) / self._dt
 
     def start(self, observation: Observation) -> PidState:
         """Return zero integral and derivative."""
@@ -88,7 +91,7 @@ class PidLaw(Law[PidState]):
         e = reference[..., 0, :] - observation.feature
         state = state._replace(integral_before=state.integral)
         state = branch(observation.feature_valid, self._learn, state, e)
-        v = config.proportional_gain * e + config.integral_gain * state.integral
+        v = self._rate * e + config.integral_gain * state.integral
         v = v + config.derivative_gain * state.derivative
         return state, np.matvec(damped_inverse(estimate.jacobian, config.damping), v)
 

@@ -11,12 +11,13 @@ The motion that is still to come of the commands so far, and the time that it ta
 
     flight = Σ_i (g_{i+1} + … + g_N) dq(k−i),   lead = Σ_i (g_{i+1} + … + g_N) / Σ_i g_i periods
 
-At fast rates an entry of g spans several periods, about 0.05 s in all: dq(k−i) is then the sum over a span, and what is
+At fast rates an entry of g spans several periods, about `SPAN` in all: dq(k−i) is then the sum over a span, and what is
 left of a command is interpolated within it. A response can also be given: a delay and a first-order lag.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,10 +25,11 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, transposed
 
-PRIOR_WEIGHT = 1e-5  # [rad²] ρ_1; one step of some milliradians outweighs it
-PRIOR_GROWTH = 1.5  # [1] of ρ_i from one period to the next, because later responses are less likely
-MAX_EXCITATION = 1.0  # [rad²] that is remembered; older excitation is forgotten in proportion
-PREDICTION_TOLERANCE = 5e-4  # [rad] nothing is learned from smaller errors (0.3 mm at the ball)
+SPAN = 0.02  # [s] of an entry of g, and no shorter than a period
+PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of spans of a second; one step of some milliradians outweighs it
+PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
+MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
+PREDICTION_TOLERANCE = 0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
 MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that does not overshoot
 
 
@@ -41,6 +43,7 @@ class JointResponse(NamedTuple):
         response: g, (..., N).
         left: the part of each of these commands that is still to come, (..., N r).
         lead: (...) [periods].
+        span: s, of an entry of g.
     """
 
     A: FloatArray
@@ -49,22 +52,26 @@ class JointResponse(NamedTuple):
     response: FloatArray
     left: FloatArray
     lead: FloatArray
+    span: float
 
     @classmethod
-    def immediate(cls, length: int, joint_position: FloatArray, span: int = 1) -> JointResponse:
+    def immediate(cls, length: int, joint_position: FloatArray, period: float, span: int = 1) -> JointResponse:
         """Return the response g₀ of an arm that follows at once and rests.
 
         Args:
             length: N, spans.
             joint_position: (..., n), of which only the shape counts.
+            period: s.
             span: r, periods.
         """
         *lead, n = joint_position.shape
-        prior = PRIOR_WEIGHT * np.eye(length)[0]
-        A, b = np.diag(PRIOR_WEIGHT * PRIOR_GROWTH ** np.arange(length)), np.broadcast_to(prior, (*lead, length))
-        commands, A = np.zeros((*lead, length * span, n)), np.broadcast_to(A, (*lead, length, length))
-        state = cls(A, b, commands, b / PRIOR_WEIGHT, np.zeros((*lead, length * span)), np.zeros(lead))
-        return with_response(state, state.response)
+        time = span * period
+        weights = PRIOR_WEIGHT * time * np.exp(PRIOR_GROWTH * time * np.arange(length))
+        first = np.broadcast_to(np.eye(length)[0], (*lead, length))
+        A, commands = np.broadcast_to(np.diag(weights), (*lead, length, length)), np.zeros((*lead, length * span, n))
+        left = np.zeros((*lead, length * span))
+        state = cls(A, weights[0] * first, commands, first, left, np.zeros(lead), time)
+        return with_response(state, first)
 
     @classmethod
     def given(cls, delay: float, lag: float, period: float, length: int, joint_position: FloatArray) -> JointResponse:
@@ -79,7 +86,7 @@ class JointResponse(NamedTuple):
         """
         lead = joint_position.shape[:-1]
         left = np.broadcast_to(remaining_share(delay, lag, period, length), (*lead, length))
-        state = cls.immediate(1, joint_position, length)
+        state = cls.immediate(1, joint_position, period, length)
         return state._replace(left=left, lead=np.full(lead, np.add.reduce(left[..., :], axis=-1))[()])
 
     def command(self, joint_step: FloatArray) -> JointResponse:
@@ -90,7 +97,9 @@ class JointResponse(NamedTuple):
         """Return the state after the joint step of the last span, (..., n), rad, unless it was predicted well."""
         spans = self._spans()
         error = joint_step - np.vecmat(self.response, spans)
-        return branch(np.vecdot(error, error) >= PREDICTION_TOLERANCE**2, _learned, self, joint_step, spans)
+        return branch(
+            np.vecdot(error, error) >= (PREDICTION_TOLERANCE * self.span) ** 2, _learned, self, joint_step, spans
+        )
 
     def flight(self) -> FloatArray:
         """Return the joint motion (..., n), rad, that is still to come of the commands so far."""
@@ -110,7 +119,7 @@ def _learned(state: JointResponse, joint_step: FloatArray, spans: FloatArray) ->
     weight = spans.shape[-2] / state.commands.shape[-2]  # motions of one span overlap at fast rates
     A = state.A + weight * (spans @ transposed(spans))
     b = state.b + weight * np.matvec(spans, joint_step)
-    kept = np.minimum(1.0, MAX_EXCITATION / A.trace(axis1=-2, axis2=-1))[..., None]
+    kept = np.minimum(1.0, MAX_EXCITATION * state.span / A.trace(axis1=-2, axis2=-1))[..., None]
     A, b = kept[..., None] * A, kept * b
     response = np.linalg.solve(A, b[..., None])[..., 0]
     return with_response(state._replace(A=A, b=b), np.minimum(np.maximum(response, 0.0), MAX_RESPONSE))
@@ -121,17 +130,21 @@ def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
     length, count = response.shape[-1], state.commands.shape[-2]
     ahead = np.zeros((*response.shape[:-1], length + 1))  # g_{i+1} + … + g_N for i = 0 … N
     ahead[..., :-1] = response[..., ::-1].cumsum(axis=-1)[..., ::-1]
-    span = count // length
-    if span == 1:
-        left = ahead[..., 1:]
-    else:
-        inside = (1.0 + np.arange(span)) / span
-        left = (ahead[..., :-1, None] * (1.0 - inside) + ahead[..., 1:, None] * inside).reshape(
-            *response.shape[:-1], count
-        )
+    left = ahead[..., 1:] if count == length else np.vecmat(ahead, _within_spans(length, count // length))
     total = ahead[..., 0]
     lead = np.add.reduce(left, axis=-1) / np.maximum(total, 0.5)
     return state._replace(response=response, left=left, lead=np.minimum(lead, count) * (total > 0.5))
+
+
+@cache
+def _within_spans(length: int, span: int) -> FloatArray:
+    """Return the weights (N + 1, N r) by which what is left is interpolated between spans.
+
+    An entry of g is fitted to all commands of its span, so that the sum up to it holds for the middle of the span.
+    """
+    middles = np.concatenate([[0.0], span * np.arange(length) + (span + 1) / 2])
+    ages = 1.0 + np.arange(length * span)
+    return np.stack([np.interp(ages, middles, row) for row in np.eye(length + 1)])
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:

@@ -19,9 +19,8 @@ import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
-from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.stages.feature_filter import FeatureFilter
-from servobench.controllers.stages.joint_response import JointResponse
+from servobench.controllers.stages.joint_response import SPAN, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.pairing import periods_in
 from servobench.plant.checks import FloatArray
@@ -92,7 +91,7 @@ class Predictor:
             delays: of a given response.
         """
         self._aids, self._period, self._delays = aids, period, delays
-        self.span = max(1, periods_in(MOTION_TIME, period))
+        self.span = max(1, periods_in(SPAN, period))
         self._length = max(1, periods_in(aids.response_length, period * self.span))
 
     def frozen(self) -> Predictor:
@@ -109,7 +108,7 @@ class Predictor:
             count = self._length * self.span
             response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
         else:
-            response = JointResponse.immediate(self._length, q, self.span)
+            response = JointResponse.immediate(self._length, q, self._period, self.span)
         return PredictorState(response, FeatureFilter(y, noise.variance, noise), np.full(y.shape[:-1], -1))
 
     def predict(
