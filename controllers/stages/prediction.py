@@ -11,6 +11,7 @@ that is still to come (`joint_response`). Both halves can be left out.
 from __future__ import annotations
 
 import copy
+import math
 from dataclasses import replace
 from typing import NamedTuple, final
 
@@ -27,6 +28,7 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch
 from servobench.plant.signals import BoolArray, Observation
 
+SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
 IntArray = npt.NDArray[np.int_]
 
 
@@ -105,7 +107,7 @@ class Predictor:
         q, y, delays = observation.joint_position, observation.feature, self._delays
         noise = NoiseLevel.guess(self._aids.feature_noise, y.shape[:-1])
         if self._aids.response == "given":
-            count = self._length * self.span
+            count = 1 + math.ceil((delays.command_delay + SETTLED_LAGS * delays.lag) / self._period)
             response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
         else:
             response = JointResponse.immediate(self._length, q, self._period, self.span)

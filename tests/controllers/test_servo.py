@@ -1,11 +1,13 @@
 """Tests of the composed controller: what it hands to its parts, what it refuses, what each lane does."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from kit.toy import plant_spec, seen
+from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.estimator import Estimator
@@ -15,7 +17,6 @@ from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.servo import Servo, ServoController
-from servobench.controllers.stages.prediction import Prediction, Predictor
 from servobench.plant.faults import ControllerDiverged
 
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
@@ -52,10 +53,10 @@ class Broken(Law):
         return {}
 
 
-def servo(estimator, law=None, predictor=None, **initial):
-    law = MfacLaw(MfacConfig(), KNOWLEDGE) if law is None else law
-    provider = initial_jacobian(InitialConfig(**initial), KNOWLEDGE)
-    return ServoController(Servo(estimator, law, provider, KNOWLEDGE, predictor))
+def servo(estimator, law=None, aids=None, knowledge=KNOWLEDGE, **initial):
+    law = MfacLaw(MfacConfig(), knowledge) if law is None else law
+    provider = initial_jacobian(InitialConfig(**initial), knowledge)
+    return ServoController(Servo(estimator, law, provider, knowledge, aids and AidsConfig(**aids)))
 
 
 def test_a_motion_spans_the_gap_that_lost_frames_leave():
@@ -111,36 +112,89 @@ def test_an_estimate_that_is_not_finite_is_a_named_fault():
     controller = servo(estimator)
     controller.reset(first, 0)
     controller.step(first, np.zeros((2, 2)))
-    controller.state = controller.state._replace(estimator=Recorded(np.full((2, 3), np.nan)))
+    estimation = controller.state.estimation
+    learned = estimation.learned._replace(estimator=Recorded(np.full((2, 3), np.nan)))
+    controller.state = controller.state._replace(estimation=estimation._replace(learned=learned))
     with pytest.raises(ControllerDiverged, match="jacobian is not finite at 0 s"):
         controller.step(first, np.zeros((2, 2)))
 
 
-def test_a_predictor_stands_before_the_law_and_gets_the_command():
-    class Doubling:
-        def start(self, observation):
-            return ()
+class Wishing(Law):
+    """A law that wants the sum of all it gets, and remembers what it got and what was sent."""
 
-        def predict(self, state, estimate, observation):
-            return state, Prediction(2.0 * observation.feature, observation.joint_position, np.array(1.0))
+    def start(self, observation):
+        return ()
 
-        def note(self, state, joint_step):
-            return (*state, joint_step)
+    def command(self, state, estimate, observation, reference):
+        return (*state, (estimate.jacobian, observation, reference)), np.array([0.4, -0.2, 0.1])
 
-    controller, law = servo(ConstantEstimator(), predictor=Doubling()), MfacLaw(MfacConfig(), KNOWLEDGE)
-    first = seen(np.zeros(3), [0.1, 0.0])
-    controller.reset(first, 0)
-    u = controller.step(first, np.array([[0.0, 0.0], [0.3, 0.2]])).joint_velocity
-    doubled = seen(np.zeros(3), [0.2, 0.0])
-    shifted = np.array([[0.3, 0.2], [0.6, 0.4]])
-    np.testing.assert_array_equal(u, law.command(law.start(first), Estimate(J0), doubled, shifted)[1])
-    np.testing.assert_array_equal(controller.state.predictor, [u * 0.05])
+    def noted(self, state, joint_velocity, limited):
+        return (*state, (joint_velocity, limited))
+
+    def diagnostics(self, state):
+        return {}
 
 
-def test_the_predictor_starts_where_the_probing_ends():
+def test_the_law_gets_the_feature_and_the_reference_of_when_commands_are_carried_out():
+    """A given delay of one period: all of the last step is still to come, and takes that period."""
+    controller = servo(
+        ConstantEstimator(), Wishing(), {"response": "given", "command_delay": 0.05, "lag": 0.0, "feedforward": True}
+    )
+    reference = np.array([[0.0, 0.0], [0.3, 0.2]])
+    controller.reset(seen(np.zeros(3), [0.1, 0.0]), 0)
+    for k in range(2):
+        controller.step(seen(np.zeros(3), [0.1, 0.0], k=k), reference)
+    (J, first, rows), _, (_, look, _), (sent, _) = controller.state.law
+    np.testing.assert_array_equal(J, J0)
+    np.testing.assert_array_equal(first.feature, [0.1, 0.0])
+    np.testing.assert_allclose(look.joint_position, sent * 0.05)
+    np.testing.assert_allclose(look.feature, [0.1, 0.0] + J0 @ sent * 0.05)
+    np.testing.assert_allclose(rows, [[0.3, 0.2], [0.6, 0.4]])  # one period later, and beyond the preview
+    assert controller.diagnostics()["lead"] == pytest.approx(0.05)
+
+
+def test_the_last_stages_change_what_is_sent_and_the_law_notes_it():
+    aids = {"feedforward": True, "limit": "clip"}
+    controller, reference = servo(ConstantEstimator(), Wishing(), aids), np.array([[0.0, 0.0], [0.02, 0.01]])
+    controller.reset(seen(np.zeros(3), np.zeros(2)), 0)
+    u = controller.step(seen(np.zeros(3), np.zeros(2)), reference).joint_velocity
+    wanted = np.array([0.4, -0.2, 0.1]) + J0.T @ np.linalg.solve(J0 @ J0.T + 0.02**2 * np.eye(2), reference[1]) / 0.05
+    assert np.abs(wanted).max() > 1.0
+    np.testing.assert_allclose(u, np.clip(wanted, -1.0, 1.0))
+    noted, limited = controller.state.law[-1]
+    np.testing.assert_array_equal(noted, u)
+    assert limited
+    assert controller.diagnostics()["saturated"]
+
+
+def test_a_law_of_the_model_works_in_the_frame_of_the_model():
+    """Turning the camera turns what such a law gets not at all, once the camera is known."""
+
+    class Trained(Wishing):
+        in_model_frame = True
+
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    for law, frame in ((Trained(), np.eye(2)), (Wishing(), turn)):
+        controller, rng, q = servo(ConstantEstimator(), law, {"model": "map"}), np.random.default_rng(0), 0.0
+        for k in range(40):
+            q = q + 0.05 * rng.normal(size=3)
+            y = turn @ J0 @ q
+            look = seen(q, y, k=k)
+            if k == 0:
+                controller.reset(look, 0)
+            controller.step(look, np.tile(turn @ [0.3, 0.1], (2, 1)))
+        J, look, reference = controller.state.law[-2]
+        np.testing.assert_allclose(J, frame @ J0, atol=5e-3)
+        np.testing.assert_allclose(look.feature, frame @ J0 @ q, atol=5e-3)
+        np.testing.assert_allclose(reference, np.tile(frame @ [0.3, 0.1], (2, 1)), atol=5e-3)
+        np.testing.assert_allclose(controller.estimated_jacobian(), turn @ J0, atol=5e-3)
+
+
+def test_the_stages_start_where_the_probing_ends():
     probing = {"source": "probe", "probe_step": 0.01, "settle_periods": 1, "average_periods": 1}
+    knowledge = dataclasses.replace(KNOWLEDGE, preview=1)
     controller, q, reference = (
-        servo(ConstantEstimator(), predictor=Predictor(), **probing),
+        servo(ConstantEstimator(), None, EQUIPPED, knowledge, **probing),
         np.zeros(3),
         np.zeros((2, 2)),
     )
@@ -149,16 +203,34 @@ def test_the_predictor_starts_where_the_probing_ends():
         u = controller.step(seen(q, J0 @ q, k=k), reference).joint_velocity
         if not controller.diagnostics()["probing"]:
             break
+        assert controller.diagnostics()["lead"] == 0.0
         q = q + 0.05 * u
     assert k > 6
     assert q.all()
-    np.testing.assert_array_equal(controller.state.predictor.past, np.tile(q, (16, 1)))
+    past = controller.state.estimation.learned.pair.past[..., :3]
+    np.testing.assert_array_equal(past, np.tile(q, (len(past), 1)))
+    np.testing.assert_allclose(controller.estimated_jacobian(), J0, atol=1e-9)
 
 
-def test_a_second_predict_stage_is_refused():
-    law = MpcLaw(MpcConfig(use_preview=False), KNOWLEDGE)
-    with pytest.raises(ValueError, match="predictor must be None for MpcLaw, which predicts itself"):
-        servo(ConstantEstimator(), law, Predictor())
+PREDICTIVE = MpcLaw(MpcConfig(use_preview=False, delay=0.1), KNOWLEDGE)
+PREVIEWING = MpcLaw(MpcConfig(horizon_time=0.05, moves=1), KNOWLEDGE)
+
+
+@pytest.mark.parametrize(
+    ("law", "aids", "message"),
+    [
+        (PREDICTIVE, {"delay": "identified"}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
+        (PREDICTIVE, {"response": "given"}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
+        (PREDICTIVE, {"filter": True}, "aids: MpcLaw predicts by itself; leave delay, response and filter off"),
+        (PREVIEWING, {"feedforward": True}, "aids: MpcLaw brings its own preview; leave that aid off"),
+        (PREVIEWING, {"limit": "clip"}, "aids: MpcLaw brings its own limit; leave that aid off"),
+        (None, {"feedforward": True}, "preview must be at least 1 for feedforward, got 0"),
+    ],
+)
+def test_an_aid_that_the_law_brings_or_that_lacks_a_preview_is_refused_in_one_line(law, aids, message):
+    knowledge = KNOWLEDGE if law else dataclasses.replace(KNOWLEDGE, preview=0)
+    with pytest.raises(ValueError, match=f"^{message}$"):
+        servo(ConstantEstimator(), law, aids, knowledge)
 
 
 def test_the_law_notes_what_is_sent():

@@ -1,0 +1,140 @@
+"""Tests of the last stages: feedforward, posture, and a command within its limits."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kit.toy import KNOWLEDGE, LIMIT, PERIOD, A, M, N
+from servobench.controllers.aids import AidsConfig
+from servobench.controllers.stages.finish import Finish
+from servobench.controllers.stages.limit import redistribute, scale_to_limit
+
+NOTHING = np.zeros(())
+
+
+def finish(wanted, q=None, forward=NOTHING, J=A, knowledge=KNOWLEDGE, **aids):
+    """Return what leaves the chain, and whether it was limited."""
+    made = Finish(AidsConfig(**aids), knowledge, "ALaw", ())
+    return made.finish(np.asarray(wanted), J, np.zeros(np.shape(wanted)) if q is None else q, forward)
+
+
+def test_feedforward_and_posture_by_hand():
+    """dq = dq_law + J⁺ r + κ (I − J⁺J)(q_c − q), with the middle of the working region as q_c."""
+    region = np.full(N, -0.5), np.full(N, 1.5)
+    knowledge = dataclasses.replace(KNOWLEDGE, region=region)
+    q, r, wanted = np.full(N, 0.1), np.array([0.001, 0.0, 0.002]), np.linspace(-0.1, 0.1, N)
+    pinv = np.linalg.pinv(A)
+    posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (0.5 - q)
+    aids = {"feedforward": True, "posture": True, "damping": 1e-9}
+    u, limited = finish(wanted, q, r, knowledge=knowledge, **aids)
+    np.testing.assert_allclose(u, wanted + (pinv @ r + posture) / PERIOD, atol=1e-8)
+    assert not limited
+
+
+def test_feedforward_follows_a_moving_reference_without_error_on_an_affine_plant():
+    y, q, aids = np.zeros(M), np.zeros(N), {"feedforward": True, "posture": True, "damping": 1e-9}
+    for k in range(40):
+        reference = 0.1 * np.array([[np.sin(0.1 * t), np.cos(0.1 * t) - 1.0, 0.1 * t] for t in (k, k + 1)])
+        np.testing.assert_allclose(y, reference[0], atol=1e-7)
+        u, limited = finish(np.zeros(N), q, reference[1] - reference[0], **aids)
+        assert not limited
+        q = q + u * PERIOD
+        y = A @ q
+
+
+def test_the_posture_does_not_move_the_feature_and_comes_nearer_to_the_middle():
+    q = np.linspace(-1.0, 1.0, N)
+    y, null = A @ q, np.eye(N) - np.linalg.pinv(A) @ A
+    for _ in range(200):
+        u, _ = finish(np.zeros(N), q, posture=True, damping=1e-9)
+        q = q + u * PERIOD
+        np.testing.assert_allclose(A @ q, y, atol=1e-7)
+    np.testing.assert_allclose(null @ q, np.exp(-0.2 * 200 * PERIOD) * null @ np.linspace(-1.0, 1.0, N), atol=1e-6)
+
+
+@pytest.mark.parametrize("period", [0.1, 0.008])
+def test_the_posture_does_not_depend_on_the_control_rate(period):
+    ends = []
+    for dt in (PERIOD, period):
+        knowledge, q = dataclasses.replace(KNOWLEDGE, spec=dataclasses.replace(KNOWLEDGE.spec, period=dt)), np.ones(N)
+        for _ in range(round(2.0 / dt)):
+            q = q + finish(np.zeros(N), q, posture=True, knowledge=knowledge, damping=1e-9)[0] * dt
+        ends.append(q)
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("limit", ["scale", "clip", "redistribute"])
+def test_a_command_within_the_limits_is_sent_as_it_is(limit):
+    wanted = np.linspace(-1.0, 1.0, N) * LIMIT
+    u, limited = finish(wanted, limit=limit)
+    np.testing.assert_allclose(u, wanted, rtol=1e-15)
+    assert not limited
+
+
+def test_a_command_beyond_the_limits_is_scaled_cut_or_taken_over_by_joints_with_room():
+    wanted = np.array([3.0, -0.5, 0.2, -1.5, 0.6]) * LIMIT
+    scaled, cut, shared = (finish(wanted, limit=limit) for limit in ("scale", "clip", "redistribute"))
+    np.testing.assert_allclose(scaled[0], wanted / 3.0)
+    np.testing.assert_array_equal(cut[0], np.clip(wanted, -LIMIT, LIMIT))
+    way = A @ wanted
+    np.testing.assert_array_less(np.abs(shared[0]), LIMIT * (1.0 + 1e-12))
+    assert (A @ shared[0]) @ way > 1.2 * (A @ scaled[0]) @ way
+    assert scaled[1] and cut[1] and shared[1]  # noqa: PT018 - all three are limited
+
+
+def test_a_joint_at_the_edge_of_the_region_does_not_take_over():
+    J, wanted = np.array([[1.0, 1.0, 0.0, 0.0, 0.0]] * 1), np.array([1.5, 0.0, 0.0, 0.0, 0.0])
+    at_edge = np.array([0.0, 6.0, 0.0, 0.0, 0.0])  # the reach of the toy's joints
+    free, _ = finish(wanted, J=J, limit="redistribute", damping=1e-6)
+    held, _ = finish(wanted, at_edge, J=J, limit="redistribute", damping=1e-6)
+    np.testing.assert_allclose(free[:2], [1.0, 0.5], atol=1e-4)
+    np.testing.assert_allclose(held[:2], [1.0, 0.0], atol=1e-4)
+
+
+def test_every_lane_is_finished_as_if_it_were_alone():
+    rng = np.random.default_rng(0)
+    wanted, q, J = 1.5 * rng.normal(size=(3, N)), rng.normal(size=(3, N)), A + 0.1 * rng.normal(size=(3, M, N))
+    forward = 0.01 * rng.normal(size=(3, M))
+    for limit in ("scale", "clip", "redistribute"):
+        aids = {"feedforward": True, "posture": True, "limit": limit}
+        together, limited = finish(wanted, q, forward, J, **aids)
+        for lane in range(3):
+            u, one = finish(wanted[lane], q[lane], forward[lane], J[lane], **aids)
+            np.testing.assert_array_equal(u, together[lane])
+            assert one == limited[lane]
+
+
+def test_the_second_joint_takes_over_where_the_first_is_at_its_limit():
+    """Both move the feature by 1 m/rad; (0.3, 0.1) wants 0.4 m, scaled to (0.1, 0.033); the second goes on to 0.1."""
+    dq = redistribute(np.array([0.3, 0.1]), np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9)
+    np.testing.assert_allclose(dq, [0.1, 0.1])
+    small = np.array([0.05, 0.1])
+    np.testing.assert_array_equal(redistribute(small, np.array([[1.0, 1.0]]), np.array([0.1, 0.1]), 1e-9), small)
+
+
+@settings(max_examples=60)
+@given(n=st.integers(1, 7), m=st.integers(1, 4), seed=st.integers(0, 10**6))
+def test_redistribution_keeps_limits_and_direction_and_goes_no_less_far(n, m, seed):
+    rng = np.random.default_rng(seed)
+    J, limit = rng.normal(size=(m, n)), rng.uniform(0.05, 0.2, n)
+    wanted = rng.normal(size=n)
+    dq, scaled = redistribute(wanted, J, limit, 1e-6), scale_to_limit(wanted, limit)
+    assert (np.abs(dq) <= limit * (1 + 1e-12)).all()
+    way = J @ wanted
+    if np.linalg.cond(J) < 100.0:
+        share = float((J @ dq) @ way / (way @ way))
+        np.testing.assert_allclose(J @ dq, share * way, atol=1e-5)
+        assert float((J @ scaled) @ way / (way @ way)) - 1e-6 <= share <= 1.0 + 1e-9
+
+
+def test_redistribution_goes_further_than_scaling_on_most_arms():
+    rng, further = np.random.default_rng(1), 0
+    for _ in range(50):
+        J, limit, wanted = rng.normal(size=(3, 6)), np.full(6, 0.05), rng.normal(size=6)
+        way = J @ wanted
+        gained = (J @ (redistribute(wanted, J, limit, 0.02) - scale_to_limit(wanted, limit))) @ way / (way @ way)
+        further += gained > 0.005
+    assert further > 40
