@@ -107,8 +107,8 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
             del shares["period"]
         yield f"{task} on {plant}: {word}, %", shares
         if good.sum() < place["runs"].sum():
-            kinds = place.pivot_table(values="runs", index="outcome", columns="controller", aggfunc="sum", sort=False)
-            table = (100.0 * kinds / kinds.sum()).map(_percent)
+            kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
+            table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(_percent)
             yield f"{task} on {plant}: what came of the runs, %", table.rename_axis(columns=None).reset_index()
 
 
