@@ -91,7 +91,7 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
         path = cached_fmu(config.fmi_version)
     except (CompilerMissing, CompilationFailed, OSError) as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
-    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing)
+    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, config.lag)
 
 
 ENTRY = PlantEntry(

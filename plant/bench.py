@@ -83,7 +83,7 @@ class Bench(Plant):
                 period.
         """
         self.world = world
-        self._sensing = sensing
+        self._sensing, self._command_delay = sensing, command_delay
         self._noise_scale = sensing.noise_factor * sensing.feature_noise
         spec = world.spec
         self._period = spec.period if period is None else period
@@ -222,7 +222,12 @@ class Bench(Plant):
 
     def true_model(self) -> TrueModel:
         """See `Plant.true_model`."""
-        return self.world.true_model()
+        return self.with_delays(self.world.true_model())
+
+    def with_delays(self, model: TrueModel) -> TrueModel:
+        """See `Plant.with_delays`."""
+        latency, delay = self._sensing.latency, self._command_delay
+        return replace(model, latency=latency, command_delay=delay, lag=self.world.lag)
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""

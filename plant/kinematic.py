@@ -95,6 +95,7 @@ class KinematicWorld(World):
         self.lead, self._first = model.lead, KinematicState(model, start, np.zeros(start.shape))
         self._model, self._q, self._v = self._first
         self._truth: Truth | None = None
+        self.lag = config.lag
         A, B = discretise_lag(config.lag, setup.period)
         self._coefficients = float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1])
 

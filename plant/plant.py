@@ -27,15 +27,21 @@ ImageArray: TypeAlias = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class TrueModel:
-    """The kinematics of the true robot; for upper bounds only.
+    """The kinematics of the true robot and how late commands and features are; for upper bounds only.
 
     Attributes:
         jacobian: (..., n) rad -> (..., m, n), unit of the feature per rad.
         symbolic: from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1).
+        latency: between exposure and delivery of a frame, s.
+        command_delay: between a command and its first effect, s.
+        lag: time constant of the joints' velocity loops, s; None where it is unknown.
     """
 
     jacobian: Callable[[FloatArray], FloatArray]
     symbolic: Callable[[Any], Any]
+    latency: float = 0.0
+    command_delay: float = 0.0
+    lag: float | None = None
 
 
 class Abilities(ABC):
@@ -73,6 +79,10 @@ class Abilities(ABC):
             ValueError: the plant does not know them; says why.
         """
         raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
+
+    def with_delays(self, model: TrueModel) -> TrueModel:
+        """Return the kinematics of the plant's robot with the plant's own delays, as far as it knows them."""
+        return model
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """Return the public nominal Jacobian of a robot that the plant brings, (..., n) -> (..., m, n); or None."""

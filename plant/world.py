@@ -20,6 +20,9 @@ class World(Abilities):
     lead: tuple[int, ...] = ()
     """Number of runs side by side, as the shape of the leading axis; () for a single run."""
 
+    lag: float | None = None
+    """[s] time constant of the joints' velocity loops; None where it is unknown."""
+
     def fail(self, lane: int, fault: RunFault) -> None:
         """Take the fault of a lane, or raise that of a single run; of a lane the first one counts."""
         if not self.lead:

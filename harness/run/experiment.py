@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from servobench.controllers.controller import Controller, RobotKnowledge
+from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
@@ -145,7 +145,9 @@ def assemble(
     try:
         source = network_source(nominal_ur5().jacobian, plant.spec, keep, progress)
         knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
-        controller = _build_controller(request.controller, resolved.controller, knowledge, lambda: _equations(true))
+        controller = _build_controller(
+            request.controller, resolved.controller, knowledge, lambda: plant.with_delays(_equations(true))
+        )
     except BaseException:
         plant.close()
         raise
@@ -260,7 +262,11 @@ def _build_controller(
             true = true_model()
             nominal = knowledge.nominal_jacobian or true.jacobian
             knowledge = replace(
-                knowledge, nominal_jacobian=nominal, true_jacobian=true.jacobian, true_symbolic=true.symbolic
+                knowledge,
+                nominal_jacobian=nominal,
+                true_jacobian=true.jacobian,
+                true_symbolic=true.symbolic,
+                true_delays=Delays(true.latency, true.command_delay, true.lag or 0.0),
             )
         return entry.build(config, knowledge)
     except ValueError as error:

@@ -147,6 +147,7 @@ class BulletWorld(World):
 
         model, start = setup.robot()
         self._config, self._model, arm = config, model, model.arm
+        self.lag = config.lag
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
         self._start = as_vector("start", start, self.spec.n)
         self._steps = whole_steps(setup.period, PHYSICS_STEP)

@@ -28,15 +28,24 @@ class FmuConfig:
     RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
-def build_fmu(mapping: FmuMapping, setup: PlantSetup, command_delay: float, sensing: SensingConfig) -> Bench:
+def build_fmu(
+    mapping: FmuMapping, setup: PlantSetup, command_delay: float, sensing: SensingConfig, lag: float | None = None
+) -> Bench:
     """Return the plant of an FMU, for a registry.
+
+    Args:
+        mapping: the roles of its variables.
+        setup: start and control period.
+        command_delay: between a command and its first effect, s.
+        sensing: noise, latency, frame period and lost frames.
+        lag: time constant of the FMU's joints, s; None where it is unknown.
 
     Raises:
         ValueError: an FMU or mapping that cannot be used; also if the FMU itself says so.
     """
     try:
         start = mapping.start if setup.start is None else setup.start
-        return build_bench(lambda own: FmuWorld(mapping, start, own.period), setup, command_delay, sensing)
+        return build_bench(lambda own: FmuWorld(mapping, start, own.period, lag), setup, command_delay, sensing)
     except FmuError as error:
         raise ValueError(str(error)) from error
 

@@ -50,7 +50,7 @@ class FmuState:
 class FmuWorld(World):
     """y, q ← fmi…GetReal after fmi…DoStep under the held command, with an instance for each run side by side."""
 
-    def __init__(self, mapping: FmuMapping, start: FloatArray | None, period: float) -> None:
+    def __init__(self, mapping: FmuMapping, start: FloatArray | None, period: float, lag: float | None = None) -> None:
         """Extract and load the FMU and look all names up.
 
         Args:
@@ -58,6 +58,7 @@ class FmuWorld(World):
             start: (..., n), rad, joint positions at time 0, for an FMU with a home or without joints; None: the FMU's
                 own home, or 0. Its leading axis says how many runs there are.
             period: of `advance`, s.
+            lag: time constant of the FMU's joints, s; None where it is unknown.
 
         Raises:
             ValueError: an FMU that cannot be used, or a name or size that does not fit.
@@ -65,7 +66,7 @@ class FmuWorld(World):
         """
         self._substeps = whole_steps(period, mapping.period or period)
         self._own_step, self._period = mapping.period or period, period
-        self._mapping = mapping
+        self._mapping, self.lag = mapping, lag
         root = extract_fmu(mapping.file)
         self.description = read_description(mapping.file, root)
         self.spec = mapping_spec(mapping, self.description, period)
