@@ -25,9 +25,9 @@ def fresh(limit=100.0, **settings):
 
 
 def test_the_first_step_equals_the_one_computed_by_hand():
-    law = PidLaw(PidConfig(proportional_gain=2.0, integral_gain=4.0, damping=0.0), knowledge(n=1, m=1))
+    law = PidLaw(PidConfig(proportional_gain=-20.0 * np.log(0.9), integral_gain=4.0, damping=0.0), knowledge(n=1, m=1))
     first = seen([0.0], [0.0])
-    # e = 0.1, I = 0.05 · 0.1 = 0.005, v = 2 · 0.1 + 4 · 0.005 = 0.22, u = 0.22 / 0.5
+    # γ = 0.1, e = 0.1, I = 0.05 · 0.1 = 0.005, v = 0.1 / 0.05 · 0.1 + 4 · 0.005 = 0.22, u = 0.22 / 0.5
     _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.full((2, 1), 0.1))
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
@@ -37,15 +37,15 @@ def test_the_derivative_is_the_filtered_difference_of_the_error():
     law.command(Estimate(J), look([0.0, 0.0]), np.zeros((2, 2)))
     u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
     # d = (0.15 · 0 + 0.1) / (0.15 + 0.05) = 0.5
-    np.testing.assert_allclose(J @ u, [0.1 + 0.5, 0.0], atol=1e-14)
+    np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05 + 0.5, 0.0], atol=1e-14)
 
 
-def test_with_the_exact_jacobian_an_affine_plant_loses_kp_dt_of_its_error_each_step():
+def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():
     law, y, ref = fresh(proportional_gain=3.0), np.array([0.2, -0.1]), np.array([[0.5, 0.3]] * 2)
     for _ in range(50):
         e = ref[0] - y
         y = y + J @ law.command(Estimate(J), look(y), ref) * 0.05
-        np.testing.assert_allclose(ref[0] - y, (1 - 3.0 * 0.05) * e, atol=1e-15)
+        np.testing.assert_allclose(ref[0] - y, np.exp(-3.0 * 0.05) * e, atol=1e-15)
 
 
 def test_the_integral_waits_while_the_command_is_limited():

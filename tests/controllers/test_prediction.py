@@ -21,7 +21,7 @@ NO_DELAYS = Delays(0.0, 0.0, 0.0)
 def answered(response, steps=40, length=4, joints=3):
     """A JointResponse that has seen random commands and their answers; and the commands, the newest last."""
     rng = np.random.default_rng(3)
-    made, commands = JointResponse.immediate(length, np.zeros(joints)), [np.zeros(joints)] * len(response)
+    made, commands = JointResponse.immediate(length, np.zeros(joints), PERIOD), [np.zeros(joints)] * len(response)
     for _ in range(steps):
         made = made.learn(sum(g * commands[-1 - i] for i, g in enumerate(response)))
         commands.append(0.05 * rng.uniform(-1.0, 1.0, joints))
@@ -44,13 +44,13 @@ def test_flight_and_lead_are_what_is_still_to_come():
 
 
 def test_at_first_an_arm_is_expected_to_follow_at_once():
-    made = JointResponse.immediate(4, np.zeros(2)).command(np.array([0.05, -0.05]))
+    made = JointResponse.immediate(4, np.zeros(2), PERIOD).command(np.array([0.05, -0.05]))
     np.testing.assert_array_equal(made.flight(), 0.0)
     assert made.lead == 0.0
 
 
 def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_foreseen():
-    rng, made, rows, answers = np.random.default_rng(0), JointResponse.immediate(3, np.zeros(1)), [], []
+    rng, made, rows, answers = np.random.default_rng(0), JointResponse.immediate(3, np.zeros(1), PERIOD), [], []
     past = np.zeros(3)
     for _ in range(12):
         step = float(np.array([0.2, 0.5, 0.3]) @ past) + 0.003 * rng.choice([-1.0, 1.0])
@@ -62,10 +62,32 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
         past = np.array([command, *past[:-1]])
         made = made.command(np.array([command]))
     U, prior = np.array(rows), np.array([1.0, 0.0, 0.0])
-    rho = 1e-5 * np.diag([1.0, 1.5, 2.25])
+    rho = 2e-4 * PERIOD * np.diag(np.exp(8.1 * PERIOD * np.arange(3)))
     expected = np.linalg.solve(U.T @ U + rho, U.T @ np.array(answers) + rho @ prior)
     assert (expected > 0.0).all()
     np.testing.assert_allclose(made.response, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("period", "span"), [(0.05, 1), (0.02, 1), (0.008, 2), (0.004, 5)])
+def test_the_flight_that_is_found_is_that_of_the_delayed_lag_at_every_rate(period, span):
+    """The arm answers by the closed form of a delay of 0.05 s and a lag of 0.05 s."""
+    rng, count = np.random.default_rng(1), round(0.6 / (span * period))
+    true = JointResponse.given(0.05, 0.05, period, round(1.0 / period), np.zeros(3))
+    made, q, past, errors = JointResponse.immediate(count, np.zeros(3), period, span), np.zeros(3), [], []
+    goal = np.zeros(3)
+    for k in range(round(6.0 / period)):
+        past.append(goal - true.flight())  # what is done of the commands up to now
+        if k >= span:
+            made = made.learn(past[-1] - past[-1 - span])
+        if k * period > 3.0:
+            errors.append([made.flight() - true.flight(), true.flight()])
+        if k % round(0.2 / period) == 0:
+            speed = rng.uniform(-1.0, 1.0, 3)
+        q = q + 0.2 * (speed - q)
+        goal, made, true = goal + q * period, made.command(q * period), true.command(q * period)
+    wrong, size = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+    assert wrong < 0.1 * size
+    assert made.lead * period == pytest.approx(0.1, abs=0.012)
 
 
 def filter_at(feature, noise=0.001):
