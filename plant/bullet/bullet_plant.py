@@ -21,7 +21,7 @@ import numpy as np
 from annotated_types import Len
 
 from servobench.plant.bench import Bench, build_bench
-from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.bullet.detection import ByteArray, Patch, add_colour_noise, draw_detection, find_ball
 from servobench.plant.bullet.drives import PHYSICS_STEP, DriveConfig, Drives, DriveState
 from servobench.plant.bullet.urdf import Box
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
@@ -83,8 +83,12 @@ class BulletConfig:
     """[m] between the two imagers; RealSense D435."""
     native_width: Count = 848
     """[px] width at which the depth sensor matches; optimum of the RealSense D435."""
+    depth_patch: NonNegative = 9.0
+    """[px] side of the matched patch at `native_width`, over which depths share their error; 0 means white noise."""
     depth_quantisation: NonNegative = 0.001
     """[m] depth unit of the sensor; 0 means none."""
+    colour_noise: NonNegative = 2.5
+    """[of 255] deviation of each channel of each pixel: shot noise of a pixel with a full well of 10,000 electrons."""
     scenery: bool = True
     """Draw the table and the floor; without them a frame costs a fifth."""
     view: bool = False
@@ -109,6 +113,7 @@ class BulletConfig:
             self.depth_subpixel,
             self.depth_baseline,
             self.native_width,
+            self.depth_patch,
             self.depth_quantisation,
             self.sensing.noise_factor,
         )
@@ -122,13 +127,13 @@ class BulletState:
         joints: angles, speeds and loops of the joints.
         periods: number of periods since the reset.
         X_BC: (4, 4), pose of the camera.
-        noise: generator of the depth noise.
+        noise: generators of the depth and the colour noise.
     """
 
     joints: DriveState
     periods: int
     X_BC: FloatArray
-    noise: np.random.Generator
+    noise: tuple[np.random.Generator, np.random.Generator]
 
 
 class BulletWorld(World):
@@ -169,12 +174,12 @@ class BulletWorld(World):
         self._drives = Drives(load, config.lag, assumed, (np.minimum(*stops), np.maximum(*stops)))
 
     def reset(self, seed: int) -> FloatArray:
-        """Go back to the start at rest; the depth noise gets a random stream of its own. See `World.reset`.
+        """Go back to the start at rest; depth and colour noise get random streams of their own. See `World.reset`.
 
         Raises:
             Collision: the arm overlaps with itself or the room at the start.
         """
-        self._noise = named_generator(seed, "depth_noise")
+        self._noise, self._colour_noise = named_generator(seed, "depth_noise"), named_generator(seed, "colour_noise")
         self.move_camera(self._X_BC)
         self._periods = 0
         angle = self._model.arm.joint_angle(self._start)
@@ -222,7 +227,11 @@ class BulletWorld(World):
 
     def see(self) -> FloatArray | None:
         """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
-        found = find_ball(*self._render(), self._camera, ur5.BALL_RADIUS, self._sense)
+        rgba, buffer = self._render()
+        deviation = self._config.colour_noise * self._config.sensing.noise_factor
+        if deviation > 0.0:
+            rgba = add_colour_noise(rgba, deviation, self._colour_noise)
+        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS, self._sense)
         if found is None:
             return None
         found.centre.setflags(write=False)
@@ -240,14 +249,16 @@ class BulletWorld(World):
 
     def save(self) -> BulletState:
         """See `Plant.save`; measured: joints, detections and images continue with the same bits."""
-        return BulletState(self._joints, self._periods, self._model.X_BC, copy.deepcopy(self._noise))
+        return BulletState(
+            self._joints, self._periods, self._model.X_BC, copy.deepcopy((self._noise, self._colour_noise))
+        )
 
     def restore(self, state: BulletState) -> None:
         """See `Plant.restore`."""
         self._joints, self._periods = state.joints, state.periods
         self._scene.place(state.joints.angle)
         self.move_camera(state.X_BC)
-        self._noise = copy.deepcopy(state.noise)
+        self._noise, self._colour_noise = copy.deepcopy(state.noise)
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -283,8 +294,8 @@ class BulletWorld(World):
     def _render(self) -> tuple[ByteArray, FloatArray]:
         return self._scene.render(self._camera, self._model.X_BC)
 
-    def _sense(self, depth: FloatArray) -> FloatArray:
-        return self._depth_noise.apply(depth, self._camera, self._noise)
+    def _sense(self, depth: FloatArray, patch: Patch) -> FloatArray:
+        return self._depth_noise.apply(depth, (patch.rows, patch.columns), self._camera, self._noise)
 
     def _keep_pace(self) -> None:
         """Wait until the wall clock has come as far as the run; only with a window."""

@@ -21,10 +21,10 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.camera import IntArray, PinholeCamera
 
 ByteArray = npt.NDArray[np.uint8]
-IntArray = npt.NDArray[np.intp]
+COLOUR_MARGIN = 4  # [px] around all red, in which colour noise can matter
 
 # OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
 # both ends 0 and 180, and one range covers purplish and orange reds.
@@ -100,6 +100,32 @@ def find_patch(rgb: ByteArray) -> Patch | None:
     return None if cut or len(rows) < MIN_PIXELS else Patch(rows, columns)
 
 
+def add_colour_noise(rgb: ByteArray, deviation: float, generator: np.random.Generator) -> ByteArray:
+    """Return an image with white noise on each channel around all that is red; nothing is drawn elsewhere.
+
+    Noise turns pixels of other things red by chance, but never as many together as the ball's, so only the box around
+    what is red without noise matters.
+
+    Args:
+        rgb: (h, w, 3 or 4).
+        deviation: standard deviation of the noise, of 255.
+        generator: of the noise.
+
+    Returns:
+        A new image, or `rgb` itself where nothing is red.
+    """
+    x, y, width, height = cv2.boundingRect(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), RED_LOWER, RED_UPPER))
+    if width * height < MIN_PIXELS:
+        return rgb
+    rows = slice(max(0, y - COLOUR_MARGIN), y + height + COLOUR_MARGIN)
+    columns = slice(max(0, x - COLOUR_MARGIN), x + width + COLOUR_MARGIN)
+    noisy = rgb.copy()
+    box = noisy[rows, columns, :3]
+    values = box + deviation * generator.standard_normal(box.shape)
+    noisy[rows, columns, :3] = np.clip(np.round(values), 0, 255).astype(np.uint8)
+    return noisy
+
+
 def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: float) -> Detection | None:
     """Return the ball that makes a red patch.
 
@@ -130,7 +156,7 @@ def find_ball(
     buffer: FloatArray,
     camera: PinholeCamera,
     radius: float,
-    sense: Callable[[FloatArray], FloatArray] | None = None,
+    sense: Callable[[FloatArray, Patch], FloatArray] | None = None,
 ) -> Detection | None:
     """Return the ball in a rendered image, or None where none is seen.
 
@@ -139,13 +165,13 @@ def find_ball(
         buffer: depth buffer, (h, w).
         camera: its intrinsics.
         radius: m, of the ball.
-        sense: true to measured depths of the red pixels, (k,) m each; None for a perfect sensor.
+        sense: true to measured depths of a patch, (k,) m each; None for a perfect sensor.
     """
     patch = find_patch(rgb)
     if patch is None:
         return None
     depth = camera.metric_depth(buffer[patch.rows, patch.columns])
-    return locate_ball(patch, depth if sense is None else sense(depth), camera, radius)
+    return locate_ball(patch, depth if sense is None else sense(depth, patch), camera, radius)
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:

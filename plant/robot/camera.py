@@ -6,21 +6,28 @@ PyBullet's TinyRenderer samples the pixel of column u and row v at (u, v + 1), n
 offset the error is 2.5 mm at 1.3 m.
 
 Noise models: stereo, RMS(z) = z² · subpixel / (f_native · baseline) (Intel, "Tuning D435 and D415
-for best performance"); structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012).
+for best performance"); structured light, σ(z) = 0.0012 + 0.0019 (z − 0.4)² m (Nguyen, Izadi and Lovell 2012). A match
+compares patches of pixels, so that neighbouring depths share their error: the noise is white noise smoothed by a
+Gaussian of the patch's second moment and scaled back to unit variance.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from annotated_types import Gt, Lt
+from scipy.ndimage import convolve1d
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.settings import Count, NonNegative, Positive, settings
 
 PIXEL_CENTRE = (0.0, 1.0)  # [px] sampling point of TinyRenderer, from the pixel's upper left corner
+IntArray: TypeAlias = npt.NDArray[np.intp]
+Pixels: TypeAlias = tuple[IntArray, IntArray]
+"""Rows and columns, (k,) and (k,)."""
 FieldOfView: TypeAlias = Annotated[float, Gt(0.0), Lt(180.0)]
 """Above 0° and below 180°."""
 
@@ -102,7 +109,7 @@ def view_matrix(X_BC: FloatArray) -> FloatArray:
 
 @settings
 class DepthNoise:
-    """Noise of a depth sensor: z_measured = quantise(z + factor σ(z) N(0, 1))."""
+    """Noise of a depth sensor: z_measured = quantise(z + factor σ(z) w), w of unit variance and alike over a patch."""
 
     depth_noise: Literal["none", "stereo", "structured_light"] = "stereo"
     """Model of σ(z)."""
@@ -112,6 +119,8 @@ class DepthNoise:
     """[m] between the two imagers; RealSense D435."""
     native_width: Count = 848
     """[px] width at which the sensor matches; optimum of the RealSense D435."""
+    depth_patch: NonNegative = 9.0
+    """[px] side of the matched patch at the native width; 9, as block matching takes it; 0 means white noise."""
     depth_quantisation: NonNegative = 0.001
     """[m] depth unit of the sensor; 0 means none."""
     factor: NonNegative = 1.0
@@ -127,11 +136,46 @@ class DepthNoise:
             return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2)
         return np.zeros_like(z)
 
-    def apply(self, depth: npt.ArrayLike, camera: PinholeCamera, generator: np.random.Generator) -> FloatArray:
-        """Return measured depths, m, for true depths of any shape, m; without noise nothing is drawn."""
-        z = np.asarray(depth, dtype=np.float64)
+    def apply(
+        self,
+        depth: FloatArray,
+        pixels: tuple[IntArray, IntArray],
+        camera: PinholeCamera,
+        generator: np.random.Generator,
+    ) -> FloatArray:
+        """Return measured depths of some pixels; without noise nothing is drawn.
+
+        Args:
+            depth: (k,) [m], true.
+            pixels: (k,) and (k,) [px], their rows and columns.
+            camera: its intrinsics.
+            generator: of the noise.
+
+        Returns:
+            (k,) [m].
+        """
+        z = depth
         if self.depth_noise != "none":
-            z = z + self.factor * self.sigma(z, camera) * generator.standard_normal(z.shape)
+            z = z + self.factor * self.sigma(z, camera) * self._unit_noise(pixels, camera, generator)
         if self.depth_quantisation > 0.0:
             z = np.round(z / self.depth_quantisation) * self.depth_quantisation
         return z
+
+    def _unit_noise(self, pixels: Pixels, camera: PinholeCamera, generator: np.random.Generator) -> FloatArray:
+        """Return noise of unit variance at pixels (k,), drawn on the box around them only, (k,)."""
+        rows, columns = (index - index.min() for index in pixels)
+        kernel = patch_kernel(self.depth_patch * camera.width / self.native_width)
+        margin = len(kernel) - 1
+        white = generator.standard_normal((int(rows.max()) + 1 + margin, int(columns.max()) + 1 + margin))
+        smooth = convolve1d(convolve1d(white, kernel, axis=0), kernel, axis=1)
+        return np.asarray(smooth[rows + margin // 2, columns + margin // 2])
+
+
+@cache
+def patch_kernel(side: float) -> FloatArray:
+    """Return Gaussian weights, (odd,), of the second moment of a patch of `side` [px] whose squares sum to 1."""
+    deviation = side / np.sqrt(12.0)
+    reach = int(np.ceil(3.0 * deviation))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(deviation, 1e-9)) ** 2)
+    kernel: FloatArray = weights / np.sqrt(weights @ weights)
+    return kernel

@@ -33,6 +33,7 @@ IDEAL = configure(
     drives=DriveConfig(dynamics=False),
     encoder_resolution=0.0,
     depth_noise="none",
+    colour_noise=0.0,
     depth_quantisation=0.0,
     latency=0.0,
     drop_probability=0.0,
@@ -83,7 +84,8 @@ def errors_over_poses(noise, count) -> tuple[np.ndarray, int]:
         rgba, buffer = scene.render(camera, MODEL.X_BC)
         patch, tried = find_patch(rgba), tried + 1
         if patch is not None:
-            depth = noise.apply(camera.metric_depth(buffer[patch.rows, patch.columns]), camera, rng)
+            true = camera.metric_depth(buffer[patch.rows, patch.columns])
+            depth = noise.apply(true, (patch.rows, patch.columns), camera, rng)
             found = locate_ball(patch, depth, camera, ur5.BALL_RADIUS)
             if found is not None:
                 errors.append(found.centre - MODEL.to_camera(scene.ball_position()))
@@ -103,8 +105,15 @@ def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre():
 @pytest.mark.parametrize("model", ["stereo", "structured_light"])
 def test_with_noise_the_centre_has_no_bias_of_note(model):
     errors, _ = errors_over_poses(DepthNoise(model), 100)
-    assert np.abs(errors.mean(axis=0)).max() < 0.0003
-    assert np.linalg.norm(errors, axis=1).max() < 0.01
+    assert np.abs(errors.mean(axis=0)).max() < 0.0006
+    assert np.linalg.norm(errors, axis=1).max() < 0.015
+
+
+def test_stereo_noise_moves_the_centre_by_more_than_the_noise_of_kinematic():
+    errors, _ = errors_over_poses(DepthNoise("stereo"), 100)
+    assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
+    white, _ = errors_over_poses(DepthNoise("stereo", depth_patch=0.0), 100)
+    assert (white.std(axis=0) < 0.001).all()
 
 
 def test_table_and_floor_cost_time_and_change_no_bit_of_an_observation(open_plant):

@@ -3,7 +3,15 @@ import colorsys
 import numpy as np
 import pytest
 
-from servobench.plant.bullet.detection import Detection, disc_area, draw_detection, find_patch, fit_sphere, locate_ball
+from servobench.plant.bullet.detection import (
+    Detection,
+    add_colour_noise,
+    disc_area,
+    draw_detection,
+    find_patch,
+    fit_sphere,
+    locate_ball,
+)
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
 
 CAMERA = PinholeCamera()
@@ -122,10 +130,13 @@ def test_an_image_without_red_and_a_speck_hold_no_ball():
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 1.25), (0.35, 0.3, 1.3)])
 def test_depth_noise_of_several_millimetres_leaves_the_centre_unbiased(centre):
     rgb, depth = ball_image(centre)
-    patch, noise, rng = find_patch(rgb), DepthNoise("stereo"), np.random.default_rng(2)
+    patch, noise, rng = find_patch(rgb), DepthNoise("stereo", depth_patch=0.0), np.random.default_rng(2)
     true = depth[patch.rows, patch.columns]
     assert noise.sigma(true, CAMERA).mean() > 0.003
-    found = [locate_ball(patch, noise.apply(true, CAMERA, rng), CAMERA, RADIUS) for _ in range(400)]
+    found = [
+        locate_ball(patch, noise.apply(true, (patch.rows, patch.columns), CAMERA, rng), CAMERA, RADIUS)
+        for _ in range(400)
+    ]
     errors = np.array([ball.centre for ball in found if ball is not None]) - centre
     assert len(errors) == 400
     # The bias is far below the scatter, and the scatter is what the fit says of itself.
@@ -149,3 +160,18 @@ def test_drawing_marks_the_outline_on_a_copy():
     assert len(changed) > 20
     assert distance.max() < CAMERA.focal * RADIUS / 1.0 + 5
     np.testing.assert_array_equal(draw_detection(rgb, None, CAMERA, RADIUS), rgb)
+
+
+def test_colour_noise_changes_the_surroundings_of_the_ball_only_and_by_its_deviation():
+    rgb, depth = ball_image((0.0, 0.0, 1.25))
+    noisy = add_colour_noise(rgb, 5.0, np.random.default_rng(0))
+    patch = find_patch(rgb)
+    inside = noisy[patch.rows, patch.columns].astype(float) - rgb[patch.rows, patch.columns]
+    assert 3.0 < inside[(rgb[patch.rows, patch.columns] > 20) & (rgb[patch.rows, patch.columns] < 235)].std() < 7.0
+    far = np.ones(rgb.shape[:2], dtype=bool)
+    far[patch.rows.min() - 5 : patch.rows.max() + 6, patch.columns.min() - 5 : patch.columns.max() + 6] = False
+    np.testing.assert_array_equal(noisy[far], rgb[far])
+    quiet, loud = (detect(image, depth).centre for image in (rgb, noisy))
+    assert np.linalg.norm(quiet - loud) < 0.001
+    blank = np.zeros_like(rgb)
+    assert add_colour_noise(blank, 5.0, np.random.default_rng(0)) is blank
