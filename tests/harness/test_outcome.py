@@ -7,16 +7,18 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run import episode
 from servobench.harness.run.episode import carry_out, carry_out_together
 from servobench.harness.run.log import StepLog, Steps
-from servobench.harness.run.outcome import joint_rests_at_limit
+from servobench.harness.run.outcome import find_outcome, joint_rests_at_limit
+from servobench.harness.run.references import FixedPoint
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
-from servobench.harness.run.tasks import SINGULAR
-from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.harness.run.tasks import SINGULAR, Scenario
+from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), np.full(2, 2.0), np.full(2, -3.0), np.full(2, 3.0), period=0.1)
 STOP, FREE, FAR, NEAR = 3.0, 2.9, 1.0, 0.001
-NARROW = {"kinematic": {"joint_range": 2.35}}
+REACHED, FAR_AWAY = nominal_ur5().feature(HOME), np.array([0.0, -1.5, 1.25])
 
 
 def logged(joints: list[tuple[float, float]], errors: list[float]) -> Steps:
@@ -57,7 +59,6 @@ def run(controller: str, task: str, settings: dict[str, object], seed: int = 3, 
         ("circle", {"circle": {"laps": 1}}, "not_followed"),
         ("circle", {"circle": {"radius": 0.9}}, "target_unreachable"),
         ("unreachable", {}, "target_unreachable"),
-        ("singular_start", {"kinematic": {"joint_range": 3.2}, "singular_start": {"duration": 4.0}}, "joint_at_limit"),
         ("singular_start", {}, "settled"),
         ("exp2", {"kinematic": {"sensing": {"drop_probability": 0.99}}}, "feature_lost"),
     ],
@@ -68,11 +69,25 @@ def test_each_end_has_its_name(task, settings, outcome):
     assert row["status"] == ("feature_lost" if outcome == "feature_lost" else "completed")
 
 
-def test_a_target_behind_a_stop_is_out_of_reach_only_if_no_other_joint_gets_there():
-    start = [0.35, -1.69, -2.34, 0.89, 1.22, 0.0]
-    row = carry_out(run("calibrated", "target", {"target": {"start": start, "target": [0.0, 0.0, 1.5]}, **NARROW})).row
-    assert row["outcome"] == "joint_at_limit"
-    assert row["max_joint_position_rad"] == 2.35
+@pytest.mark.parametrize(
+    ("target", "at_stop", "robot", "outcome"),
+    [
+        (REACHED, True, nominal_ur5(), "joint_at_limit"),
+        (REACHED, False, nominal_ur5(), "not_settled"),
+        (FAR_AWAY, True, nominal_ur5(), "target_unreachable"),
+        (FAR_AWAY, True, None, "joint_at_limit"),
+        (FAR_AWAY, False, None, "not_settled"),
+    ],
+)
+def test_a_target_out_of_reach_counts_before_a_joint_at_its_stop(target, at_stop, robot, outcome):
+    log = StepLog(hand_eye_spec(nominal_ur5(), 0.05, 1.0, 2.35), 40)
+    q = np.array(HOME)
+    q[2] = -2.35 if at_stop else -2.3
+    for k in range(40):
+        truth = Truth(target + 0.1, None)
+        log.add(Observation(0.05 * k, q, truth.feature), target, Command(np.zeros(6)), truth, None, {}, (0, 0))
+    scenario = Scenario(q, FixedPoint(target), 2.0, 1.5, "point_to_point")
+    assert find_outcome(log.steps(), scenario, np.nan, 0.17, robot) == outcome
 
 
 def test_outcomes_of_runs_side_by_side_are_those_of_each_alone_however_few_fit_into_memory(monkeypatch):
