@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import pandas as pd
@@ -45,6 +46,8 @@ def short(estimate: Estimate, digits: int) -> str:
     """Return value and interval; the dash where the value is infinite or unknown."""
     if not estimate.count or not abs(estimate.value) < float("inf"):
         return MISSING
+    if math.isnan(estimate.low):
+        return f"{estimate.value:.{digits}f}"
     return f"{estimate:.{digits}f}".replace("inf", "∞")
 
 
@@ -81,9 +84,17 @@ def worst_errors(runs: pd.DataFrame) -> str:
     return f"{value:.1f}" if value < float("inf") else MISSING
 
 
-def paired(runs: pd.DataFrame, first: str, second: str, *, metric: str = "settling_time_s", never: float) -> Comparison:
-    """Return how the runs of two names in the column `controller` differ, robot by robot."""
-    return compare_pairs(runs, [(first, second)], never=never, metric=metric, keys=("plant", "task", "seed"))[0]
+def overshoot(runs: pd.DataFrame) -> str:
+    """Return the median overshoot with its interval [%]."""
+    values = 100.0 * column_of(runs, "overshoot")
+    return short(median_with_interval(values, missing="left_out"), 1) if values.notna().any() else MISSING
+
+
+def paired(
+    runs: pd.DataFrame, pairs: Sequence[tuple[str, str]], *, metric: str = "settling_time_s", never: float
+) -> list[Comparison]:
+    """Return how the runs of two names in the column `controller` differ, robot by robot, for each pair of names."""
+    return compare_pairs(runs, pairs, never=never, metric=metric, keys=("plant", "task", "seed"))
 
 
 def difference(comparison: Comparison, digits: int = 2, factor: float = 1.0) -> str:

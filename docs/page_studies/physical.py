@@ -1,0 +1,196 @@
+"""Control rates, half hours, ends without arrival, and the dynamics of the rendered arm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from page_studies.held_out import LOST, RENDERED
+from page_studies.methods import (
+    BOTH,
+    MOVE,
+    by_method,
+    count_and_median,
+    difference,
+    millimetres,
+    paired,
+    quoted,
+    settling,
+    short,
+)
+from page_studies.study import Study, sweep
+from servobench.harness.analysis.comparison import column_of, outcomes, settling_times
+from servobench.harness.analysis.statistics import median_with_interval, success_rate
+from servobench.harness.batch.results import load_runs
+from servobench.harness.run.episode import COMPLETED
+
+RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
+PERIODS: Final = ",".join(f"{1.0 / rate:g}" for rate in RATES)
+RENDERING: Final = ("--set", "bullet.scenery=false")  # the same observations, bit for bit
+CURVES: Final = ("circle", "lemniscate")
+
+
+def rates_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return how many robots settle and when at each rate, and where a faster rate is worse than the next one."""
+    rows = []
+    for plant in ("kinematic", "bullet"):
+        runs = load_runs(folder / plant)
+        for name, own in by_method(runs):
+            at = {rate: own[np.isclose(own["period_s"], 1.0 / rate)] for rate in RATES}
+            worse = [f"{fast} Hz: {words}" for slow, fast in pairwise(RATES) if (words := loss(at[slow], at[fast]))]
+            cells = {f"{rate} Hz": count_and_median(each) for rate, each in at.items()}
+            rows.append({"method": quoted(name), "plant": plant} | cells | {"worse": "; ".join(worse) or "nowhere"})
+    return {"rates": pd.DataFrame(rows)}
+
+
+def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
+    """Return in which way runs are worse at a faster rate beyond the paired 95 % interval; empty if in none.
+
+    Settled shares differ where, of the robots that settle at one rate only, more than half are those of the slower one,
+    lower end of the Wilson interval; times differ where the interval of the median of their differences is above 0.
+    """
+    settles = [set(runs.loc[settling_times(runs).notna(), "seed"]) for runs in (slow, fast)]
+    lost, won = len(settles[0] - settles[1]), len(settles[1] - settles[0])
+    words = []
+    if lost and success_rate(lost, lost + won).low > 0.5:
+        words.append(f"{lost} fewer settle, {won} more")
+    named = pd.concat([slow.assign(controller="slow"), fast.assign(controller="fast")])
+    later = paired(named, [("fast", "slow")], never=MOVE)[0]
+    if later.difference.low > 0.0:
+        words.append(f"{difference(later)} s")
+    return ", ".join(words)
+
+
+def long_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the errors of the second and the last lap of half an hour, and what came of the runs."""
+    rows = []
+    for curve in CURVES:
+        for name, own in by_method(load_runs(folder / curve)):
+            done = own["status"] == COMPLETED
+            ratio = column_of(own, "rms_error_evaluated") / column_of(own, "rms_error_second_lap")
+            rows.append({
+                "method": quoted(name),
+                "curve": curve,
+                "second lap, mm": millimetres(own, "rms_error_second_lap"),
+                "last lap, mm": millimetres(own),
+                "last over second": short(median_with_interval(ratio.where(done)), 2),
+                "outcomes": counted(own),
+            })  # fmt: skip
+    return {"long": pd.DataFrame(rows)}
+
+
+def ends_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return what came of targets out of reach and of starts with the arm stretched."""
+    unreachable, singular = (load_runs(folder / part) for part in ("unreachable", "singular_start"))
+    rows = []
+    for name, own in by_method(unreachable):
+        other = singular[singular["controller"] == name]
+        rows.append({
+            "method": quoted(name),
+            "target out of reach": counted(own),
+            "error at the end, mm": millimetres(own, "steady_state_error", 0),
+            "arm stretched at the start": counted(other),
+            "settling time, s": settling(other),
+        })  # fmt: skip
+    return {"ends": pd.DataFrame(rows)}
+
+
+def counted(runs: pd.DataFrame) -> str:
+    """Return the outcomes of runs with their numbers."""
+    return ", ".join(f"{count} {word}" for word, count in outcomes(runs).value_counts().items())
+
+
+def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the paired difference that each switch of `bullet` makes to each method, in moves and on the circle."""
+    usual = load_runs(folder / USUAL)
+    made: dict[str, list[dict[str, str]]] = {"dynamics": [], "dynamics_circle": []}
+    for words, part in {"`kinematic` instead": "kinematic"} | {words: part_of(words) for words in SWITCHES}.items():
+        changed = load_runs(folder / part)
+        for table, task, metric, never, factor in (
+            ("dynamics", "random", "settling_time_s", MOVE, 1.0),
+            ("dynamics_circle", "circle", "rms_error_evaluated", LOST, 1e3),
+        ):
+            row = {"changed": words}
+            for name in RENDERED:
+                named = [
+                    runs[(runs["controller"] == name) & (runs["task"] == task)].assign(controller=label, plant="")
+                    for label, runs in (("changed", changed), ("usual", usual))
+                ]
+                compared = paired(pd.concat(named), [("changed", "usual")], metric=metric, never=never)[0]
+                row[quoted(name)] = difference(compared, 2 if factor == 1.0 else 1, factor)
+            made[table].append(row)
+    return {name: pd.DataFrame(rows) for name, rows in made.items()}
+
+
+def part_of(words: str) -> str:
+    """Return the part with one switch changed."""
+    return words.replace(" ", "_")
+
+
+def rendered(*settings: str) -> tuple[str, ...]:
+    """Return the sweep of moves and circles on `bullet` with some settings."""
+    options = [word for each in settings for word in ("--set", f"bullet.{each}")]
+    return sweep("bullet", RENDERED, "random,circle", DYNAMICS_SEEDS, *RENDERING, *options)
+
+
+USUAL: Final = "bullet"
+DYNAMICS_SEEDS: Final = "47000:47012"
+SWITCHES: Final[Mapping[str, tuple[str, ...]]] = {
+    "without dynamics": ("drives.dynamics=false",),
+    "torque limits halved": ("drives.torque_limit=[75.0, 75.0, 75.0, 14.0, 14.0, 14.0]",),
+    "payload doubled": ("drives.payload=2.8",),
+    "payload known to the drives": ("drives.assumed_payload=1.4",),
+    "without friction": (
+        "drives.coulomb_friction=[0.0]", "drives.viscous_friction=[0.0]", "drives.friction_compensation=0.0",
+    ),
+    "friction not compensated": ("drives.friction_compensation=0.0",),
+    "bandwidth halved": ("drives.velocity_bandwidth=[7.5, 7.5, 7.5, 10.0, 10.0, 10.0]",),
+    "exact encoders": ("encoder_resolution=0.0",),
+    "without contact with the room": ("room_contact=false",),
+    "contact with itself": ("self_contact=true",),
+    "without depth noise": ('depth_noise="none"',),
+}  # fmt: skip
+
+RATES_STUDY = Study(
+    "rates",
+    "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic` and 10 on `bullet`",
+    60,
+    {
+        "kinematic": sweep("kinematic", BOTH, "random", "44000:44100", "--period", PERIODS),
+        "bullet": sweep("bullet", BOTH, "random", "44100:44110", "--period", PERIODS, *RENDERING),
+    },
+    rates_table,
+)
+LONG = Study(
+    "long",
+    "half an hour on the circle and the lemniscate",
+    30,
+    {
+        curve: sweep("kinematic", BOTH, "endurance", "45000:45010", "--set", f'endurance.curve="{curve}"')
+        for curve in CURVES
+    },
+    long_table,
+)
+ENDS = Study(
+    "ends",
+    "targets out of reach and starts with the arm stretched",
+    2,
+    {task: sweep("kinematic", BOTH, task, "46000:46020") for task in ("unreachable", "singular_start")},
+    ends_table,
+)
+DYNAMICS = Study(
+    "dynamics",
+    "what each switch of `bullet` does to each method, and `bullet` against `kinematic`",
+    90,
+    {
+        "kinematic": sweep("kinematic", RENDERED, "random,circle", DYNAMICS_SEEDS),
+        USUAL: rendered(),
+    }
+    | {part_of(words): rendered(*settings) for words, settings in SWITCHES.items()},
+    dynamics_tables,
+)
