@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -14,10 +16,13 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
-from page_studies import STUDIES, readme
+from page_studies import STUDIES, held_out, physical, readme
 from page_studies.study import Study, sweep
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import TUNING, parse_seeds
+from servobench.harness.config.settings import read_settings
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve_sections
 from servobench.harness.studies import robustness
 
 TRIED = ("--set", "random.duration=0.5")
@@ -120,7 +125,7 @@ def test_cells_may_differ_as_rounding_makes_them(found, wanted, same):
 
 
 def test_an_unknown_study_is_one_line_that_names_them_all():
-    with pytest.raises(SystemExit, match="no study is called nonsense; there are claims, "):
+    with pytest.raises(SystemExit, match="no study is called nonsense; there are held_out, claims, "):
         renewal.main(["nonsense"])
 
 
@@ -141,6 +146,46 @@ def test_no_study_judges_on_seeds_that_methods_were_tuned_on_and_names_are_those
             words = () if callable(command) else command
             if "--seeds" in words:
                 assert not set(parse_seeds(words[words.index("--seeds") + 1])) & set(TUNING)
+
+
+def option(words, name, default=""):
+    return words[words.index(name) + 1] if name in words else default
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=lambda study: study.name)
+def test_methods_tasks_and_settings_of_the_sweeps_are_known(study):
+    for words in study.commands.values():
+        if callable(words) or words[0] != "sweep":
+            continue
+        settings = read_settings(None, [words[i + 1] for i, word in enumerate(words) if word == "--set"])
+        lists = (option(words, f"--{name}").split(",") for name in ("plants", "controllers", "tasks"))
+        requests = [RunRequest(*names, "moderate", 0) for names in product(*lists)]
+        sections = resolve_sections(requests, settings)
+        assert set(settings.sections) <= set(sections)
+
+
+def test_losses_at_a_faster_rate_are_those_beyond_the_paired_interval():
+    def runs(*times):
+        return pd.DataFrame({
+            "plant": "kinematic", "task": "random", "seed": range(len(times)), "status": "completed",
+            "settling_time_s": times,
+        })  # fmt: skip
+
+    slow = runs(*[1.0] * 10)
+    assert physical.loss(slow, runs(*[0.8] * 10)) == ""
+    assert physical.loss(slow, runs(*[1.2] * 4, *[0.8] * 6)) == ""
+    assert "+0.20 [+0.20, +0.20]" in physical.loss(slow, runs(*[1.2] * 10))
+    assert "4 fewer settle, 0 more" in physical.loss(slow, runs(*[math.nan] * 4, *[1.0] * 6))
+    assert physical.loss(slow, runs(*[math.nan] * 2, *[1.0] * 8)) == ""
+
+
+def test_nested_settings_become_assignments():
+    values = {"law": {"gain": 2.5, "mode": "moves"}, "aids": {"filter": True}}
+    assert list(held_out.assignments("ukf_mpc:published", values)) == [
+        "ukf_mpc:published.law.gain=2.5", 'ukf_mpc:published.law.mode="moves"', "ukf_mpc:published.aids.filter=true",
+    ]  # fmt: skip
+    read = read_settings(None, list(held_out.assignments("ukf_mpc:published", values)))
+    assert read.sections == {"ukf_mpc:published": values}
 
 
 def test_the_readmes_pictures_are_drawn_from_a_batch(monkeypatch, tmp_path):
