@@ -7,6 +7,7 @@ import sys
 import typer
 
 from servobench.harness.cli import runs, show, studies
+from servobench.harness.cli.analyse import analyse
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.options import INTERRUPTED, grouped
 from servobench.harness.cli.sweep import sweep
@@ -29,6 +30,7 @@ for command in (
     show.statistics,
     show.report,
     show.record,
+    analyse,
     studies.robustness,
     studies.claims,
     studies.tune,

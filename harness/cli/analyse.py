@@ -1,0 +1,111 @@
+"""The command `servobench analyse`: margins of loops, predicted and simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servobench.harness.cli import options
+from servobench.harness.cli.terminal import console, print_tables
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from servobench.harness.analysis.loops.equilibrium import Source
+    from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.run.resolved import ResolvedRun
+
+TABLE = "analyse.csv"
+
+
+def analyse(
+    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER...", help="Names of controllers.")],
+    mismatch: Annotated[str, typer.Option(help="How far the true robot is from the nominal one.")] = "none",
+    seed: Annotated[int, typer.Option(help="Of the move that warms controllers up, and of the robot.")] = 0,
+    jacobian: Annotated[
+        str, typer.Option(help="Where estimators are frozen: at the true, nominal or estimated Jacobian.")
+    ] = "true",
+    identify: Annotated[
+        bool, typer.Option("--identify", help="Identify all loops from logged small motions, estimators learning on.")
+    ] = False,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Also find the limits of gain and latency by simulation.")
+    ] = False,
+    overrides: options.Overrides = options.OVERRIDES,
+    out: Annotated[Path, typer.Option(help="Folder for table, pictures and page.")] = Path("results") / "analyse",
+) -> None:
+    """Analyse the loop around a rest: margins, sensitivity, Bode, Nyquist, step, stability over gain and latency."""
+    from servobench.harness.analysis.loops.loop_analysis import analyse_loop
+    from servobench.harness.analysis.loops.table import LEGEND, loop_table, printed
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.pictures.loops import write_pictures
+    from servobench.plant.faults import RunFault
+
+    source, runs = _source(jacobian), _resolved(controllers, mismatch, seed, overrides.settings())
+    loops: list[LoopAnalysis] = []
+    for run in runs:
+        with console.status(f"analysing {run.request.controller}"):
+            try:
+                loops.append(analyse_loop(run, source, identify=identify))
+            except RunFault as fault:
+                console.print(f"{run.request.controller}: {fault}", soft_wrap=True, markup=False)
+    if not loops:
+        raise ConfigurationError("no loop is left to analyse")
+    table = loop_table(loops)
+    if simulate:
+        chosen = {run.request.controller: run for run in runs}
+        with console.status("simulating"):
+            table = table.join(_simulated([chosen[loop.name] for loop in loops]))
+    out.mkdir(parents=True, exist_ok=True)
+    table.to_csv(out / TABLE, index=False)
+    text = printed(table)
+    page = write_pictures(out, loops, text, LEGEND)[0]
+    title = f"Loops at rest, estimators frozen at the {source} Jacobian"
+    print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
+    console.print(f"table in {out / TABLE}, pictures in {page}", soft_wrap=True, markup=False)
+
+
+def _source(jacobian: str) -> Source:
+    from servobench.harness.analysis.loops.equilibrium import SOURCES
+    from servobench.harness.config.settings import ConfigurationError
+
+    for source in SOURCES:
+        if source == jacobian:
+            return source
+    raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}")
+
+
+def _resolved(controllers: list[str], mismatch: str, seed: int, settings: Settings) -> list[ResolvedRun]:
+    """Return a run for each controller on the kinematic plant."""
+    from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolved import known_sections, resolve
+
+    if seed < 0:
+        raise ConfigurationError(f"seed must not be negative, got {seed}")
+    settings.check_sections([*known_sections(), *controllers])
+    names = options.split_controllers(",".join(controllers))
+    return [resolve(RunRequest(PLANT, name, TASK, read_mismatch(mismatch), seed), settings) for name in names]
+
+
+def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
+    """Return the simulated limits, a row for each run; NaN for a controller that is not composed."""
+    import pandas as pd
+
+    from servobench.controllers.servo import ServoController
+    from servobench.harness.analysis.loops.equilibrium import warm_up
+    from servobench.harness.analysis.loops.simulation import SmallLoop
+
+    rows: list[tuple[float, float]] = []
+    for run in runs:
+        warm = warm_up(run)
+        if isinstance(warm.controller, ServoController):
+            loop = SmallLoop(warm, warm.model, run.plant)
+            rows.append((loop.gain_limit(), loop.latency_limit()))
+        else:
+            rows.append((float("nan"), float("nan")))
+    return pd.DataFrame(rows, columns=["simulated_gain_margin", "simulated_latency_limit_s"])

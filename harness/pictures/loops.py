@@ -1,0 +1,162 @@
+"""Pictures of analysed loops: Bode, Nyquist, sensitivity, step, limits of gain over latency; and a page of them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
+from servobench.harness.analysis.loops.margins import loci
+from servobench.harness.pictures.draw import picture_of, save_figure
+from servobench.harness.pictures.panels import Styles, add_legend, plain_logarithms
+from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.plant.checks import FloatArray
+from servobench.plant.files import write_atomically
+
+PAGE = "analyse.html"
+FIGURES = "figures"
+LATENCIES: FloatArray = np.linspace(0.0, 0.5, 21)  # [s]
+FACTORS: FloatArray = np.geomspace(0.1, 10.0, 41)  # on the command
+PEAKS = (1.0, 1.2, 1.4, 1.7, 2.0, 3.0, 5.0, 20.0)  # M_s at the edges of the colours; above 2 a loop is hardly robust
+NYQUIST_REACH = 2.5  # of the axes
+COLUMNS = 3
+
+CAPTIONS = {
+    "loops": "Bode, Nyquist and sensitivity at the measured feature, a line for each characteristic locus; each "
+    "feature after a step of its own reference; and the factor on the command at which the loop becomes unstable.",
+    "stability_map": "Largest sensitivity M_s over gain and latency. White: unstable. The cross is the loop as it is.",
+}
+
+
+def draw_loops(loops: Sequence[LoopAnalysis], styles: Styles) -> Figure:
+    """Draw the loops side by side."""
+    figure = Figure(figsize=(11.0, 6.6), layout="constrained")
+    (magnitude, nyquist, sensitivity), (phase, step, limits) = figure.subplots(2, 3)
+    for loop in loops:
+        style, response = styles[loop.name], loop.response
+        L, frequency = response.at_feature(), response.frequency
+        curves = loci(L)
+        look = style.line_arguments(len(frequency))
+        for i, curve in enumerate(curves.T):
+            name = {"label": loop.name} if i == 0 else {}
+            magnitude.plot(frequency, np.abs(curve), **look, **name)
+            phase.plot(frequency, _falling_phase(curve), **look)
+            nyquist.plot(curve.real, curve.imag, **(look | {"marker": ""}))
+        S = np.linalg.inv(np.eye(L.shape[-1]) + L)
+        sensitivity.plot(frequency, np.linalg.norm(S, ord=2, axis=(-2, -1)), **look)
+        time = np.arange(len(loop.step)) * loop.arm.period
+        for curve in loop.step.T if loop.stable else ():
+            step.plot(time, curve, **style.line_arguments(len(time)))
+        limits.plot(1000.0 * LATENCIES, loop.gain_limits(LATENCIES.tolist()), **style.line_arguments(len(LATENCIES)))
+    _finish_frequencies(magnitude, phase, sensitivity)
+    _finish_nyquist(nyquist)
+    step.set(xlabel="time [s]", ylabel="feature after a unit step", ylim=(-0.05, 1.6))
+    limits.axhline(1.0, color="0.4", linewidth=0.9)
+    latency = 1000.0 * loops[0].arm.latency
+    limits.axvline(latency, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)))
+    limits.set(xlabel="latency of the camera [ms]", ylabel="largest factor on the command", ylim=(0.3, 20.0))
+    plain_logarithms(limits)
+    add_legend(figure, [magnitude])
+    return figure
+
+
+def draw_stability_map(loops: Sequence[LoopAnalysis]) -> Figure:
+    """Draw M_s over gain and latency, a panel for each loop."""
+    rows = -(-len(loops) // COLUMNS)
+    columns = min(len(loops), COLUMNS)
+    figure = Figure(figsize=(3.6 * columns + 0.8, 2.9 * rows + 0.4), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    norm = mpl.colors.BoundaryNorm(PEAKS, 256)
+    drawn = None
+    for axes, loop in zip(grid.flat, loops, strict=False):
+        peaks = np.minimum(loop.sensitivity_peaks(FACTORS, LATENCIES.tolist()), 2.0 * PEAKS[-1])
+        limits = loop.gain_limits(LATENCIES.tolist())
+        unstable = FACTORS[:, None] >= limits[None, :]
+        drawn = axes.pcolormesh(
+            1000.0 * LATENCIES, FACTORS, np.where(unstable, np.nan, peaks), norm=norm, cmap="viridis_r",
+            shading="nearest", rasterized=True,
+        )  # fmt: skip
+        axes.plot(1000.0 * LATENCIES, limits, color="black", linewidth=1.4)
+        axes.plot(1000.0 * loop.arm.latency, 1.0, color="white", marker="X", markersize=9, markeredgecolor="black",
+                  clip_on=False, zorder=10)  # fmt: skip
+        axes.set(title=loop.name, ylim=(FACTORS[0], FACTORS[-1]))
+        axes.grid(visible=False)
+        plain_logarithms(axes)
+    for axes in grid.flat[len(loops) :]:
+        axes.set_axis_off()
+    for axes in grid[-1]:
+        axes.set_xlabel("latency of the camera [ms]")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("factor on the command")
+    if drawn is not None:
+        figure.colorbar(drawn, ax=grid, label="M_s", format="%g")
+    return figure
+
+
+def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFrame, legend: str) -> list[Path]:
+    """Write the pictures as PNG and PDF, and a page of them; return the files, the page first.
+
+    Args:
+        folder: of the results.
+        loops: at least one.
+        table: of text, a row for each.
+        legend: of the table.
+    """
+    styles = method_styles([loop.name for loop in loops])
+    with figure_style():
+        figures = {"loops": draw_loops(loops, styles), "stability_map": draw_stability_map(loops)}
+    paths = [path for name, figure in figures.items() for path in save_figure(figure, folder / FIGURES / name)]
+    parts = [
+        "<!DOCTYPE html>",
+        '<html lang="en"><head><meta charset="utf-8"><title>servobench analyse</title>',
+        "<style>body { font: 16px/1.5 system-ui, sans-serif; max-width: 1180px; margin: 0 auto; padding: 1.5rem; }",
+        "img { max-width: 100%; height: auto; } table { border-collapse: collapse; font-size: 14px; }",
+        "th, td { padding: .25rem .6rem; text-align: right; } th { vertical-align: bottom; }</style></head><body>",
+        "<h1>Loops around a rest</h1>",
+        table.rename(columns=lambda name: name.replace("\n", " ")).to_html(index=False, border=0),
+        f"<p>{escape(legend)}</p>",
+    ]
+    for name, figure in figures.items():
+        content, width = picture_of(figure)
+        data = base64.b64encode(content).decode("ascii")
+        parts.append(f'<figure><img alt="{name}" width="{width}" src="data:image/png;base64,{data}">')
+        parts.append(f"<figcaption>{escape(CAPTIONS[name])}</figcaption></figure>")
+    page = folder / PAGE
+    text = "\n".join([*parts, "</body></html>", ""])
+    write_atomically(page, lambda path: path.write_text(text, encoding="utf-8"))
+    return [page, *paths]
+
+
+def _falling_phase(curve: FloatArray) -> FloatArray:
+    """Return the phase of a locus without jumps, [°], that begins between −270 and 90."""
+    phase = np.rad2deg(np.unwrap(np.angle(curve)))
+    return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
+
+
+def _finish_frequencies(magnitude: Axes, phase: Axes, sensitivity: Axes) -> None:
+    for axes in (magnitude, phase, sensitivity):
+        axes.set_xscale("log")
+        axes.set_xlabel("frequency [rad/s]")
+    magnitude.set(ylabel="magnitude of the loci of L", ylim=(0.01, 100.0))
+    magnitude.axhline(1.0, color="0.4", linewidth=0.9)
+    plain_logarithms(magnitude)
+    phase.set(ylabel="phase of the loci of L [°]", ylim=(-540.0, 0.0), yticks=range(-540, 1, 90))
+    phase.axhline(-180.0, color="0.4", linewidth=0.9)
+    sensitivity.set(ylabel="largest singular value of S", ylim=(0.03, 5.0))
+    plain_logarithms(sensitivity)
+
+
+def _finish_nyquist(axes: Axes) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 200)
+    axes.plot(np.cos(angle), np.sin(angle), color="0.6", linewidth=0.9)
+    axes.plot(-1.0, 0.0, color="black", marker="+", markersize=11, markeredgewidth=1.6)
+    axes.set(xlabel="real part of the loci of L", ylabel="imaginary part", aspect="equal",
+             xlim=(-NYQUIST_REACH, 1.0), ylim=(-NYQUIST_REACH, 1.0))  # fmt: skip

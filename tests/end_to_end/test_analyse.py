@@ -1,0 +1,47 @@
+"""`servobench analyse` as a user meets it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+
+
+def test_loops_are_analysed_side_by_side(monkeypatch, capsys, tmp_path):
+    arguments = ["pid+true", "mfac+ukf", "--out", str(tmp_path), "--set", "mfac+ukf.law.gain=60.0"]
+    assert servobench(monkeypatch, "analyse", *arguments) == 0
+    printed = capsys.readouterr().out
+    assert "true Jacobian" in printed
+    table = pd.read_csv(tmp_path / "analyse.csv").set_index("controller")
+    assert table["stable"].tolist() == [True, False]
+    assert np.isnan(table.loc["mfac+ukf", "gain_margin"])
+    assert table.loc["mfac+ukf", "latency_limit_s"] == 0.0
+    assert table.loc["pid+true", "latency_limit_s"] == table.loc["pid+true", "delay_margin_s"]
+    page = (tmp_path / "analyse.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 2
+    assert "pid+true" in page
+    figures = sorted(path.name for path in (tmp_path / "figures").iterdir())
+    assert figures == ["loops.pdf", "loops.png", "stability_map.pdf", "stability_map.png"]
+
+
+def test_every_loop_can_be_identified(monkeypatch, capsys, tmp_path):
+    assert servobench(monkeypatch, "analyse", "pid+true", "--identify", "--out", str(tmp_path)) == 0
+    assert "identified in small motions" in capsys.readouterr().out
+    table = pd.read_csv(tmp_path / "analyse.csv")
+    assert table["model"].tolist() == ["identified"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("pdi+true",), "law must be one of"),
+        (("pid+true", "--jacobian", "exact"), "--jacobian must be one of true, nominal, estimated, got 'exact'"),
+        (("pid+true", "--seed", "-1"), "seed must not be negative, got -1"),
+        (("pid+true", "--set", "pid.law.gain=1"), "unknown section 'pid'"),
+    ],
+)
+def test_what_cannot_be_analysed_is_one_line(monkeypatch, capsys, tmp_path, arguments, message):
+    assert servobench(monkeypatch, "analyse", *arguments, "--out", str(tmp_path)) == 2
+    assert message in capsys.readouterr().err
