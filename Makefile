@@ -26,6 +26,7 @@ results: $(VENV)/ready
 
 # Too long for every change: whether the stored figures of these studies come out again; writes nothing into the pages.
 nightly: $(VENV)/ready
+	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 
 lint: $(VENV)/ready

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from servobench.harness.batch.workers import Workers
+    from servobench.harness.studies.tuning.campaign import Method, TuningPlan
+    from servobench.harness.studies.tuning.check import Change
     from servobench.harness.studies.tuning.files import TunedValues
-    from servobench.harness.studies.tuning.study import MethodStudy, TuningPlan
+    from servobench.harness.studies.tuning.objective import TuningSet
 
 DEFAULT_CONTROLLERS = "rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
 EXIT_DIFFERENT = 1
@@ -79,12 +81,15 @@ def claims(
 
 def tune(
     controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
-    trials: Annotated[int, typer.Option(help="Trials of each method, that of the defaults included.")] = 100,
-    seeds: Annotated[int, typer.Option(help="Moves of a trial on each plant; half as many circles are added.")] = 8,
+    studies: Annotated[int, typer.Option(help="Studies of each method; the best on a second set is taken.")] = 3,
+    trials: Annotated[int, typer.Option(help="Trials of each study, known settings included.")] = 100,
+    search: Annotated[int, typer.Option(help="Most points of the coordinate search that ends a study.")] = 100,
+    robots: Annotated[int, typer.Option(help="Robots under each of the six conditions of a trial.")] = 4,
     plants: options.NamesOption = "kinematic",
     place: options.Place = options.PLACE,
     offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
-    study_seed: Annotated[int, typer.Option(help="Seed of the sampler.")] = 0,
+    study_seed: Annotated[int, typer.Option(help="Seed of the first study's sampler.")] = 0,
+    check: Annotated[bool, typer.Option("--check", help="Judge each change of one value in use instead.")] = False,
     out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
@@ -93,56 +98,93 @@ def tune(
     from servobench.harness.batch.lock import locked
     from servobench.harness.batch.workers import open_workers
     from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.studies.tuning.campaign import TuningPlan, check_study_folder, open_methods, write_results
     from servobench.harness.studies.tuning.objective import TuningSet
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
-    from servobench.harness.studies.tuning.study import TuningPlan, check_study_folder, open_studies, write_outcomes
 
     names = options.split_names("controllers", controllers, tuple(SPACES), find_tunable)
     try:
-        plan = TuningPlan(names, trials, TuningSet(options.split_words(plants), seeds, offset), study_seed)
+        runs = TuningSet(options.split_words(plants), robots, offset)
+        plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     check_study_folder(out)
     opening = open_workers(*astuple(place), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):
-        studies = open_studies(out, plan)
-        interrupted = not _advance(studies, plan, opened)
-    console.print(_tuned_table(write_outcomes(out, studies)))
-    console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
+        if check:
+            _check(out, names, runs.second(), opened)
+            return
+        methods = open_methods(out, plan)
+        interrupted = not _advance(methods, plan, opened)
+    results = write_results(out, methods)
+    if results:
+        console.print(_tuned_table(results))
+        console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
     if interrupted:
-        console.print("interrupted; the same call continues where it stopped")
-        sys.exit(options.INTERRUPTED)
+        _say_interrupted()
 
 
-def _advance(studies: Sequence[MethodStudy], plan: TuningPlan, workers: Workers) -> bool:
+def _say_interrupted() -> None:
+    console.print("interrupted; the same call continues where it stopped")
+    sys.exit(options.INTERRUPTED)
+
+
+def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
+    """Score every change of one value of the settings in use and say which of them improve a score by too much."""
+    from servobench.harness.cli.progress import run_progress
+    from servobench.harness.studies.tuning.check import TOLERANCE, Check, improvements
+
+    checked = Check(folder, names, runs)
+    with run_progress(console) as progress:
+        bar = progress.add_task("points", total=len(checked), completed=checked.known())
+        try:
+            for _ in checked.carry_out(workers):
+                progress.update(bar, advance=1)
+        except KeyboardInterrupt:
+            progress.stop()
+            _say_interrupted()
+    found = improvements(checked.changes())
+    console.print(_change_table(found) if found else f"no change improves a score by more than {TOLERANCE:.0%}")
+    if found:
+        sys.exit(EXIT_DIFFERENT)
+
+
+def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> bool:
     """Advance the studies to their end and show how far they are; return whether they got there."""
     from rich.progress import TextColumn
 
     from servobench.harness.cli.progress import run_progress
-    from servobench.harness.studies.tuning.study import advance
+    from servobench.harness.studies.tuning.campaign import advance
 
-    runs = len(plan.runs.runs())
-    with run_progress(console, TextColumn("runs, best {task.fields[best]}")) as progress:
-        bars = {
-            study.controller: progress.add_task(
-                study.controller, total=plan.trials * runs, completed=len(study.finished()) * runs, best="–"
-            )
-            for study in studies
-        }
+    total = plan.studies * (plan.trials + plan.search)
+    with run_progress(console, TextColumn("points, best {task.fields[best]}")) as progress:
+        bars = {method.name: progress.add_task(method.name, total=total, best="–") for method in methods}
         try:
-            for controller, best in advance(studies, plan, workers):
-                progress.update(bars[controller], advance=1, best="–" if best is None else f"{best:.4f}")
+            for method in advance(methods, plan, workers):
+                best = method.ledger.best()
+                progress.update(bars[method.name], completed=method.done, best="–" if best is None else f"{best:.4f}")
         except KeyboardInterrupt:
             return False
     return True
 
 
-def _tuned_table(outcomes: Mapping[str, TunedValues]) -> Table:
+def _change_table(changes: Sequence[Change]) -> Table:
     from rich.table import Table
 
-    table = Table("controller", "trials", "score of defaults", "score tuned", "best trial")
-    for name, tuned in outcomes.items():
-        table.add_row(
-            name, str(tuned.trials), f"{tuned.score_of_defaults:.4f}", f"{tuned.score:.4f}", str(tuned.best_trial)
-        )
+    table = Table("controller", "key", "in use", "better", "score", "with the change", "gain")
+    for change in changes:
+        values = (f"{value:.4g}" if isinstance(value, float) else str(value) for value in (change.before, change.after))
+        scores = f"{change.score_before:.4f}", f"{change.score_after:.4f}", f"{change.gain:.1%}"
+        table.add_row(change.controller, change.key, *values, *scores)
+    return table
+
+
+def _tuned_table(results: Mapping[str, TunedValues]) -> Table:
+    from rich.table import Table
+
+    table = Table("controller", "score of defaults", "score tuned", "second set, defaults", "tuned", "its studies")
+    for name, tuned in results.items():
+        numbers = (tuned.score_of_defaults, tuned.score, tuned.second_score_of_defaults, tuned.second_score)
+        spread = " ".join(f"{study.second_score:.4f}" for study in tuned.studies)
+        table.add_row(name, *(f"{number:.4f}" for number in numbers), spread)
     return table

@@ -1,7 +1,8 @@
 """The defaults of a controller: those of its configuration class with the tuned values on top.
 
-Tuned values are files `controllers/tuned/NAME.toml` that `servobench tune` wrote; their table `[settings]` holds nested
-fields of the configuration. A controller without a file keeps the defaults of its class.
+Tuned values are files `controllers/tuned/NAME.toml` that `servobench tune` wrote, with a dot for a colon in the name;
+their table `[settings]` holds nested fields of the configuration. A controller without a file keeps the defaults of its
+class.
 """
 
 from __future__ import annotations
@@ -17,9 +18,14 @@ from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.settings import ConfigurationError, Settings
 
 
+def file_stem(name: str) -> str:
+    """Return a controller's name as part of a file's name; some systems refuse the colon of a division's name."""
+    return name.replace(":", ".")
+
+
 def tuned_file(name: str) -> Traversable:
     """Return where the tuned values of the controller called `name` lie, if it has any."""
-    return files("servobench.controllers") / "tuned" / f"{name.replace(':', '.')}.toml"
+    return files("servobench.controllers") / "tuned" / f"{file_stem(name)}.toml"
 
 
 @cache

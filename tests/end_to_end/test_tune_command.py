@@ -8,10 +8,11 @@ import signal
 import pytest
 
 from kit.command import finish, servobench, start, wait_for
+from servobench.harness.studies.tuning import check as tuning_check
 from servobench.harness.studies.tuning.files import read_tuned
 from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
 
-SHORT = ["--controllers", "rls", "--seeds", "4", "--workers", "1"]
+SHORT = ["--controllers", "rls", "--robots", "2", "--studies", "1", "--search", "0", "--workers", "1"]
 
 
 def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypatch, capsys, tmp_path):
@@ -23,8 +24,22 @@ def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypat
     assert first.score == first.score_of_defaults
     assert servobench(monkeypatch, "tune", *SHORT, "--trials", "2", "--out", str(out)) == 0
     second = read_tuned(out / "rls.toml")
-    assert (second.trials, second.score_of_defaults) == (2, first.score)
-    assert sorted(path.name for path in out.iterdir()) == ["rls.journal", "rls.toml"]
+    assert (second.studies[0].trials, second.score_of_defaults) == (2, first.score)
+    assert sorted(path.name for path in out.iterdir()) == ["rls.jsonl", "rls.second.jsonl", "rls.toml"]
+
+
+@pytest.mark.parametrize("tolerance", [10.0, -10.0])
+def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whether(
+    monkeypatch, capsys, tmp_path, tolerance
+):
+    monkeypatch.setattr(tuning_check, "TOLERANCE", tolerance)
+    check = ("tune", "--check", "--controllers", "constant", "--robots", "2", "--workers", "1")
+    code = servobench(monkeypatch, *check, "--out", str(tmp_path / "out"))
+    output = capsys.readouterr().out
+    assert code == (0 if tolerance > 0.0 else 1)
+    assert ("no change improves a score" in output) == (tolerance > 0.0)
+    assert ("law.damping" in output) == (tolerance < 0.0)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["constant.second.jsonl"]
 
 
 @pytest.mark.parametrize(
@@ -34,10 +49,12 @@ def test_tuning_leaves_studies_and_values_and_goes_on_with_more_trials(monkeypat
         (("--controllers", "mfac+rls"), "controller mfac+rls has no search space"),
         (("--controllers", ","), "--controllers is empty"),
         (("--trials", "0"), "trials must be at least 1, got 0"),
-        (("--seeds", "0"), "seeds must be 4, 8, 12"),
-        (("--seeds", "6"), "seeds must be 4, 8, 12"),
-        (("--seeds", "8000"), "12000 seeds from 10000 on leave the tuning range 10000:20000"),
-        (("--offset", "9999"), "12 seeds from 19999 on leave the tuning range 10000:20000"),
+        (("--studies", "0"), "studies must be at least 1, got 0"),
+        (("--search", "-1"), "search must be at least 0, got -1"),
+        (("--robots", "0"), "robots must be 2, 4, 6"),
+        (("--robots", "3"), "robots must be 2, 4, 6"),
+        (("--robots", "8000"), "48000 seeds from 10000 on leave the tuning range 10000:20000"),
+        (("--offset", "9999"), "24 seeds from 19999 on leave the tuning range 10000:20000"),
         (("--offset", "-1"), "offset must be at least 0, got -1"),
         (("--study-seed", "-1"), "study_seed must be at least 0, got -1"),
         (("--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
@@ -63,18 +80,19 @@ def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(monk
     out = str(tmp_path / "out")
     assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", out) == 0
     assert servobench(monkeypatch, "tune", *SHORT, "--trials", "1", "--out", out, "--offset", "40") == 2
-    assert "rls.journal was made with other seeds; name another folder with --out" in capsys.readouterr().err
+    assert "rls.jsonl was made with other robots; name another folder with --out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_ctrl_c_keeps_the_study(tmp_path, workers):
     out = tmp_path / "out"
-    arguments = ("tune", "--controllers", "constant", "--seeds", "4", "--workers", workers, "--trials", "500")
-    process, journal = start(*arguments, "--out", str(out)), out / "constant.journal"
-    wait_for(lambda: journal.exists() and journal.read_text().count('"values":[') >= 2)
+    arguments = ("tune", "--controllers", "constant", "--robots", "2", "--workers", workers, "--trials", "500")
+    process, ledger = start(*arguments, "--out", str(out)), out / "constant.jsonl"
+    wait_for(lambda: ledger.exists() and ledger.read_text().count('"costs"') >= 2)
     os.killpg(process.pid, signal.SIGINT)
     code, output = finish(process)
     assert code == 130, output
     assert "Traceback" not in output
     assert "interrupted; the same call continues where it stopped" in output
-    assert 2 <= read_tuned(out / "constant.toml").trials < 500
+    assert [path.name for path in out.iterdir()] == ["constant.jsonl"]
+    assert ledger.read_text().count('"costs"') >= 2

@@ -18,35 +18,58 @@ HEADING = "# Tuned values, made by `servobench tune`: the table [settings] repla
 
 
 @dataclass(frozen=True)
+class StudyRecord:
+    """One of the studies of a method."""
+
+    seed: int  # of the sampler
+    trials: int  # of the sampler, known settings included
+    best_trial: int  # the number of the best one; 0 is that of the defaults
+    best_trial_score: float
+    search_points: int  # scored by the coordinate search that began there
+    search_complete: bool  # whether no change of one value improves the score; False: its budget ended first
+    score: float  # at its end
+    second_score: float  # of the same settings on the second set
+    settings: Mapping[str, Any]  # nested values
+
+
+@dataclass(frozen=True)
 class TunedValues:
-    """The outcome of a study, all of it in the file."""
+    """What the studies of a method found, all of it in the file; the best one on the second set is in use."""
 
     controller: str
-    study_seed: int  # seed of the sampler
-    trials: int  # number of trials of which these values are the best
-    best_trial: int  # its number; 0 is that of the defaults
-    runs_a_trial: int
     plants: tuple[str, ...]  # on which the runs took place
-    moves: int  # on each plant (`--seeds`)
+    robots: int  # under each condition (`--robots`)
     offset: int  # of the seeds in the tuning range (`--offset`)
-    seeds: tuple[int, ...]  # first and last seed, for the reader
-    date: str  # day on which the last trial ended, UTC
+    runs_a_trial: int
+    runs_of_second_set: int
+    date: str  # day on which the file was written, UTC
     version: str  # of servobench
     score: float  # of these values
     score_of_defaults: float  # of the defaults of the controller's class
+    second_score: float  # of these values on the second set of robots
+    second_score_of_defaults: float
     checked_score: float  # of these values on the subset `TuningSet.checked`
     checked_score_of_defaults: float
     settings: Mapping[str, Any]  # nested values
+    studies: tuple[StudyRecord, ...]  # empty for values that were found under another objective and only scored anew
 
     def tuning_set(self) -> TuningSet:
         """Return the runs on which the values were found."""
-        return TuningSet(self.plants, self.moves, self.offset)
+        return TuningSet(self.plants, self.robots, self.offset)
 
 
 def write_tuned(path: Path, tuned: TunedValues) -> None:
     """Write the file atomically."""
-    header = {item.name: getattr(tuned, item.name) for item in fields(tuned) if item.name != "settings"}
-    text = HEADING + _table("", header) + _table("settings", tuned.settings)
+    tables = ("settings", "studies")
+    header = {item.name: getattr(tuned, item.name) for item in fields(tuned) if item.name not in tables}
+    if not tuned.studies:
+        header["studies"] = ()
+    text = HEADING + _table("", header)
+    text += _table("settings", tuned.settings)
+    for record in tuned.studies:
+        values = {item.name: getattr(record, item.name) for item in fields(record)}
+        text += "\n[[studies]]\n" + _table("", {key: value for key, value in values.items() if key != "settings"})
+        text += _table("studies.settings", record.settings)
     write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
@@ -58,8 +81,8 @@ def read_tuned(path: Path | Traversable) -> TunedValues:
     """
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-        tuples = {key: tuple(data[key]) for key in ("plants", "seeds")}
-        return TunedValues(**{**data, **tuples})
+        studies = tuple(StudyRecord(**record) for record in data["studies"])
+        return TunedValues(**{**data, "plants": tuple(data["plants"]), "studies": studies})
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigurationError(f"tuned values {path} cannot be read: {error}") from error
 

@@ -1,13 +1,21 @@
 """What tuning minimises, and the runs that it is measured on.
 
-For each plant, `seeds` moves of the task `random` and half as many runs of the task `circle`, every one on another
-robot of `moderate` mismatch. Every other run has a camera latency of 50 ms, as the rendered plant has.
+For each plant, `robots` runs under each of six conditions: latencies of 0 to 150 ms, usual and fourfold noise, four
+times moves (the task `random`, cut to 6 s), once a circle and once a figure of eight, both smaller and shorter than
+those of the tasks. Every run is another robot of `moderate` mismatch; of each second one the camera is turned by 30° or
+60°.
 
-    score = mean over random of c_random + mean over circle of c_circle         (0 is perfect, 4 the worst)
+    score = mean over the runs of weight · cost                              (0 is perfect, 2 the worst)
 
-    c_random = settling time / duration; 1 if it never settled; 2 if the run did not complete
-    c_circle = min(RMS error of the second lap / 0.05 m, 1);     2 if the run did not complete
+    weight: 3/4 of each of the many moves, 3/2 of each of the few curves; their mean is 1
 
+    move:   cost = settling time / duration
+                   1 + e / (e + 50 mm), e the RMS error of the last quarter, if it never settled
+    curve:  cost = 2 e / (e + 50 mm), e the RMS error of the second lap
+    2 if the run did not complete
+
+So moves and curves have the same weight: a second of settling time on all moves counts about as much as 4 mm on all
+curves.
 Overshoot has no term of its own: it lengthens the settling time, since the error must come back and stay within 5 mm.
 """
 
@@ -16,31 +24,59 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 
 from servobench.harness.batch.blocks import Cell, Job, carry_out_blocks, cut, even_size
-from servobench.harness.batch.compare import tuning_seeds
+from servobench.harness.batch.compare import TUNING, tuning_seeds
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import COMPLETED
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
-from servobench.harness.run.tasks import find_task
 from servobench.harness.run.together import side_by_side_key
 from servobench.plant.sensing import can_vary_sensing
 from servobench.plant.settings import Periods, settings
 
+
+@dataclass(frozen=True)
+class Condition:
+    """What the runs of a block share."""
+
+    task: str
+    latency: float  # [s] of the camera
+    noise_factor: float  # on the usual noise
+    weight: float  # of a run in the score
+
+
 MOVE: Final = "random"
-CURVE: Final = "circle"
-MISMATCH: Final = "moderate"
-LATENCIES: Final = (0.0, 0.05)  # [s] between exposure and delivery of the feature, in turn
-RMS_SATURATION: Final = 0.05  # [m] on the circle; the cost saturates at 1 here
-FAULT_PENALTY: Final = 1.0  # added to the cost 1 of a run that did not complete
-CHECKED: Final = len(LATENCIES)  # runs of each task in the subset that a test scores again
+CONDITIONS: Final = (
+    Condition(MOVE, 0.0, 1.0, weight=0.75),
+    Condition(MOVE, 0.05, 4.0, weight=0.75),
+    Condition(MOVE, 0.1, 1.0, weight=0.75),
+    Condition(MOVE, 0.15, 4.0, weight=0.75),
+    Condition("circle", 0.0, 1.0, weight=1.5),
+    Condition("lemniscate", 0.1, 4.0, weight=1.5),
+)
+WEIGHTS: Final[Mapping[str, float]] = {condition.task: condition.weight for condition in CONDITIONS}
+MISMATCHES: Final = (
+    "moderate",
+    "moderate+camera_rotation=60deg",
+    "moderate",
+    "moderate+camera_rotation=30deg",
+)  # of the robots of a condition, in turn
+MOVE_DURATION: Final = 6.0  # [s]
+TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
+    MOVE: {"duration": MOVE_DURATION},
+    "circle": {"radius": 0.2, "lap_time": 6.0},  # at 0.21 m/s, the whole task at 0.19 m/s
+    "lemniscate": {"radius": 0.17, "lap_time": 6.0},
+}  # settings of the tasks: what is settled needs no more time
+ERROR_SCALE: Final = 0.05  # [m] error at which half of the worst cost of errors is reached
+WORST: Final = 2.0  # cost of a run that did not complete, and most of any run
+SECOND_OFFSET: Final = len(TUNING) // 2  # where in the tuning range the seeds of the second sets begin
+SECOND_FACTOR: Final = 3  # robots of the second set for each of the first
 
 
 @settings
@@ -49,18 +85,16 @@ class TuningSet:
 
     plants: tuple[str, ...] = ("kinematic",)
     """names of plants whose latency can be set"""
-    seeds: int = 8
-    """moves on each plant: 4, 8, 12, …, so that each delay has its share of moves and circles"""
+    robots: int = 4
+    """under each condition on each plant: 2, 4, 6, …, so that cameras as they are and turned ones have equal shares"""
     offset: Periods = 0
     """where in the tuning range the seeds begin"""
 
     def __post_init__(self) -> None:
-        """Refuse an odd share of delays, seeds outside the tuning range, and a plant without latency."""
-        if self.seeds < 4 or self.seeds % 4:
-            raise ValueError(
-                f"seeds must be 4, 8, 12, …, so that each delay has its share of moves and circles; got {self.seeds}"
-            )
-        tuning_seeds(self.seeds + self.seeds // 2, self.offset)
+        """Refuse an odd share of cameras, seeds outside the tuning range, and a plant without latency."""
+        if self.robots < 2 or self.robots % 2:
+            raise ValueError(f"robots must be 2, 4, 6, …, so that half of the cameras are turned; got {self.robots}")
+        tuning_seeds(len(CONDITIONS) * self.robots, self.offset)
         if not self.plants:
             raise ValueError("no plant to tune on; name one with --plants kinematic")
         for name in self.plants:
@@ -68,19 +102,33 @@ class TuningSet:
             if entry.own_robot or not can_vary_sensing(entry.config()):
                 raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
+    def second(self) -> TuningSet:
+        """Return the second, larger set: other robots of the tuning range, which no trial sees."""
+        return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
+
     def runs(self) -> list[RunRequest]:
-        """Return all runs, still without a controller: for each plant the moves, then the circles on further seeds."""
-        seeds = tuning_seeds(self.seeds + self.seeds // 2, self.offset)
-        tasks = [MOVE] * self.seeds + [CURVE] * (self.seeds // 2)
+        """Return all runs, still without a controller, the robots of a condition one after the other."""
+        seeds = tuning_seeds(len(CONDITIONS) * self.robots, self.offset)
+        mismatches = [read_mismatch(text) for text in MISMATCHES]
         return [
-            RunRequest(plant, "", task, read_mismatch(MISMATCH), seed, latency=latency)
+            RunRequest(
+                plant,
+                "",
+                condition.task,
+                mismatches[robot % len(mismatches)],
+                seeds[c * self.robots + robot],
+                condition.noise_factor,
+                condition.latency,
+            )
             for plant in self.plants
-            for task, seed, latency in zip(tasks, seeds, cycle(LATENCIES), strict=False)
+            for c, condition in enumerate(CONDITIONS)
+            for robot in range(self.robots)
         ]
 
     def checked(self) -> list[int]:
-        """Return the indices of a subset with both tasks and both delays, small enough for a test."""
-        return [first + i for first in (0, self.seeds) for i in range(CHECKED)]
+        """Return the indices of a subset small enough for a test: two robots on moves, two on a circle."""
+        curves = next(c for c, condition in enumerate(CONDITIONS) if condition.task != MOVE)
+        return [c * self.robots + robot for c in (1, curves) for robot in (0, 1)]
 
 
 @dataclass(frozen=True)
@@ -93,7 +141,7 @@ class Trial:
     def resolved(self, runs: Sequence[RunRequest]) -> list[ResolvedRun]:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
-        sections = resolve_sections(requests, Settings()) | {self.controller: self.config}
+        sections = resolve_sections(requests, Settings(TASKS)) | {self.controller: self.config}
         return [select(request, sections) for request in requests]
 
 
@@ -101,19 +149,21 @@ Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run
 
 
 def run_cost(task: str, row: Mapping[str, Any]) -> float:
-    """Return the cost of one run from its row of results; see the module's docstring."""
+    """Return the weighted cost of one run from its row of results; see the module's docstring."""
+    weight = WEIGHTS[task]
     if row["status"] != COMPLETED:
-        return 1.0 + FAULT_PENALTY
-    if task == CURVE:
-        return min(float(row["rms_error_evaluated"]) / RMS_SATURATION, 1.0)
+        return weight * WORST
+    error = float(row["rms_error_evaluated"])
+    saturated = error / (error + ERROR_SCALE)
+    if task != MOVE:
+        return weight * WORST * saturated
     settling_time = float(row["settling_time_s"])
-    return 1.0 if math.isnan(settling_time) else settling_time / float(find_task(MOVE).default.duration)
+    return weight * (1.0 + saturated if math.isnan(settling_time) else settling_time / MOVE_DURATION)
 
 
-def score(runs: Sequence[RunRequest], costs: Sequence[float]) -> float:
+def score(costs: Sequence[float]) -> float:
     """Return the score of a trial from the costs of its runs."""
-    pairs = list(zip(runs, costs, strict=True))
-    return float(sum(np.mean([cost for run, cost in pairs if run.task == task]) for task in (MOVE, CURVE)))
+    return float(np.mean(costs))
 
 
 def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[Cost]:

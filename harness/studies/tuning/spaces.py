@@ -1,32 +1,35 @@
-"""What may be tuned: for each controller three to six parameters and their ranges.
+"""What may be tuned: for each controller its switches and its numbers with their ranges.
 
 Ranges reach about a factor of ten around the defaults, or as far as a method allows; `log` ones are searched by factor.
-Everything else keeps the default of its class, and is the same for all: limits, noise, delay, period and the preview of
-ten rows. The preview is offered to all methods alike. `rbfnn_mfac`, `ukf_mpc` and `nmpc_calibrated` look at it by
-construction; the laws `mfac` and `pid` may use its first row, and whether they do (`feedforward`) is a parameter, for
-all of them. Predictive laws must bridge delay and horizon within the preview, so that what is searched is their `reach`
-= horizon_time + delay.
+Everything else keeps the default of its class, and is the same for all: limits, delays, period and the preview.
 
-`nmpc_calibrated` has no space. It is a bound that never looks at the camera: tuned where its model of the delay is
-exact it gains nothing (0.071 against 0.072) and then cycles around the target on the rendered plant, whose joints
-answer one period earlier.
+Every best equipped method has all words of the section `aids` as switches, but for those that its law brings itself,
+and the same three numbers of the aids. A delay or response that is given by a number is no choice: it would be a guess
+where latencies differ. `NAME:published` has the numbers of its law as printed and of its estimator, and no aid. A
+combination that cannot be built has the worst score without a run.
+
+The bounds `constant` and `calibrated` have their gains only, `nmpc_calibrated` has no space: it never looks at the
+camera, and tuned where its model of the delay is exact it gains nothing (0.071 against 0.072) and then cycles around
+the target on the rendered plant, whose joints answer one period earlier.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Final, TypeAlias
 
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
 from servobench.plant.settings import suggest
 
-Space: TypeAlias = Mapping[str, BaseDistribution]
+Distribution: TypeAlias = CategoricalDistribution | FloatDistribution | IntDistribution
+Space: TypeAlias = Mapping[str, Distribution]
+Point: TypeAlias = Mapping[str, Any]
+"""A value for each key of a space."""
 
-REACH: Final = "reach"
 DIGITS: Final = 3  # of a tuned number: more would pretend to a precision that no study has
 
 
@@ -35,73 +38,97 @@ def _log(low: float, high: float) -> FloatDistribution:
 
 
 _SWITCH: Final = CategoricalDistribution((False, True))
-_PID: Final[Space] = {
-    "law.proportional_gain": _log(0.5, 8.0),  # 1/s
-    "law.damping": _log(0.002, 0.2),  # m/rad
-    "law.feedforward": _SWITCH,
+_AIDS: Final[Space] = {
+    "aids.delay": CategoricalDistribution(("ignored", "identified")),
+    "aids.response": CategoricalDistribution(("ignored", "identified")),
+    "aids.noise": CategoricalDistribution(("given", "identified")),
+    "aids.filter": _SWITCH,
+    "aids.model": CategoricalDistribution(("own", "nominal", "map")),
+    "aids.feedforward": _SWITCH,
+    "aids.posture": _SWITCH,
+    "aids.limit": CategoricalDistribution(("scale", "clip", "redistribute")),
+    "aids.map_walk": _log(0.03, 3.0),  # 1/√m
+    "aids.map_error": _log(0.01, 0.5),
+    "aids.posture_gain": FloatDistribution(0.0, 1.0),  # 1/s
 }
-_PID_INTEGRAL: Final[Space] = {**_PID, "law.integral_gain": FloatDistribution(0.0, 3.0)}  # 1/s²
+_P: Final[Space] = {
+    "law.proportional_gain": _log(0.5, 30.0),  # 1/s
+    "law.damping": _log(0.002, 0.2),  # m/rad
+}
+_PI: Final[Space] = {**_P, "law.integral_gain": FloatDistribution(0.0, 3.0)}  # 1/s²
+_PID: Final[Space] = {**_PI, "law.derivative_gain": FloatDistribution(0.0, 0.5)}
 _MFAC: Final[Space] = {
-    "law.step_factor": _log(0.03, 0.6),
-    "law.step_weight": _log(0.001, 0.2),  # m²/rad²
-    "law.feedforward": _SWITCH,
+    "law.gain": _log(0.6, 40.0),  # 1/s
+    "law.step_weight": _log(1e-4, 0.2),  # m²/rad²
+}
+_MPC: Final[Space] = {
+    "law.decay": _log(0.6, 40.0),  # 1/s
+    "law.move_weight": _log(0.001, 1.0),  # m²/rad²
+    "law.horizon_time": FloatDistribution(0.2, 0.5, step=0.05),  # s, at most the preview
+}
+_RBFNN: Final[Space] = {
+    "law.k": _log(0.01, 1.0),
+    "law.epsilon": _log(1e-5, 1e-1),  # m⁴
+    "law.horizon": IntDistribution(3, 10),  # steps of 0.05 s, at most the preview
+    "training.controller.gain": FloatDistribution(2.0, 5.0, step=1.0),  # 1/s; each value is a training of its own
+}
+_RBF: Final[Space] = {
+    "estimator.k2": FloatDistribution(0.05, 1.8),
+    "estimator.epsilon": _log(1e-5, 1e-2),  # rad²
+}
+_LYAPUNOV: Final[Space] = {
+    "estimator.n2": _log(1e-4, 0.2),  # 1/(m s)
+    "estimator.n3": _log(1e-3, 2.0),  # 1/m
+}
+_UKF: Final[Space] = {
+    "estimator.walk": _log(0.004, 1.5),  # m/rad/√rad
+    "estimator.initial_deviation": _log(0.005, 0.5),  # m/rad
+}
+_BROYDEN: Final[Space] = {
+    "estimator.step_factor": _log(0.02, 1.0),
+    "estimator.min_joint_step": _log(0.001, 0.05),  # rad
+}
+_RLS: Final[Space] = {
+    "estimator.memory": _log(0.2, 20.0),  # s
+    "estimator.initial_covariance": _log(0.5, 100.0),  # 1/rad²; the class bounds it by 100
+}
+_CFDL: Final[Space] = {
+    "estimator.reset": _SWITCH,
+    "estimator.step_factor": FloatDistribution(0.05, 1.9),
+    "estimator.regularisation": _log(1e-5, 0.1),  # rad²
+}
+
+
+def _aids(without: Collection[str] = ()) -> Space:
+    """Return the space of the aids but for those that a law or an estimator brings."""
+    return {key: values for key, values in _AIDS.items() if key.removeprefix("aids.") not in without}
+
+
+_MPC_SWITCHES: Final[Space] = {"law.mode": CategoricalDistribution(("constant", "moves")), "law.use_preview": _SWITCH}
+_RBFNN_SWITCHES: Final[Space] = {
+    "law.preview": _SWITCH,
+    "law.row_space_only": _SWITCH,
+    "law.anti_windup": _SWITCH,
 }
 
 SPACES: Final[Mapping[str, Space]] = {
-    "rbfnn_mfac": {
-        "law.k": _log(0.01, 1.0),
-        "law.epsilon": _log(1e-5, 1e-1),  # m⁴
-        "law.horizon": IntDistribution(3, 10),  # periods, at most the preview
-        "estimator.k2": FloatDistribution(0.05, 1.8),
-        "estimator.epsilon": _log(1e-5, 1e-2),  # rad²
-        "training.controller.gain": FloatDistribution(2.0, 5.0, step=1.0),  # 1/s; each value is a training of its own
-    },
-    "rbfnn_mfac_plus": {
-        "law.gain": _log(4.0, 30.0),  # 1/s
-        "law.k": _log(0.01, 1.0),
-        "law.leak": FloatDistribution(0.0, 0.1),
-        "law.posture_gain": FloatDistribution(0.0, 1.0),  # 1/s
-        "estimator.walk": _log(0.03, 3.0),
-        "estimator.model_error": _log(0.01, 0.5),
-    },
-    "ukf_mfac": {
-        **_MFAC,
-        "estimator.process_deviation": _log(0.001, 0.3),  # m/rad
-        "estimator.initial_deviation": _log(0.005, 0.5),  # m/rad
-    },
-    "ukf_mpc": {
-        "law.decay": _log(0.6, 40.0),  # 1/s
-        "law.move_weight": _log(0.001, 1.0),  # m²/rad²
-        "law.reach": FloatDistribution(0.25, 0.5, step=0.05),  # s, at most the preview
-        "law.delay": FloatDistribution(0.0, 0.15, step=0.05),  # s
-        "estimator.process_deviation": _log(0.001, 0.3),  # m/rad
-        "estimator.initial_deviation": _log(0.005, 0.5),  # m/rad
-    },
-    "rbf_pid": {
-        "law.proportional_gain": _log(0.5, 8.0),  # 1/s
-        "law.integral_gain": FloatDistribution(0.0, 3.0),  # 1/s²
-        "law.derivative_gain": FloatDistribution(0.0, 0.5),
-        "law.feedforward": _SWITCH,
-        "estimator.n2": _log(1e-4, 0.2),  # 1/(m s)
-        "estimator.n3": _log(1e-3, 2.0),  # 1/m
-    },
-    "constant": _PID_INTEGRAL,
-    "calibrated": _PID_INTEGRAL,
-    "broyden": {
-        **_PID,
-        "estimator.step_factor": _log(0.02, 1.0),
-        "estimator.min_joint_step": _log(0.001, 0.05),  # rad
-    },
-    "rls": {
-        **_PID,
-        "estimator.forgetting": FloatDistribution(0.8, 1.0),
-        "estimator.initial_covariance": _log(0.5, 100.0),  # 1/rad²; the class bounds it by 100
-    },
-    "cfdl_mfac": {
-        **_MFAC,
-        "estimator.step_factor": FloatDistribution(0.05, 1.9),
-        "estimator.regularisation": _log(1e-5, 0.1),  # rad²
-    },
+    "rbfnn_mfac": {**_aids({"posture", "posture_gain"}), **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
+    "rbfnn_mfac:published": {**_RBFNN, **_RBF},
+    "map_mfac": {**_aids(), **_MFAC},
+    "ukf_mfac": {**_aids(), **_MFAC, **_UKF},
+    "ukf_mfac:published": {**_MFAC, **_UKF},
+    "ukf_mpc": {**_aids({"feedforward", "limit"}), **_MPC_SWITCHES, **_MPC, **_UKF},
+    "ukf_mpc:published": {**_MPC, **_UKF},
+    "rbf_pid": {**_aids(), **_PID, **_LYAPUNOV},
+    "rbf_pid:published": {**_P, **_LYAPUNOV},
+    "constant": _PI,
+    "calibrated": _PI,
+    "broyden": {**_aids(), **_PID, **_BROYDEN},
+    "broyden:published": {**_P, **_BROYDEN},
+    "rls": {**_aids(), **_PID, **_RLS},
+    "rls:published": {**_P, **_RLS},
+    "cfdl_mfac": {**_aids(), **_MFAC, **_CFDL},
+    "cfdl_mfac:published": {**_MFAC, **_CFDL},
 }
 
 
@@ -117,27 +144,40 @@ def find_tunable(name: str) -> ControllerEntry:
     return entry
 
 
-def default_values(entry: ControllerEntry) -> dict[str, Any]:
+def find_space(name: str) -> Space:
+    """Return the search space of a controller, its switches first.
+
+    Raises:
+        ConfigurationError: an unknown controller, or one without a space.
+    """
+    find_tunable(name)
+    space = SPACES[name]
+    return {key: space[key] for key in sorted(space, key=lambda key: not is_switch(space[key]))}
+
+
+def is_switch(distribution: Distribution) -> bool:
+    """Return whether a parameter is a choice, not a number."""
+    return isinstance(distribution, CategoricalDistribution)
+
+
+def default_values(entry: ControllerEntry) -> Point:
     """Return the point of the search space that is the default of the controller's class, untuned."""
-    flat = flatten(entry.config())
-    for key in SPACES[entry.name]:
-        prefix, _, last = key.rpartition(REACH)
-        if not last and key not in flat:
-            flat[key] = flat[f"{prefix}horizon_time"] + flat[f"{prefix}delay"]
-    return {key: flat[key] for key in SPACES[entry.name]}
+    return values_of(entry.name, entry.config())
 
 
-def nested_settings(values: Mapping[str, Any]) -> dict[str, Any]:
+def values_of(name: str, config: Any) -> Point:  # noqa: ANN401 - any configuration dataclass
+    """Return the point of a controller's search space that its settings are."""
+    flat = flatten(config)
+    return {key: flat[key] for key in find_space(name)}
+
+
+def nested_settings(values: Point) -> dict[str, Any]:
     """Return the nested settings of a point of a search space, numbers rounded to three digits."""
     nested: dict[str, Any] = {}
     for key, value in values.items():
-        prefix, _, last = key.rpartition(".")
+        *path, last = key.split(".")
         target = nested
-        for word in prefix.split(".") if prefix else ():
+        for word in path:
             target = target.setdefault(word, {})
-        if last == REACH:
-            dot = "." if prefix else ""
-            target["horizon_time"] = float(f"{value - values[f'{prefix}{dot}delay']:.{DIGITS}g}")
-        else:
-            target[last] = float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+        target[last] = float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
     return nested

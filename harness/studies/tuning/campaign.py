@@ -1,0 +1,339 @@
+"""All studies of all methods, advanced in step, and the best of each method chosen on a second set of robots.
+
+In a round every study asks for the one point that it needs next; all runs of the points that no ledger knows yet are
+carried out by the workers, and the ledgers of their methods take the costs. What is decided is decided in this process
+from the ledgers only: so the outcome is the same for any number of workers, and for a call that was interrupted and
+repeated.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, TypeAlias, final
+
+import numpy as np
+
+from servobench.harness.batch.lock import LOCK
+from servobench.harness.batch.workers import Workers
+from servobench.harness.config.defaults import apply_settings, default_config, file_stem
+from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.harness.run.experiment import build
+from servobench.harness.run.request import RunSettings
+from servobench.harness.studies.tuning import objective
+from servobench.harness.studies.tuning.files import StudyRecord, TunedValues, write_tuned
+from servobench.harness.studies.tuning.ledger import LEDGER, Ledger
+from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate, score
+from servobench.harness.studies.tuning.spaces import Point, default_values, find_space, find_tunable, nested_settings
+from servobench.harness.studies.tuning.study import StudyOutcome, first_points, study
+from servobench.plant.settings import Count, Periods, settings
+
+SECOND: Final = ".second"  # of the name of the ledger of the second set
+Wanted: TypeAlias = tuple["Ledger", str, Point]
+"""A point whose costs a ledger lacks: the ledger, the controller, the point."""
+
+
+@settings
+class TuningPlan:
+    """What is asked for."""
+
+    controllers: tuple[str, ...]
+    """names with a search space"""
+    trials: Count
+    """of the sampler in each study, that of the defaults and of other known settings included"""
+    runs: TuningSet
+    """on which a point is scored"""
+    studies: Count = 3
+    """of each method, with samplers of their own"""
+    search: Periods = 100
+    """most points of the coordinate search that ends a study"""
+    study_seed: Periods = 0
+    """seed of the first study's sampler; the others count on from it"""
+
+    def __post_init__(self) -> None:
+        """Refuse an unknown controller and one without a search space."""
+        for name in self.controllers:
+            find_tunable(name)
+
+
+@final
+class RunningStudy:
+    """A study and where it stands.
+
+    Attributes:
+        seed: of its sampler.
+        wanted: the point that it asks for; None once it has ended.
+        asked: number of points that it was given the scores of.
+        outcome: what it found, once it has ended.
+    """
+
+    def __init__(self, seed: int, course: Generator[Point, float, StudyOutcome]) -> None:
+        """Ask for the first point."""
+        self.seed, self.asked = seed, 0
+        self.outcome: StudyOutcome | None = None
+        self._course = course
+        self.wanted: Point | None = next(course)
+
+    def advance(self, ledger: Ledger) -> None:
+        """Go on up to a point that the ledger does not know, or to the end."""
+        while self.wanted is not None and (costs := ledger.costs(nested_settings(self.wanted))) is not None:
+            try:
+                self.asked += 1
+                self.wanted = self._course.send(score(costs))
+            except StopIteration as end:
+                self.wanted, self.outcome = None, end.value
+
+
+@final
+class Method:
+    """A controller with its studies and the ledgers of both sets."""
+
+    def __init__(self, folder: Path, name: str, plan: TuningPlan) -> None:
+        """Open its ledgers.
+
+        Raises:
+            ConfigurationError: a file of the folder is no ledger, or one of other settings or runs.
+        """
+        self.name, self._plan, second = name, plan, plan.runs.second()
+        self.ledger = open_ledger(folder, name, plan.runs)
+        self.second = open_ledger(folder, name, second, SECOND)
+        self.studies: list[RunningStudy] = []
+
+    def begin(self) -> None:
+        """Begin its studies."""
+        plan, space, first = self._plan, find_space(self.name), first_points(self.name)
+        seeds = range(plan.study_seed, plan.study_seed + plan.studies)
+        self.studies = [
+            RunningStudy(seed, study(self.name, space, first, plan.trials, plan.search, seed)) for seed in seeds
+        ]
+
+    @property
+    def done(self) -> int:
+        """Number of points asked for, as if every finished study had used its whole budget."""
+        whole = self._plan.trials + self._plan.search
+        return sum(each.asked if each.outcome is None else whole for each in self.studies)
+
+    def chosen(self) -> list[Point]:
+        """Return the points to be scored on the second set: the defaults and what the studies found; none before."""
+        found = [each.outcome.found.values for each in self.studies if each.outcome is not None]
+        return [default_values(find_tunable(self.name)), *found] if len(found) == len(self.studies) else []
+
+    def result(self) -> TunedValues | None:
+        """Return what the finished studies found; None while one is not finished or not scored on the second set."""
+        records = [record for each in self.studies if (record := self._record(each)) is not None]
+        if len(records) < len(self.studies):
+            return None
+        best, runs = min(records, key=lambda record: record.second_score), self._plan.runs
+        default = nested_settings(default_values(find_tunable(self.name)))
+        mine, theirs = self.ledger.costs(best.settings), self.ledger.costs(default)
+        on_second = self.second.costs(default)
+        if mine is None or theirs is None or on_second is None:
+            return None
+        checked = runs.checked()
+        return TunedValues(
+            controller=self.name,
+            robots=runs.robots,
+            offset=runs.offset,
+            plants=runs.plants,
+            runs_a_trial=len(mine),
+            runs_of_second_set=len(on_second),
+            date=datetime.now(UTC).date().isoformat(),
+            version=version("servobench"),
+            score=score(mine),
+            score_of_defaults=score(theirs),
+            second_score=best.second_score,
+            second_score_of_defaults=score(on_second),
+            checked_score=score([mine[i] for i in checked]),
+            checked_score_of_defaults=score([theirs[i] for i in checked]),
+            settings=best.settings,
+            studies=tuple(records),
+        )
+
+    def _record(self, running: RunningStudy) -> StudyRecord | None:
+        if running.outcome is None:
+            return None
+        outcome, chosen = running.outcome, nested_settings(running.outcome.found.values)
+        second = self.second.costs(chosen)
+        if second is None:
+            return None
+        return StudyRecord(
+            seed=running.seed,
+            trials=outcome.trials,
+            best_trial=outcome.best_trial,
+            best_trial_score=outcome.best_trial_score,
+            search_points=outcome.found.evaluations,
+            search_complete=outcome.found.complete,
+            score=outcome.found.score,
+            second_score=score(second),
+            settings=chosen,
+        )
+
+
+def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") -> Ledger:
+    """Return the ledger of a controller on a set of runs.
+
+    Raises:
+        ConfigurationError: the file is no ledger, or one of other settings or runs.
+    """
+    return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint(controller, runs))
+
+
+def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
+    """Return all that costs depend on besides the settings, as JSON has it."""
+    constants = ("CONDITIONS", "MISMATCHES", "TASKS", "ERROR_SCALE", "WORST")
+    return {
+        "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
+        "objective": {name: repr(getattr(objective, name)) for name in constants},
+        "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
+        "plants": list(runs.plants),
+        "robots": [runs.robots, runs.offset],
+    }
+
+
+def check_study_folder(folder: Path) -> None:
+    """Refuse a folder with other things than studies in it.
+
+    Raises:
+        ConfigurationError: names the folder.
+    """
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else [folder.name] * folder.exists()
+    if set(names) - {LOCK} and not any(name.endswith(LEDGER) for name in names):
+        raise ConfigurationError(f"{folder} exists already and holds no study; name another folder with --out")
+
+
+def open_methods(folder: Path, plan: TuningPlan) -> list[Method]:
+    """Open the ledgers of a plan's methods and begin their studies.
+
+    Raises:
+        ConfigurationError: the folder has other things in it or cannot be made, or a ledger of it is another one.
+    """
+    check_study_folder(folder)
+    make_folder(folder)
+    methods = [Method(folder, name, plan) for name in plan.controllers]
+    for method in methods:
+        refuse_broken_defaults(method.name, plan.runs)
+        method.begin()
+    return methods
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of studies.
+
+    Raises:
+        ConfigurationError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"study folder {folder} cannot be made: {error.strerror}") from error
+
+
+def refuse_broken_defaults(controller: str, runs: TuningSet) -> None:
+    """Build the first run with the settings in use, so that what no setting can cure is said before any run.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used.
+    """
+    reason = refusal(Trial(controller, default_config(find_tunable(controller))), runs)
+    if reason is not None:
+        raise ConfigurationError(reason)
+
+
+def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> Iterator[Method]:
+    """Carry the studies out, and score what those of a method found on the second set as soon as all have ended.
+
+    Yields:
+        A method after each of its points.
+    """
+    by_name = {method.name: method for method in methods}
+    under_way = True
+    while under_way:
+        wanted = _wanted(methods)
+        under_way = bool(wanted)
+        yield from methods
+        chosen = [(method.second, method.name, point) for method in methods for point in method.chosen()]
+        for points, runs in ((wanted, plan.runs), (chosen, plan.runs.second())):
+            for name in fill(points, runs, workers):
+                yield by_name[name]
+
+
+def _wanted(methods: Sequence[Method]) -> list[Wanted]:
+    wanted: list[Wanted] = []
+    for method in methods:
+        for each in method.studies:
+            each.advance(method.ledger)
+            if each.wanted is not None:
+                wanted.append((method.ledger, method.name, each.wanted))
+    return wanted
+
+
+def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
+    """Score the points that their ledgers lack, each once, and yield the controller of each as soon as it is written.
+
+    Settings that cannot be built have the worst cost in every run.
+    """
+    requests = runs.runs()
+    lacking: dict[str, tuple[Ledger, Trial, dict[str, Any]]] = {}
+    for ledger, name, point in wanted:
+        nested = nested_settings(point)
+        if ledger.costs(nested) is not None or f"{name}{nested}" in lacking:
+            continue
+        try:
+            trial = Trial(name, apply_settings(find_tunable(name), nested))
+            refused = refusal(trial, runs) is not None
+        except ConfigurationError:
+            refused = True
+        if refused:
+            ledger.add(nested, [WEIGHTS[run.task] * WORST for run in requests])
+            yield name
+        else:
+            lacking[f"{name}{nested}"] = ledger, trial, nested
+    points = list(lacking.values())
+    costs = np.full((len(points), len(requests)), np.nan)
+    for point_index, run_index, cost in evaluate([trial for _, trial, _ in points], requests, workers):
+        costs[point_index, run_index] = cost
+        if not np.isnan(costs[point_index]).any():
+            ledger, trial, nested = points[point_index]
+            with undisturbed():
+                ledger.add(nested, costs[point_index].tolist())
+            yield trial.controller
+
+
+def refusal(trial: Trial, runs: TuningSet) -> str | None:
+    """Return why a run with these settings cannot be built, or None; networks are trained before workers need them.
+
+    Whatever else fails is left to the runs, whose cost says so.
+    """
+    try:
+        build(trial.resolved(runs.runs()[:1])[0]).plant.close()
+    except ConfigurationError as error:
+        return str(error)
+    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
+        return None
+    return None
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C back until the end, so that it cannot interrupt a ledger that is written."""
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
+
+
+def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, TunedValues]:
+    """Write `NAME.toml` for every method whose studies are finished, and return their contents by name."""
+    results = {method.name: tuned for method in methods if (tuned := method.result()) is not None}
+    for name, tuned in results.items():
+        write_tuned(folder / f"{file_stem(name)}.toml", tuned)
+    return results

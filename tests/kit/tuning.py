@@ -1,0 +1,50 @@
+"""Tuning in small: few runs, and runs whose cost is a formula."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from servobench.harness.batch.workers import open_workers
+from servobench.harness.config.settings import flatten
+from servobench.harness.studies.tuning import campaign
+from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods
+from servobench.harness.studies.tuning.objective import TuningSet
+
+SMALL = TuningSet(robots=2)
+
+
+def plan_of(*names, trials=1, studies=1, search=0, **further):
+    """Return a plan on the smallest set of runs."""
+    return TuningPlan(names, trials, SMALL, studies, search, **further)
+
+
+def carried_out(folder, plan, workers=1):
+    """Carry a plan out and return its methods."""
+    methods = open_methods(folder, plan)
+    with open_workers(workers) as place:
+        for _ in advance(methods, plan, place):
+            pass
+    return methods
+
+
+def outcomes(folder, plan, workers=1):
+    """Carry a plan out and return what each study of each method found."""
+    return [[each.outcome for each in method.studies] for method in carried_out(folder, plan, workers)]
+
+
+def cost_by_formula(monkeypatch):
+    """Let runs cost nothing: their cost is a smooth function of settings and seed. Return what will be scored."""
+    scored = []
+
+    def cost(trial, run):
+        numbers = [value for value in flatten(trial.config).values() if isinstance(value, float)]
+        return float(np.sum(np.square(np.tanh(numbers[:2]) - 0.1)) + 1e-3 * (run.seed % 7))
+
+    def costs(trials, runs, _workers):
+        for t, trial in enumerate(trials):
+            scored.append((trial.controller, len(runs), str(trial.config)))
+            for r, run in enumerate(runs):
+                yield t, r, cost(trial, run)
+
+    monkeypatch.setattr(campaign, "evaluate", costs)
+    return scored
