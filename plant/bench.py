@@ -264,4 +264,10 @@ def build_bench(
         ValueError: times without a common sub-step, or whatever `make` refuses.
     """
     step = common_step(setup.period, command_delay, sensing)
-    return Bench(make(replace(setup, period=step)), command_delay, sensing, setup.period)
+    try:
+        world = make(replace(setup, period=step))
+    except ValueError as error:
+        if step == setup.period:
+            raise
+        raise ValueError(f"in sub-steps of {step:g} s, which the delays and the period need: {error}") from error
+    return Bench(world, command_delay, sensing, setup.period)

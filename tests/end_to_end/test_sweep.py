@@ -81,6 +81,24 @@ def test_a_finished_sweep_is_not_run_again(undisturbed, monkeypatch, capsys):
     assert "camera_rotation=20deg" in capsys.readouterr().out
 
 
+def test_a_sweep_over_control_periods_has_the_same_robots_and_the_rows_of_single_runs(monkeypatch, capsys, tmp_path):
+    out, alone = tmp_path / "periods", tmp_path / "alone"
+    common = ("sweep", "--controllers", "rbf_pid", "--seeds", "2", "--workers", "1", "--set", "random.duration=1")
+    assert servobench(monkeypatch, *common, "--period", "0.05,0.02", "--out", str(out)) == 0
+    assert "50" in capsys.readouterr().out
+    assert servobench(monkeypatch, *common, "--set", "run.period=0.02", "--out", str(alone)) == 0
+    table, fast = results.load_runs(out), judged(results.load_runs(alone))
+    assert table["period_s"].tolist() == [0.05, 0.05, 0.02, 0.02]
+    assert table["periods"].tolist() == [20, 20, 50, 50]
+    assert table["run_id"].str.contains("-period").all()
+    drawn = table.groupby("seed")["mismatch_values"].nunique()
+    assert drawn.tolist() == [1, 1]
+    own = ["run_id", "period_s"]
+    pd.testing.assert_frame_equal(
+        judged(table).iloc[2:].drop(columns=own).reset_index(drop=True), fast.drop(columns=own), check_exact=True
+    )
+
+
 def test_ctrl_c_keeps_what_is_finished(tmp_path):
     out = tmp_path / "stopped"
     process = start(*SWEEP, "--out", str(out))

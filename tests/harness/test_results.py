@@ -91,6 +91,9 @@ def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
     (folder / results.MANIFEST).write_text(json.dumps({"schema_version": "0"}))
     with pytest.raises(ConfigurationError, match="results of schema '0'; this servobench reads"):
         results.load_runs(folder)
+    (folder / results.MANIFEST).write_text(json.dumps({"schema_version": "3"}))
+    with pytest.raises(ConfigurationError, match=r"schema '3'.*latency_periods \[periods\] is now latency_s \[s\]"):
+        results.load_runs(folder)
     with pytest.raises(ConfigurationError, match="is not a results folder"):
         results.load_steps(tmp_path)
     with pytest.raises(ConfigurationError, match="is not a results folder"):
