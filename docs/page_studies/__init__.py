@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from page_studies.audit import AUDIT
 from page_studies.claims import CLAIMS
 from page_studies.failures import FAILURES
 from page_studies.held_out import HELD_OUT
@@ -13,6 +14,7 @@ from page_studies.worlds import MAP, PAIRS_STUDY, WORLDS
 STUDIES = {
     study.name: study
     for study in (
-        HELD_OUT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS, PAIRS_STUDY, MAP, README, FAILURES, PERFORMANCE,
+        HELD_OUT, AUDIT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS, PAIRS_STUDY, MAP, README, FAILURES,
+        PERFORMANCE,
     )
 }  # fmt: skip
