@@ -9,7 +9,7 @@ RUNS ?= results/pages
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
-	  --controllers rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
+	  --controllers map_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid,constant,calibrated,nmpc_calibrated
 
 # For every save: half a minute.
 check: lint

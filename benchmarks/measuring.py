@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.figure import Figure
 
-METHODS = ("ukf_mfac", "ukf_mpc", "rbf_pid", "rbfnn_mfac", "rbfnn_mfac_plus")
+METHODS = ("ukf_mfac", "ukf_mpc", "rbf_pid", "rbfnn_mfac", "map_mfac")
 PERIODS = 200  # of a run of the task random
 FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110

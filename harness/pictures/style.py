@@ -53,7 +53,7 @@ class MethodStyle:
 
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
-    "rbfnn_mfac_plus": MethodStyle(WINE, "-", "*"),
+    "map_mfac": MethodStyle(WINE, "-", "*"),
     "ukf_mfac": MethodStyle(BLUE, "--", "s"),
     "ukf_mpc": MethodStyle(GREEN, "-.", "^"),
     "rbf_pid": MethodStyle(ORANGE, (0, (5, 1)), "D"),

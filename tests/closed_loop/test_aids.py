@@ -1,0 +1,66 @@
+"""Methods with and without aids on the kinematic plant: turned, late and moved cameras, circles, settings."""
+
+import numpy as np
+import pytest
+
+from servobench.harness.config.settings import read_settings
+from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.request import RunRequest
+
+EQUIPPED = ("map_mfac", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
+TURNED = "moderate+camera_rotation=120deg"
+PLUS, PAPER = "map_mfac", "rbfnn_mfac:published"
+
+
+def row(controller, task, mismatch, seed, *settings, latency=None):
+    request = RunRequest("kinematic", controller, task, mismatch, seed, latency=latency)
+    return run_experiment(request, read_settings(None, settings)).row
+
+
+@pytest.mark.parametrize("name", EQUIPPED)
+def test_with_its_aids_a_method_settles_soon_behind_a_turned_and_late_camera(name):
+    times = [row(name, "random", TURNED, seed, latency=0.1)["settling_time_s"] for seed in range(2)]
+    assert max(times) < 5.0
+
+
+def test_a_turned_and_late_camera_stops_the_published_method():
+    for seed in range(2):
+        assert np.isnan(row(PAPER, "random", TURNED, seed, latency=0.1)["settling_time_s"])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_links_and_tool_and_a_camera_turned_right_round_settle(seed):
+    found = row(PLUS, "random", "links=20%+tool=60mm+camera_rotation=180deg", seed)
+    assert found["settling_time_s"] < 4.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_camera_that_is_moved_during_the_run_is_noticed_once_and_recovered_from(seed):
+    settings = read_settings(None, ["random.duration=10"])
+    run = run_experiment(RunRequest("kinematic", PLUS, "random", "moderate+camera_move=90deg", seed), settings)
+    assert 5.0 < run.row["settling_time_s"] < 9.0
+    assert run.steps["diagnostic_camera_moves"].iloc[-1] == 1.0
+
+
+def test_it_is_sooner_there_with_less_overshoot_and_tracks_better_than_the_method_of_the_paper():
+    for seed in range(2):
+        plus, paper = (row(name, "random", "moderate", seed) for name in (PLUS, PAPER))
+        assert plus["settling_time_s"] < paper["settling_time_s"]
+        assert plus["overshoot"] < 0.5 * paper["overshoot"] + 0.005
+    assert row(PLUS, "circle", "moderate", 1)["rms_error_evaluated"] < 0.004
+
+
+def test_the_method_of_the_paper_tracks_a_circle_within_10_mm_and_worse_without_the_row_space():
+    kept, leaking = (
+        row(PAPER, "circle", "moderate", 1, f"{PAPER}.law.row_space_only={only}")["rms_error_evaluated"]
+        for only in ("true", "false")
+    )
+    assert kept < 0.010
+    assert leaking > 1.5 * kept
+
+
+def test_the_settings_reach_the_parts():
+    slow, fast = (row(PLUS, "random", "none", 0, f"{PLUS}.law.gain={gain}") for gain in (2.0, 20.0))
+    assert slow["settling_time_s"] > 1.3 * fast["settling_time_s"]
+    blind = row(PLUS, "random", "camera_rotation=120deg", 0, f"{PLUS}.aids.model=own")
+    assert np.isnan(blind["settling_time_s"])
