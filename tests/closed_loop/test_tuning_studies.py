@@ -166,6 +166,15 @@ def test_settings_that_cannot_be_built_have_the_worst_cost_and_are_not_carried_o
     assert not made_up
 
 
+@pytest.mark.parametrize(("gain", "runs"), [(2.5, 1), (29.0, 0)])
+def test_a_loop_with_too_small_a_delay_margin_has_the_worst_cost_without_a_run(made_up, tmp_path, gain, runs):
+    ledger = open_ledger(tmp_path, "constant", SMALL)
+    point = {**default_values(find_tunable("constant")), "law.proportional_gain": gain}
+    assert list(fill([(ledger, "constant", point)], SMALL, Workers())) == ["constant"]
+    assert len(made_up) == runs
+    assert (score(ledger.costs(nested_settings(point))) == pytest.approx(WORST)) == (runs == 0)
+
+
 def test_any_number_of_workers_gives_the_same_studies_and_files_say_what_they_hold(tmp_path):
     plan = plan_of("broyden:published", trials=2, studies=2, search=1)
     one, two = carried_out(tmp_path / "one", plan), carried_out(tmp_path / "two", plan, workers=2)

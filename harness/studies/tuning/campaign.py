@@ -19,6 +19,7 @@ from typing import Any, Final, TypeAlias, final
 
 import numpy as np
 
+from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.defaults import apply_settings, default_config, file_stem
@@ -185,7 +186,7 @@ def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") 
 
 def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
     """Return all that costs depend on besides the settings, as JSON has it."""
-    constants = ("CONDITIONS", "MISMATCHES", "TASKS", "ERROR_SCALE", "WORST")
+    constants = ("CONDITIONS", "MISMATCHES", "TASKS", "ERROR_SCALE", "MIN_DELAY_MARGIN", "WORST")
     return {
         "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
         "objective": {name: repr(getattr(objective, name)) for name in constants},
@@ -275,7 +276,7 @@ def _wanted(methods: Sequence[Method]) -> list[Wanted]:
 def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
     """Score the points that their ledgers lack, each once, and yield the controller of each as soon as it is written.
 
-    Settings that cannot be built have the worst cost in every run.
+    Settings that cannot be built or whose loop bears no delay have the worst cost in every run, without a run.
     """
     requests = runs.runs()
     lacking: dict[str, tuple[Ledger, Trial, dict[str, Any]]] = {}
@@ -285,7 +286,7 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
             continue
         try:
             trial = Trial(name, apply_settings(find_tunable(name), nested))
-            refused = refusal(trial, runs) is not None
+            refused = refusal(trial, runs) is not None or not bears_delay(trial)
         except ConfigurationError:
             refused = True
         if refused:
@@ -316,6 +317,20 @@ def refusal(trial: Trial, runs: TuningSet) -> str | None:
     except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
         return None
     return None
+
+
+def bears_delay(trial: Trial) -> bool:
+    """Return whether the loop of a composed controller has the least delay margin, `objective.MIN_DELAY_MARGIN`.
+
+    A controller that identifies the delay changes its loop with it and is left to the runs; so is one whose loop cannot
+    be analysed.
+    """
+    if trial.config.aids.delay == "identified":
+        return True
+    try:
+        return delay_margin(trial.config, trial.controller) >= objective.MIN_DELAY_MARGIN
+    except Exception:  # noqa: BLE001 - whatever fails in it fails in the runs, whose cost says so
+        return True
 
 
 @contextlib.contextmanager

@@ -75,6 +75,7 @@ TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
 }  # settings of the tasks: what is settled needs no more time
 ERROR_SCALE: Final = 0.05  # [m] error at which half of the worst cost of errors is reached
 WORST: Final = 2.0  # cost of a run that did not complete, and most of any run
+MIN_DELAY_MARGIN: Final = 0.05  # [s] of the loop at the usual latency; settings with less are refused without a run
 SECOND_OFFSET: Final = len(TUNING) // 2  # where in the tuning range the seeds of the second sets begin
 SECOND_FACTOR: Final = 3  # robots of the second set for each of the first
 
