@@ -163,6 +163,7 @@ class _Structure:
     def sections(self) -> tuple[_Section, ...]:
         state = ("joint_position", "joint_velocity")
         outputs: _Rows = [(name, (name,), True) for name in state]
+        outputs += [("encoder_position", ("joint_position",), True)]
         outputs += [(name, ("joint_position",), False) for name in ("ball_position", "jacobian")]
         derivatives: _Rows = [
             ("der(joint_position)", state, True),
@@ -173,6 +174,7 @@ class _Structure:
             ("joint_velocity", (), True),
             ("der(joint_position)", (), True),
             ("der(joint_velocity)", ("lag", "max_speed", "joint_velocity_command"), True),
+            ("encoder_position", ("encoder_resolution", "home"), True),
             ("ball_position", (*self._geometry, "home"), False),
             ("jacobian", (*self._geometry, "home"), False),
         ]

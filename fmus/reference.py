@@ -20,7 +20,7 @@ STEPS = 200
 INPUT_FILE = "extra/servobench/reference_input.csv"
 OUTPUT_FILE = "extra/servobench/reference_output.csv"
 COMMAND = "joint_velocity_command"
-OUTPUTS = ("joint_position", "joint_velocity", "ball_position")
+OUTPUTS = ("joint_position", "joint_velocity", "ball_position", "encoder_position")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
     n = model.arm.n
     limit, reach = actuation.max_speed, actuation.joint_range
     wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, n))
-    A, B = discretise_lag(actuation.lag, STEP)
+    lags = np.broadcast_to(actuation.lag, n).tolist()
+    A, B = (np.stack(parts, axis=-1) for parts in zip(*(discretise_lag(lag, STEP) for lag in lags), strict=True))
     positions, velocities = np.empty((STEPS + 1, n)), np.empty((STEPS + 1, n))
     q, v = np.array(actuation.home, dtype=np.float64), np.zeros(n)
     for k in range(STEPS + 1):
@@ -52,7 +53,14 @@ def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
         free = q + A[0, 1] * v + B[0] * u
         q = np.clip(free, -reach, reach)
         v = np.where(q == free, A[1, 1] * v + B[1] * u, 0.0)
-    outputs = {"joint_position": positions, "joint_velocity": velocities, "ball_position": model.feature(positions)}
+    resolution = np.broadcast_to(actuation.encoder_resolution, n)
+    steps = np.where(resolution > 0.0, resolution, 1.0)
+    outputs = {
+        "joint_position": positions,
+        "joint_velocity": velocities,
+        "ball_position": model.feature(positions),
+        "encoder_position": np.where(resolution > 0.0, np.round(positions / steps) * steps, positions),
+    }
     return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, wanted, outputs)
 
 

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
 import platformdirs
 
 from servobench.fmus.compile import CompilationFailed, CompilerMissing
@@ -35,6 +36,10 @@ class Ur5FmuConfig:
     """[rad] largest joint position each way; the vendor's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
+    joint_lags: tuple[NonNegative, ...] = ()
+    """[s] τ of each of the six joints in place of `lag`; an empty list for none."""
+    encoder_resolution: NonNegative = 0.0
+    """[rad] step of reported positions; 0 means exact ones, as those of `kinematic`."""
     command_delay: NonNegative = 0.05
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
@@ -63,13 +68,17 @@ def cached_fmu(fmi_version: int) -> Path:
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported UR5, with the true model of `setup` as its parameters, (..., size)."""
     model, start = setup.robot()
-    actuation = Actuation(config.lag, config.max_joint_speed, config.joint_range, start)
+    lag, n = config.joint_lags or (config.lag,), model.arm.n
+    if len(lag) not in {1, n}:
+        raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
+    resolution = config.encoder_resolution
+    actuation = Actuation(np.array(lag), config.max_joint_speed, config.joint_range, start, resolution)
     parameters = parameters_of(model, actuation)
     del parameters["home"]
     return FmuMapping(
         file=path,
         inputs=("joint_velocity_command",),
-        joints=("joint_position",),
+        joints=("encoder_position" if resolution > 0.0 else "joint_position",),
         features=("ball_position",),
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
@@ -91,7 +100,8 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
         path = cached_fmu(config.fmi_version)
     except (CompilerMissing, CompilationFailed, OSError) as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
-    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, config.lag)
+    lag = float(np.mean(config.joint_lags or config.lag))
+    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag)
 
 
 ENTRY = PlantEntry(

@@ -80,12 +80,14 @@ def arm_groups(n: int) -> tuple[Group, ...]:
         Group("max_speed", (n,), PARAMETER, "rad/s", "Commands beyond it, either way, are clipped.", 0.0),
         Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
         Group("joint_upper", (n,), PARAMETER, "rad", "The joint stops here."),
+        Group("encoder_resolution", (n,), PARAMETER, "rad", "Step of the encoder; 0 for an exact one.", 0.0),
         Group("home", (n,), PARAMETER, "rad", "Reported joint position at the start; read at initialisation."),
         Group("joint_velocity_command", (n,), INPUT, "rad/s", "Joint velocity command, held over a step."),
         Group("joint_position", (n,), STATE, "rad", "Reported joint position."),
         Group("joint_velocity", (n,), STATE, "rad/s", "Reported joint velocity."),
         Group("der(joint_position)", (n,), DERIVATIVE, "rad/s", "Derivative of the joint position."),
         Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
+        Group("encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."),
         Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
         Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),
     )
@@ -124,16 +126,18 @@ class Actuation:
     """Parameters of the model other than its geometry.
 
     Attributes:
-        lag: time constants of the velocity loops [s].
+        lag: time constant of the velocity loops [s], one for all joints or (n,).
         max_speed: limit of the joint speeds [rad/s].
         joint_range: distance of the stops from zero [rad].
         home: (..., n) reported joint positions at the start [rad].
+        encoder_resolution: step of the encoders [rad], one for all joints or (n,); 0 for exact ones.
     """
 
-    lag: float
+    lag: float | FloatArray
     max_speed: float
     joint_range: float
     home: FloatArray
+    encoder_resolution: float | FloatArray = 0.0
 
 
 def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:
@@ -151,10 +155,11 @@ def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatA
         "tool": arm.tool,
         "camera_position": model.X_BC[..., :3, 3],
         "camera_rpy": rpy_from_rotation(model.X_BC[..., :3, :3]),
-        "lag": np.full(n, actuation.lag),
+        "lag": np.array(np.broadcast_to(actuation.lag, n)),
         "max_speed": np.full(n, actuation.max_speed),
         "joint_lower": np.full(n, -actuation.joint_range),
         "joint_upper": np.full(n, actuation.joint_range),
+        "encoder_resolution": np.array(np.broadcast_to(actuation.encoder_resolution, n)),
         "home": as_array("home", actuation.home, (*model.lead, n)),
     }
 

@@ -17,6 +17,13 @@ static double clip(double value, double lower, double upper)
     return value < lower ? lower : value > upper ? upper : value;
 }
 
+/* The joint position in whole steps of its encoder; ties go to even numbers of steps. */
+static double encoder_position(const Model *model, size_t i)
+{
+    const double q = model->values[OFFSET_JOINT_POSITION + i], step = model->values[OFFSET_ENCODER_RESOLUTION + i];
+    return step > 0.0 ? rint(q / step) * step : q;
+}
+
 static double clipped_command(const Model *model, size_t i)
 {
     const double limit = model->values[OFFSET_MAX_SPEED + i];
@@ -106,6 +113,10 @@ static void refresh_derivatives(Model *model)
 ModelStatus model_get(Model *model, size_t index, double *value)
 {
     if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
+    if (index >= OFFSET_ENCODER_POSITION && index < OFFSET_BALL_POSITION) {
+        *value = encoder_position(model, index - OFFSET_ENCODER_POSITION);
+        return MODEL_OK;
+    }
     if (model->stale != 0 && index >= OFFSET_DER_JOINT_POSITION) {
         if (index >= OFFSET_JACOBIAN) {
             if (model->stale & STALE_JACOBIAN) refresh_kinematics(model, STALE_JACOBIAN);
@@ -177,6 +188,7 @@ void model_derive(const Model *model, double direction[N_VALUES], int starting)
         const int blocked = is_blocked(model, i);
         direction[OFFSET_DER_JOINT_POSITION + i] = blocked ? 0.0 : direction[OFFSET_JOINT_VELOCITY + i];
         direction[OFFSET_DER_JOINT_VELOCITY + i] = derive_acceleration(model, direction, i, blocked);
+        direction[OFFSET_ENCODER_POSITION + i] = direction[OFFSET_JOINT_POSITION + i]; /* the mean over a step */
     }
     double work[N_WORK];
     const double *arguments[4] = {model->values + OFFSET_JOINT_POSITION, model->values,

@@ -106,6 +106,50 @@ def test_any_lag_is_solved_exactly(lag):
     plant.close()
 
 
+def test_each_joint_may_have_a_lag_of_its_own():
+    lags, quiet = (0.0, 0.02, 0.05, 0.1, 0.2, 1.0), {"feature_noise": 0.0, "command_delay": 0.0}
+    plant = ENTRY.build(configure(Ur5FmuConfig, joint_lags=lags, **quiet), setup())
+    oracles = [KINEMATIC.build(configure(KinematicConfig, lag=lag, **quiet), setup()) for lag in lags]
+    for each in (plant, *oracles):
+        each.reset(0)
+    for _ in range(20):
+        command = Command(np.full(6, 0.7))
+        wanted = [oracle.step(command).joint_position[i] for i, oracle in enumerate(oracles)]
+        np.testing.assert_allclose(plant.step(command).joint_position, wanted, rtol=0, atol=1e-9)
+    plant.close()
+    with pytest.raises(ValueError, match="joint_lags must have 6 numbers or none, got 2"):
+        ENTRY.build(Ur5FmuConfig(joint_lags=(0.1, 0.2)), setup())
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_encoders_round_the_joint_position_to_their_steps(version):
+    steps = np.array([0.0, 1e-3, 1e-2, 0.1, 4.8e-5, 1.0])
+    with Opened(version) as opened:
+        opened.set("joint_velocity_command", np.linspace(-0.9, 0.9, 6))
+        opened.instance.stepper(0.5)(0.0)
+        q = opened.get("joint_position").copy()
+        np.testing.assert_array_equal(opened.get("encoder_position"), q)
+        opened.set("encoder_resolution", steps)
+        expected = np.where(steps > 0, np.round(q / np.maximum(steps, 1e-9)) * steps, q)
+        np.testing.assert_array_equal(opened.get("encoder_position"), expected)
+        np.testing.assert_array_equal(opened.get("joint_position"), q)
+        with pytest.raises(FmuError):
+            opened.set("encoder_resolution", -1.0)
+
+
+def test_the_plant_reports_encoder_steps_and_judges_by_exact_positions():
+    config = configure(Ur5FmuConfig, feature_noise=0.0)
+    coarse, exact = (ENTRY.build(replace(config, encoder_resolution=size), setup()) for size in (1e-2, 0.0))
+    coarse.reset(0), exact.reset(0)
+    for _ in range(5):
+        came, wanted = (plant.step(Command(np.full(6, 0.37))) for plant in (coarse, exact))
+        expected = np.round(wanted.joint_position / 1e-2) * 1e-2
+        np.testing.assert_allclose(came.joint_position, expected, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(came.feature, wanted.feature)
+        np.testing.assert_array_equal(coarse.truth().jacobian, exact.truth().jacobian)
+    coarse.close(), exact.close()
+
+
 @pytest.mark.parametrize("version", VERSIONS)
 def test_many_small_steps_end_where_one_large_step_ends(version):
     with Opened(version) as once, Opened(version) as often:
