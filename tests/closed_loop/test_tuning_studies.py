@@ -14,14 +14,7 @@ from servobench import controllers
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning import objective
-from servobench.harness.studies.tuning.campaign import (
-    TuningPlan,
-    advance,
-    fill,
-    open_ledger,
-    open_methods,
-    write_results,
-)
+from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods, write_results
 from servobench.harness.studies.tuning.files import StudyRecord, read_tuned, write_tuned
 from servobench.harness.studies.tuning.ledger import Ledger
 from servobench.harness.studies.tuning.objective import (
@@ -29,6 +22,7 @@ from servobench.harness.studies.tuning.objective import (
     TuningSet,
     score,
 )
+from servobench.harness.studies.tuning.scoring import fill, open_ledger
 from servobench.harness.studies.tuning.search import ACCEPTED, changes, coordinate_search, neighbours
 from servobench.harness.studies.tuning.spaces import (
     default_values,

@@ -6,7 +6,7 @@ import numpy as np
 
 from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.settings import flatten
-from servobench.harness.studies.tuning import campaign
+from servobench.harness.studies.tuning import scoring
 from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods
 from servobench.harness.studies.tuning.objective import TuningSet
 
@@ -46,5 +46,5 @@ def cost_by_formula(monkeypatch):
             for r, run in enumerate(runs):
                 yield t, r, cost(trial, run)
 
-    monkeypatch.setattr(campaign, "evaluate", costs)
+    monkeypatch.setattr(scoring, "evaluate", costs)
     return scored

@@ -12,16 +12,10 @@ from typing import Any, Final
 
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.defaults import default_config
-from servobench.harness.studies.tuning.campaign import (
-    SECOND,
-    Wanted,
-    fill,
-    make_folder,
-    open_ledger,
-    refuse_broken_defaults,
-)
+from servobench.harness.studies.tuning.campaign import make_folder
 from servobench.harness.studies.tuning.ledger import Ledger
 from servobench.harness.studies.tuning.objective import TuningSet, score
+from servobench.harness.studies.tuning.scoring import SECOND, Wanted, fill, open_ledger, refuse_broken_defaults
 from servobench.harness.studies.tuning.search import neighbours
 from servobench.harness.studies.tuning.spaces import Point, find_space, find_tunable, nested_settings, values_of
 

@@ -1,0 +1,135 @@
+"""The scores of points: what a ledger lacks is refused or carried out, each point once, and written down.
+
+Points whose settings cannot be built, or whose loop is too close to instability, have the worst cost without a run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+
+from servobench.harness.analysis.loops.loop_analysis import delay_margin
+from servobench.harness.batch.workers import Workers
+from servobench.harness.config.defaults import apply_settings, default_config, file_stem
+from servobench.harness.config.settings import ConfigurationError, flatten
+from servobench.harness.run.experiment import build
+from servobench.harness.run.request import RunSettings
+from servobench.harness.studies.tuning import objective
+from servobench.harness.studies.tuning.ledger import LEDGER, Ledger
+from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate
+from servobench.harness.studies.tuning.spaces import Point, find_tunable, nested_settings
+
+SECOND: Final = ".second"  # of the name of the ledger of the second set
+Wanted: TypeAlias = tuple["Ledger", str, Point]
+"""A point whose costs a ledger lacks: the ledger, the controller, the point."""
+
+
+def open_ledger(folder: Path, controller: str, runs: TuningSet, kind: str = "") -> Ledger:
+    """Return the ledger of a controller on a set of runs.
+
+    Raises:
+        ConfigurationError: the file is no ledger, or one of other settings or runs.
+    """
+    return Ledger(folder / f"{file_stem(controller)}{kind}{LEDGER}", fingerprint(controller, runs))
+
+
+def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
+    """Return all that costs depend on besides the settings, as JSON has it."""
+    constants = ("CONDITIONS", "MISMATCHES", "TASKS", "ERROR_SCALE", "MIN_DELAY_MARGIN", "WORST")
+    return {
+        "defaults": {key: repr(value) for key, value in flatten(find_tunable(controller).config()).items()},
+        "objective": {name: repr(getattr(objective, name)) for name in constants},
+        "run settings": {key: repr(value) for key, value in asdict(RunSettings()).items()},
+        "plants": list(runs.plants),
+        "robots": [runs.robots, runs.offset],
+    }
+
+
+def refuse_broken_defaults(controller: str, runs: TuningSet) -> None:
+    """Build the first run with the settings in use, so that what no setting can cure is said before any run.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used.
+    """
+    reason = refusal(Trial(controller, default_config(find_tunable(controller))), runs)
+    if reason is not None:
+        raise ConfigurationError(reason)
+
+
+def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterator[str]:
+    """Score the points that their ledgers lack, each once, and yield the controller of each as soon as it is written.
+
+    Settings that cannot be built or whose loop bears no delay have the worst cost in every run, without a run.
+    """
+    requests = runs.runs()
+    lacking: dict[str, tuple[Ledger, Trial, dict[str, Any]]] = {}
+    for ledger, name, point in wanted:
+        nested = nested_settings(point)
+        if ledger.costs(nested) is not None or f"{name}{nested}" in lacking:
+            continue
+        try:
+            trial = Trial(name, apply_settings(find_tunable(name), nested))
+            refused = refusal(trial, runs) is not None or not bears_delay(trial)
+        except ConfigurationError:
+            refused = True
+        if refused:
+            ledger.add(nested, [WEIGHTS[run.task] * WORST for run in requests])
+            yield name
+        else:
+            lacking[f"{name}{nested}"] = ledger, trial, nested
+    points = list(lacking.values())
+    costs = np.full((len(points), len(requests)), np.nan)
+    for point_index, run_index, cost in evaluate([trial for _, trial, _ in points], requests, workers):
+        costs[point_index, run_index] = cost
+        if not np.isnan(costs[point_index]).any():
+            ledger, trial, nested = points[point_index]
+            with undisturbed():
+                ledger.add(nested, costs[point_index].tolist())
+            yield trial.controller
+
+
+def refusal(trial: Trial, runs: TuningSet) -> str | None:
+    """Return why a run with these settings cannot be built, or None; networks are trained before workers need them.
+
+    Whatever else fails is left to the runs, whose cost says so.
+    """
+    try:
+        build(trial.resolved(runs.runs()[:1])[0]).plant.close()
+    except ConfigurationError as error:
+        return str(error)
+    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
+        return None
+    return None
+
+
+def bears_delay(trial: Trial) -> bool:
+    """Return whether the loop of a composed controller has the least delay margin, `objective.MIN_DELAY_MARGIN`.
+
+    A controller that identifies the delay changes its loop with it and is left to the runs; so is one whose loop cannot
+    be analysed.
+    """
+    if trial.config.aids.delay == "identified":
+        return True
+    try:
+        return delay_margin(trial.config, trial.controller) >= objective.MIN_DELAY_MARGIN
+    except Exception:  # noqa: BLE001 - whatever fails in it fails in the runs, whose cost says so
+        return True
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold Ctrl-C back until the end, so that it cannot interrupt a ledger that is written."""
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
