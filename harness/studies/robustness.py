@@ -6,16 +6,18 @@ take longer, so that there is time to recover.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.loops.loop_analysis import latency_border
 from servobench.harness.analysis.measures import settling_band
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
@@ -24,11 +26,14 @@ from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.sweep import Place
+from servobench.harness.config.defaults import default_config
+from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.draw import save_figure
-from servobench.harness.pictures.panels import draw_places
+from servobench.harness.pictures.panels import Styles, draw_places
 from servobench.harness.pictures.style import method_styles
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"
@@ -41,6 +46,7 @@ MOVE_DURATION: Final = 20.0  # [s], of a run whose camera is moved half-way
 STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it is
 MOVED_CAMERA: Final = "moved"  # folder of the runs whose camera is moved
 FIGURES: Final = "figures"
+LIMITS: Final = "predicted_limits.csv"
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,26 @@ def make_map(
         folder = out / name
         carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
     results.write_summary(out, map_tables(out), results.read_manifest(out / STATIC_CAMERA))
-    return draw_map(results.load_runs(out), out / FIGURES)
+    limits = predicted_limits(controllers, settings)
+    pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
+    return draw_map(results.load_runs(out), out / FIGURES, limits)
+
+
+def predicted_limits(controllers: Sequence[str], settings: Settings) -> dict[str, float]:
+    """Return from which latency on the loop of each composed controller is predicted to be unstable, in s.
+
+    The prediction is that of small motions of the nominal robot, of the plant `kinematic`, without mismatch.
+    """
+    line = next(line for line in LINES if line.axis == LATENCY)
+    latencies = [place.number / 1000.0 for place in line.places]
+    run, plant = settings.resolve("run", RunSettings()), settings.resolve("kinematic", KinematicConfig())
+    limits = {}
+    for name in controllers:
+        entry = find_controller(name)
+        if entry.side_by_side:
+            config = settings.resolve(name, default_config(entry))
+            limits[name] = latency_border(config, name, latencies, run, plant)
+    return limits
 
 
 def map_cells(plant: str, controllers: Sequence[str], seeds: Sequence[int]) -> tuple[Grid[Cell], Grid[Cell]]:
@@ -133,12 +158,13 @@ def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
     }
 
 
-def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:
+def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | None = None) -> list[Path]:
     """Draw success rates and settling times along all axes, as PNG and PDF.
 
     Args:
         runs: the table of the map's runs.
         folder: where; made if needed.
+        limits: predicted limits of the latency by method, see `predicted_limits`; None: they are not drawn.
 
     Returns:
         The files.
@@ -150,13 +176,14 @@ def draw_map(runs: pd.DataFrame, folder: Path) -> list[Path]:
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
     arrived = f"Runs that arrived within {settling_band(runs)} and stayed, %"
     return [
-        *_draw(runs, folder / "robustness", arrived, settled_share, 104.0),
+        *_draw(runs, folder / "robustness", arrived, settled_share, 104.0, limits or {}),
         *_draw(
             runs,
             folder / "robustness_settling",
             "Median settling time (after the move, where the camera moves), s",
             settling_median,
             10.0,
+            limits or {},
         ),
     ]
 
@@ -171,7 +198,12 @@ def settling_median(runs: pd.DataFrame) -> Estimate:
 
 
 def _draw(
-    runs: pd.DataFrame, stem: Path, title: str, measure: Callable[[pd.DataFrame], Estimate], top: float
+    runs: pd.DataFrame,
+    stem: Path,
+    title: str,
+    measure: Callable[[pd.DataFrame], Estimate],
+    top: float,
+    limits: Mapping[str, float],
 ) -> list[Path]:
     lines = [line for line in LINES if line.axis in set(runs["axis"])]
     controllers = list(dict.fromkeys(runs["controller"]))
@@ -186,6 +218,8 @@ def _draw(
         draw_places(axes, range(len(line.places)), values, styles, joined=True)
         axes.set_xticks(range(len(line.places)), [f"{place.number:g}" for place in line.places])
         axes.set_xlabel(line.title)
+        if line.axis == LATENCY and limits:
+            _mark_limits(axes, line, limits, styles)
         axes.set_ylim(0.0, top)
         axes.grid(visible=True, alpha=0.3)
     for axes in grid.flat[len(lines) :]:
@@ -198,3 +232,13 @@ def _draw(
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     figure.suptitle(f"{title}: {robots} robots a point on {plant}, bars are 95 % intervals")
     return save_figure(figure, stem)
+
+
+def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: Styles) -> None:
+    """Draw a vertical line where each method is predicted to become unstable, if that is on the axis."""
+    numbers = [place.number for place in line.places]
+    for name, limit in limits.items():
+        if name in styles and 1000.0 * limit <= numbers[-1]:
+            where = np.interp(1000.0 * limit, numbers, np.arange(len(numbers)))
+            axes.axvline(where, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6)
+    axes.set_xlabel(f"{line.title}\n(upright: predicted limit of stability)")

@@ -10,7 +10,17 @@ import pytest
 
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.studies.robustness import LINES, MOVE, draw_map, map_cells, moved_settings, settling_median
+from servobench.harness.studies import robustness
+from servobench.harness.studies.robustness import (
+    LATENCY,
+    LINES,
+    MOVE,
+    draw_map,
+    map_cells,
+    moved_settings,
+    predicted_limits,
+    settling_median,
+)
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():
@@ -41,3 +51,25 @@ def test_settling_counts_from_the_move_of_the_camera():
 def test_a_table_that_is_no_map_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="holds no axis of the robustness map; make one with"):
         draw_map(pd.DataFrame({"axis": ["", ""]}), tmp_path)
+
+
+def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatch):
+    fast = Settings({"pid+true": {"law": {"proportional_gain": 9.0}}})
+    limits = predicted_limits(["pid+true", "pid+constant", "nmpc_calibrated"], fast)
+    assert 0.0 < limits["pid+true"] < 0.25 < limits["pid+constant"] == math.inf
+    assert "nmpc_calibrated" not in limits
+    line = next(line for line in LINES if line.axis == LATENCY)
+    runs = pd.DataFrame(
+        [
+            {"axis": LATENCY, "controller": name, "magnitude": place.number, "seed": 0, "plant": "kinematic",
+             "settling_time_s": 1.0, "status": "completed", "outcome": "settled"}
+            for name in limits
+            for place in line.places
+        ]
+    )  # fmt: skip
+    figures = []
+    monkeypatch.setattr(robustness, "save_figure", lambda figure, stem: figures.append(figure) or [stem])
+    draw_map(runs, tmp_path, limits)
+    lines = [np.asarray(each.get_xdata()) for each in figures[0].axes[0].get_lines()]
+    upright = [x[0] for x in lines if len(x) == 2 and x[0] == x[1]]
+    assert upright == [pytest.approx(limits["pid+true"] / 0.05)]

@@ -61,6 +61,7 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     Of the past joint positions only those are kept that the present delay needs.
     """
     other, pairing, estimation = copy.copy(servo), servo.estimation.pairing, state.estimation
+    estimation = estimation._replace(learned=estimation.learned._replace(estimator=None))  # it may be large
     other.estimation = FrozenEstimation(pairing, jacobian)  # type: ignore[assignment]
     other.predictor = None if servo.predictor is None else servo.predictor.frozen()
     if pairing is not None:
@@ -161,8 +162,9 @@ def reached(image: Linear, first: FloatArray) -> tuple[FloatArray, FloatArray]:
     while candidates.size:
         for _ in range(2):  # once more for the rounding of the first time
             candidates = candidates - basis @ (basis.T @ candidates)
-        left, values, _ = np.linalg.svd(candidates, full_matrices=False)
-        new = left[:, values > RANK_TOLERANCE * scale]
+        tall, small = np.linalg.qr(candidates)
+        left, values, _ = np.linalg.svd(small)
+        new = (tall @ left)[:, values > RANK_TOLERANCE * scale]
         if new.shape[1] == 0:
             break
         candidates = image(new)

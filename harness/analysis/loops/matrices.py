@@ -10,7 +10,7 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
-STABILITY_TOLERANCE = 1e-6  # [1] of a pole's modulus above 1, which neutral drift in the null space has by rounding
+STABILITY_TOLERANCE = 1e-4  # [1] of a pole's modulus above 1, which neutral modes have by rounding of differences
 
 
 class StateSpace(NamedTuple):
