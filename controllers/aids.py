@@ -49,7 +49,7 @@ class AidsConfig:
     """[unit of the feature] standard deviation of a feature; the first guess where it is identified."""
     map_deviation: Positive = 1.0
     """[1] of an entry of the map from the identity at first; 1: any camera is possible."""
-    map_walk: NonNegative = 0.3
+    map_walk: NonNegative = 0.1
     """[1/√m] deviation of an entry of the map after the feature has moved by a metre."""
     map_error: NonNegative = 0.1
     """[1] share of a step that nominal model and map do not explain."""
@@ -67,7 +67,7 @@ class AidsConfig:
     """[1] sum of innovations (CUSUM) beyond which it seems so."""
     filter_error: NonNegative = 0.2
     """[1] error of the Jacobian as a share of its size, as the filter sees it."""
-    posture_gain: NonNegative = 0.2
+    posture_gain: NonNegative = 0.6
     """[1/s] of the posture."""
     damping: Positive = 0.02
     """[m/rad] of the inverse in feedforward, posture and redistribution."""

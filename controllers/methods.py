@@ -137,6 +137,11 @@ _ROWS = (
         {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
     Method(
+        "arm_mfac", "mfac", "arm",
+        "the same with gear ratios and joint zeros of the nominal model identified",
+        {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
+    ),
+    Method(
         "ukf_mfac", "mfac", "ukf", "unscented Kalman filter with model-free adaptive control (eq. 45)",
         {}, EQUIPPED, printed={},
     ),

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
+from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
 from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
 from servobench.controllers.estimators.estimator import Estimator
@@ -51,6 +52,7 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "rbf": Part(RbfConfig, RbfEstimator, trained=True),
     "rbf_lyapunov": Part(RbfLyapunovConfig, RbfLyapunovEstimator, trained=True),
     "cfdl": Part(CfdlConfig, CfdlEstimator),
+    "arm": Part(ArmConfig, ArmEstimator),
 }
 
 LAWS: dict[str, Part[Law[Any]]] = {

@@ -1,0 +1,108 @@
+"""The structured estimate of the arm, against a noise-free arm of the same structure."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmState
+from servobench.controllers.estimators.estimator import Motion
+from servobench.plant.checks import FloatArray
+from servobench.plant.lanes import stack, take
+from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
+
+GEARS = np.array([1.1, 0.95, 1.05, 0.9, 1.08, 1.0])
+OFFSETS = np.array([0.0, 0.05, -0.08, 0.06, 0.1, 0.0])  # a turn of the first joint is one of the camera
+
+
+def estimator(**values: float) -> ArmEstimator:
+    model = nominal_ur5()
+    knowledge = RobotKnowledge(hand_eye_spec(model, 0.05, 1.0, 6.0), 10, nominal_jacobian=model.jacobian)
+    return ArmEstimator(ArmConfig(**values), knowledge)
+
+
+def bent_arm() -> HandEyeModel:
+    model = nominal_ur5()
+    return replace(model, arm=replace(model.arm, gear_ratio=GEARS, joint_offset=OFFSETS))
+
+
+def walk(seed: int, count: int = 400) -> FloatArray:
+    generator = np.random.default_rng(seed)
+    corners = generator.uniform(TRAINING_LOWER, TRAINING_UPPER, (count // 20 + 1, 6))
+    return np.concatenate([np.linspace(a, b, 20, endpoint=False) for a, b in itertools.pairwise(corners)])
+
+
+def motions(path: FloatArray) -> list[Motion]:
+    y, zero = bent_arm().feature(path), np.zeros(3)
+    time = np.asarray(0.05)[()]
+    return [Motion(path[k], path[k + 1] - path[k], y[k + 1] - y[k], zero, time) for k in range(len(path) - 1)]
+
+
+def learned(arm: ArmEstimator, path: FloatArray) -> ArmState:
+    state = arm.start(nominal_ur5().jacobian(path[0]))
+    for motion in motions(path):
+        state = arm.update(state, motion)
+    return state
+
+
+def test_gears_and_zeros_of_a_noise_free_arm_are_found() -> None:
+    state = learned(estimator(model_error=0.0, feature_noise=1e-5), walk(1))
+    seen = slice(1, 5)  # the last joint turns the ball about its own axis, the first one's zero turns the camera
+    np.testing.assert_allclose(state.x[:6][seen], GEARS[seen], atol=6e-3)
+    np.testing.assert_allclose(state.x[6:][seen], OFFSETS[seen], atol=6e-3)
+
+
+def test_the_jacobian_elsewhere_is_that_of_the_bent_arm() -> None:
+    arm, elsewhere = estimator(), walk(2, 40)
+    state = learned(arm, walk(1))
+    true = bent_arm().jacobian(elsewhere)
+    estimated = np.stack([arm.jacobian(state, q) for q in elsewhere])
+    error = np.linalg.norm(estimated - true) / np.linalg.norm(true)
+    nominal = np.linalg.norm(nominal_ur5().jacobian(elsewhere) - true) / np.linalg.norm(true)
+    assert error < 0.1 * nominal
+
+
+def test_it_starts_as_the_nominal_arm_and_learns_nothing_from_short_ways() -> None:
+    arm, path = estimator(min_joint_step=50.0), walk(3, 40)
+    state = learned(arm, path)
+    np.testing.assert_array_equal(arm.jacobian(state, path[0]), nominal_ur5().jacobian(path[0]))
+
+
+def test_motions_that_do_not_join_begin_a_new_way() -> None:
+    arm, path = estimator(min_joint_step=50.0), walk(3, 60)
+    pieces = motions(path)
+    state = arm.start(nominal_ur5().jacobian(path[0]))
+    for motion in [*pieces[:5], *pieces[9:11]]:
+        state = arm.update(state, motion)
+    np.testing.assert_array_equal(state.begin, path[9])
+    np.testing.assert_allclose(state.joint_step, path[11] - path[9])
+
+
+def test_the_sensitivity_is_the_derivative_of_the_predicted_motion() -> None:
+    q0, q1, step = np.array(TRAINING_LOWER) + 0.2, np.array(TRAINING_LOWER) + 0.5, 1e-6
+    model = nominal_ur5()
+
+    def moved(g: FloatArray, offset: FloatArray) -> FloatArray:
+        return np.asarray(model.feature(g * q1 + offset) - model.feature(g * q0 + offset))
+
+    one, none = np.ones(6), np.zeros(6)
+    first, last = model.jacobian(q0), model.jacobian(q1)
+    for i, unit in enumerate(np.eye(6)):
+        by_gear = (moved(one + step * unit, none) - moved(one - step * unit, none)) / (2 * step)
+        by_offset = (moved(one, step * unit) - moved(one, -step * unit)) / (2 * step)
+        np.testing.assert_allclose(last[:, i] * q1[i] - first[:, i] * q0[i], by_gear, atol=1e-8)
+        np.testing.assert_allclose(last[:, i] - first[:, i], by_offset, atol=1e-8)
+
+
+def test_lanes_are_bit_equal_to_single_runs() -> None:
+    arm, paths = estimator(), [walk(seed, 60) for seed in (4, 5, 6)]
+    alone = [learned(arm, path) for path in paths]
+    state = arm.start(np.stack([nominal_ur5().jacobian(path[0]) for path in paths]))
+    for together in zip(*map(motions, paths), strict=True):
+        state = arm.update(state, stack(together))
+    for lane, single in enumerate(alone):
+        np.testing.assert_equal(take(state, lane), single)
