@@ -162,7 +162,7 @@ def part_of(world: str) -> str:
 
 def other_table(folder: Path) -> pd.DataFrame:
     """Return the paired differences of the audit: on the circle, in the moves of claim 3, and with weaker motors."""
-    tuning = pd.concat([load_runs(path.parent) for path in sorted(folder.glob("tuning_*/runs.parquet"))])
+    tuning = pd.concat([load_runs(folder / part) for part in AUDIT.commands if part.startswith("tuning_")])
     circles = tuning[(tuning["task"] == "circle") & (tuning["latency_s"] == 0.0)]
     printed = load_runs(folder / "printed")
     weak, usual = (load_runs(folder / part).assign(label=part) for part in ("weak_motors", "bullet"))

@@ -109,7 +109,8 @@ def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the paired difference that each switch of `bullet` makes to each method, in moves and on the circle."""
     usual = load_runs(folder / USUAL)
     made: dict[str, list[dict[str, str]]] = {"dynamics": [], "dynamics_circle": []}
-    for words, part in {"`kinematic` instead": "kinematic"} | {words: part_of(words) for words in SWITCHES}.items():
+    parts = {"`kinematic` instead": "kinematic"} | {words: part_of(words) for words in SWITCHES}
+    for words, part in parts.items():
         changed = load_runs(folder / part)
         for table, task, metric, never, factor in (
             ("dynamics", "random", "settling_time_s", MOVE, 1.0),

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
@@ -16,8 +17,8 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
-from page_studies import STUDIES, held_out, physical, readme
-from page_studies.study import Study, sweep
+from page_studies import STUDIES, audit, held_out, physical, readme, worlds
+from page_studies.study import Study, nothing, sweep
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import TUNING, parse_seeds
 from servobench.harness.config.settings import read_settings
@@ -162,6 +163,40 @@ def test_methods_tasks_and_settings_of_the_sweeps_are_known(study):
         requests = [RunRequest(*names, "moderate", 0) for names in product(*lists)]
         sections = resolve_sections(requests, settings)
         assert set(settings.sections) <= set(sections)
+
+
+def toy_runs(words):
+    """Runs that a sweep could have given, two robots a cell."""
+    random = np.random.default_rng(0)
+    seeds = parse_seeds(option(words, "--seeds"))[:2]
+    lists = [option(words, f"--{name}", usual).split(",") for name, usual in (
+        ("plants", ""), ("controllers", ""), ("tasks", "random"), ("mismatch", "moderate"), ("latency", "nan"),
+        ("period", "nan"),
+    )]  # fmt: skip
+    return pd.DataFrame([
+        {
+            "run_id": "-".join(map(str, cell)), "plant": cell[0], "controller": cell[1], "task": cell[2],
+            "mismatch": cell[3], "latency_s": float(cell[4]), "period_s": float(cell[5]), "seed": cell[6],
+            "status": "completed", "outcome": "settled",
+            **{name: random.uniform(0.5, 1.0) for name in (
+                "settling_time_s", "overshoot", "steady_state_error", "rms_error_evaluated", "rms_error_second_lap",
+            )},
+        }
+        for cell in product(*lists, seeds)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("module", [audit, held_out, physical, worlds], ids=lambda module: module.__name__)
+def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path, module):
+    steps = pd.DataFrame({"error_norm": np.full(50, 0.001)})
+    monkeypatch.setattr(module, "load_steps", lambda *_: steps, raising=False)
+    shown = "".join(page.read_text() for page in generated_tables.PAGES)
+    for study in (value for value in vars(module).values() if isinstance(value, Study) and value.tables is not nothing):
+        monkeypatch.setattr(module, "load_runs", lambda path, study=study: toy_runs(study.commands[path.name]))
+        for name, table in study.tables(tmp_path).items():
+            assert len(table) or name == "held_out_studies"
+            assert table.map(lambda cell: isinstance(cell, str)).all(axis=None), name
+            assert f"<!-- table: {name} -->" in shown
 
 
 def test_losses_at_a_faster_rate_are_those_beyond_the_paired_interval():
