@@ -53,7 +53,7 @@ def test_gears_and_zeros_of_a_noise_free_arm_are_found() -> None:
     state = learned(estimator(model_error=0.0, feature_noise=1e-5), walk(1))
     seen = slice(1, 5)  # the last joint turns the ball about its own axis, the first one's zero turns the camera
     np.testing.assert_allclose(state.x[:6][seen], GEARS[seen], atol=6e-3)
-    np.testing.assert_allclose(state.x[6:][seen], OFFSETS[seen], atol=6e-3)
+    np.testing.assert_allclose(state.x[6:][seen], OFFSETS[seen], atol=2e-2)
 
 
 def test_the_jacobian_elsewhere_is_that_of_the_bent_arm() -> None:

@@ -4,7 +4,8 @@ Ranges reach about a factor of ten around the defaults, or as far as a method al
 Everything else keeps the default of its class, and is the same for all: limits, delays, period and the preview.
 
 Every best equipped method has all words of the section `aids` as switches, but for those that its law brings itself,
-and the same three numbers of the aids. A delay or response that is given by a number is no choice: it would be a guess
+and the same three numbers of the aids. The posture is no choice: a run of some seconds gains nothing by it, and without
+it an arm drifts to its stops in half an hour. A delay or response that is given by a number is no choice: it would be a guess
 where latencies differ. `NAME:published` has the numbers of its law as printed and of its estimator, and no aid. A
 combination that cannot be built has the worst score without a run.
 
@@ -45,11 +46,10 @@ _AIDS: Final[Space] = {
     "aids.filter": _SWITCH,
     "aids.model": CategoricalDistribution(("own", "nominal", "map")),
     "aids.feedforward": _SWITCH,
-    "aids.posture": _SWITCH,
     "aids.limit": CategoricalDistribution(("scale", "clip", "redistribute")),
     "aids.map_walk": _log(0.03, 3.0),  # 1/√m
     "aids.map_error": _log(0.01, 0.5),
-    "aids.posture_gain": FloatDistribution(0.0, 1.0),  # 1/s
+    "aids.posture_gain": FloatDistribution(0.1, 1.0),  # 1/s
 }
 _P: Final[Space] = {
     "law.proportional_gain": _log(0.5, 30.0),  # 1/s
@@ -99,6 +99,14 @@ _CFDL: Final[Space] = {
 }
 
 
+_ARM: Final[Space] = {
+    "estimator.gear_deviation": _log(0.02, 0.5),
+    "estimator.offset_deviation": _log(0.02, 0.5),  # rad
+    "estimator.model_error": _log(0.005, 0.2),
+    "estimator.min_joint_step": _log(0.03, 0.5),  # rad
+}
+
+
 def _aids(without: Collection[str] = ()) -> Space:
     """Return the space of the aids but for those that a law or an estimator brings."""
     return {key: values for key, values in _AIDS.items() if key.removeprefix("aids.") not in without}
@@ -115,6 +123,7 @@ SPACES: Final[Mapping[str, Space]] = {
     "rbfnn_mfac": {**_aids({"posture", "posture_gain"}), **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
     "rbfnn_mfac:published": {**_RBFNN, **_RBF},
     "map_mfac": {**_aids(), **_MFAC},
+    "arm_mfac": {**_aids(), **_MFAC, **_ARM},
     "ukf_mfac": {**_aids(), **_MFAC, **_UKF},
     "ukf_mfac:published": {**_MFAC, **_UKF},
     "ukf_mpc": {**_aids({"feedforward", "limit"}), **_MPC_SWITCHES, **_MPC, **_UKF},
