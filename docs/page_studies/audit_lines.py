@@ -69,10 +69,10 @@ ABLATION: Final = (  # moderate, latency of 100 ms, camera turned by 120°, nois
     Line("`rbfnn_bridged+constant`", ("26/40", "8/24", "0/24", "11/24", "69"), "mfac+constant", BRIDGED),
     Line(
         "`mpc+rbf_aligned`, delay of 2 periods", ("0.83", "1.04", "0.98", "1/24", "1.78"), "mpc+constant",
-        ("law.delay=0.1", "law.decay=16.0", *MAPPED),
+        ("law.delay=0.1", "law.decay=16.0", "law.horizon_time=0.4", *MAPPED),
     ),
     Line(
-        "`mpc+ukf`, the same", ("1.08", "1/24", "1.50", "4/24", "8.3"), "mpc+ukf", ("law.delay=0.1", "law.decay=16.0")
+        "`mpc+ukf`, the same", ("1.08", "1/24", "1.50", "4/24", "8.3"), "mpc+ukf", ("law.delay=0.1", "law.decay=16.0", "law.horizon_time=0.4")
     ),
     Line(
         "`mfac+rbf_aligned`, `feedforward`", ("1.20", "4.08", "1.33", "0/24", "3.0"), "mfac+constant",
