@@ -82,8 +82,8 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
         (("run", "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
         (("run", "--plant", "kinematic", "--view"), "--view shows the plant bullet only, got --plant kinematic"),
         (
-            ("run", "--plant", "bullet", "--set", "run.period=0.007"),
-            "period must be a whole multiple of the plant's own step",
+            ("run", "--plant", "bullet", "--set", "run.period=0.0333"),
+            "period must be a whole number of milliseconds, because latency is no multiple of the control",
         ),
         (("run", "--set", "run.period=-1"), "run.period must be above 0, got -1"),
         (

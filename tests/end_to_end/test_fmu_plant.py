@@ -24,7 +24,7 @@ from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.signals import Command
 
-QUIET = FmuConfig(0, SensingConfig(0.0))
+QUIET = FmuConfig(0.0, SensingConfig(0.0))
 START = np.array([0.3, 1.2])
 PERIOD = 0.05
 ROLES = {
@@ -100,7 +100,7 @@ def test_a_loop_closes_on_a_foreign_fmu_through_a_mapping_alone(tmp_path, versio
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_commands_are_clipped_delayed_and_held_over_the_fmus_own_steps(tmp_path, version):
-    plant = crane(tmp_path, version, FmuConfig(1, SensingConfig(0.0)), period=0.01)
+    plant = crane(tmp_path, version, FmuConfig(PERIOD, SensingConfig(0.0)), period=0.01)
     plant.reset(0)
     assert plant.step(Command([9.0, -1.0])).joint_position.tolist() == START.tolist()
     observation = plant.step(Command([0.0, 0.0]))
