@@ -12,6 +12,7 @@ import pytest
 
 import generated_tables
 from kit.documents import names, read, section, tables
+from servobench.controllers.aids import AidsConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.parts import ESTIMATORS, LAWS
@@ -34,7 +35,7 @@ def config_classes():
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
     whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
     tasks = [type(entry.default) for entry in TASKS.values()]
-    common = [InitialConfig, TrainingConfig, RunSettings]
+    common = [InitialConfig, AidsConfig, TrainingConfig, RunSettings]
     return {kind for kind in (*parts, *whole, *tasks, *common) if dataclasses.fields(kind)}
 
 
@@ -59,7 +60,7 @@ def test_the_presets_differ_from_their_parts_only_where_it_is_told():
     for name in registry.CONTROLLERS:
         for part in dataclasses.fields(config := registry.find_controller(name).config()):
             value = getattr(config, part.name)
-            if dataclasses.is_dataclass(value):
+            if dataclasses.is_dataclass(value) and part.name != "aids":
                 usual = flatten(type(value)())
                 changed = {key: new for key, new in flatten(value).items() if new != usual[key]}
                 found |= {f"{name}.{part.name}.{key}": new for key, new in changed.items()}
@@ -80,8 +81,10 @@ def test_the_table_of_controllers_has_their_parts():
 
 @pytest.fixture(scope="module")
 def short_runs():
-    """A short run of each estimator, each law and what is no pair of them."""
-    controllers = [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS] + ["nmpc_calibrated"]
+    """A short run of each estimator, each law, what is no pair of them, and all aids."""
+    controllers = (
+        [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS] + ["nmpc_calibrated", "map_mfac"]
+    )
     settings = read_settings(None, ["exp2.duration=0.2", "run.full_jacobian=true"])
     return [
         run_experiment(RunRequest("kinematic", controller, "exp2", "moderate", 0), settings)
