@@ -54,6 +54,7 @@ GAIN: Final = ("law.gain=27.7", "law.step_weight=4e-4")  # those of `map_mfac`
 BRIDGED: Final = (*GAIN, 'aids.response="identified"', *FEEDFORWARD, "aids.posture=true", 'aids.limit="redistribute"')
 DELAYS: Final = (*BRIDGED, 'aids.delay="identified"')
 TOLD: Final = (*BRIDGED[:2], 'aids.response="given"', *BRIDGED[3:])
+DELAYED_MPC: Final = ("law.delay=0.1", "law.decay=16.0", "law.horizon_time=0.4")
 MAPPED: Final = ('aids.model="map"',)
 ABLATION: Final = (  # moderate, latency of 100 ms, camera turned by 120°, noise × 8, circle
     Line("`rbfnn_mfac_plus`", ("0.78", "0.85", "0.93", "24/24", "1.46"), BETTER),
@@ -69,10 +70,10 @@ ABLATION: Final = (  # moderate, latency of 100 ms, camera turned by 120°, nois
     Line("`rbfnn_bridged+constant`", ("26/40", "8/24", "0/24", "11/24", "69"), "mfac+constant", BRIDGED),
     Line(
         "`mpc+rbf_aligned`, delay of 2 periods", ("0.83", "1.04", "0.98", "1/24", "1.78"), "mpc+constant",
-        ("law.delay=0.1", "law.decay=16.0", "law.horizon_time=0.4", *MAPPED),
+        (*DELAYED_MPC, *MAPPED),
     ),
     Line(
-        "`mpc+ukf`, the same", ("1.08", "1/24", "1.50", "4/24", "8.3"), "mpc+ukf", ("law.delay=0.1", "law.decay=16.0", "law.horizon_time=0.4")
+        "`mpc+ukf`, the same", ("1.08", "1/24", "1.50", "4/24", "8.3"), "mpc+ukf", DELAYED_MPC
     ),
     Line(
         "`mfac+rbf_aligned`, `feedforward`", ("1.20", "4.08", "1.33", "0/24", "3.0"), "mfac+constant",
