@@ -54,10 +54,10 @@ class DriveConfig:
     """[Nm s/rad] at 1 rad/s as much as Coulomb friction; an order of magnitude, too."""
     friction_compensation: Share = 0.8
     """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
-    payload: NonNegative = 1.4
-    """[kg] true load, a point at the ball: a gripper of 0.9 kg (Robotiq 2F-85) and a thing of 0.5 kg."""
+    payload: NonNegative = 2.5
+    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and what it holds."""
     assumed_payload: NonNegative = 0.9
-    """[kg] load by which the drives compensate gravity: the gripper alone; the UR5 takes up to 5 kg."""
+    """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
 
     def __post_init__(self) -> None:
         """Check the lengths of the lists."""
