@@ -1,4 +1,4 @@
-"""Writes the generated parts of the pages: settings, the variables of the exported FMU, and measured tables.
+"""Writes the generated parts of the pages: settings, methods, variables of the exported FMU, and measured tables.
 
     make docs
 
@@ -8,6 +8,8 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
     <!-- studies: docs/page_studies -->
+    <!-- methods: table -->
+    <!-- methods: presets -->
     <!-- end -->
 
 The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
@@ -31,13 +33,15 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
+import methods_table
+
 import stored_tables
 from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
-PART = re.compile(r"(<!-- (settings|variables|table|studies): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+PART = re.compile(r"(<!-- (settings|variables|table|studies|methods): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # what a string below a field begins with
 SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
@@ -54,6 +58,7 @@ def renewed(page: Path) -> str:
         "settings": lambda part: settings_table(find(part[3])),
         "variables": lambda _: variables_table(),
         "studies": lambda _: studies_table(),
+        "methods": lambda part: named_methods(part[3]),
         "table": lambda part: measured_table(part[3], page.parent) or part[4].strip("\n"),
     }
     text = page.read_text(encoding="utf-8")
@@ -64,6 +69,14 @@ def studies_table() -> str:
     """Return the table of the studies behind the measured tables and pictures."""
     rows = [(f"`{study.name}`", study.purpose, f"{study.minutes:g}") for study in STUDIES.values()]
     return table(("study", "what it measures", "minutes on two processors"), rows)
+
+
+def named_methods(kind: str) -> str:
+    """Return the table of the named methods, or for the kind "presets" that of their own defaults."""
+    if kind == "presets":
+        rows = [(f"`{name}.{key}`", toml(value)) for name, key, value in methods_table.presets_rows()]
+        return table(methods_table.PRESETS_HEADER, rows)
+    return table(methods_table.METHODS_HEADER, methods_table.methods_rows())
 
 
 def measured_table(name: str, folder: Path) -> str:

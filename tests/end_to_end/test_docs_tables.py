@@ -12,7 +12,7 @@ import pytest
 
 import generated_tables
 from kit.documents import names, read, section, tables
-from servobench.controllers.aids import AidsConfig
+from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.parts import ESTIMATORS, LAWS
@@ -35,7 +35,7 @@ def config_classes():
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
     whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
     tasks = [type(entry.default) for entry in TASKS.values()]
-    common = [InitialConfig, AidsConfig, TrainingConfig, RunSettings]
+    common = [AidsConfig, InitialConfig, TrainingConfig, RunSettings]
     return {kind for kind in (*parts, *whole, *tasks, *common) if dataclasses.fields(kind)}
 
 
@@ -67,24 +67,36 @@ def test_the_presets_differ_from_their_parts_only_where_it_is_told():
     assert told == found
 
 
-def test_the_table_of_controllers_has_their_parts():
+def told_aids(cell):
+    """The aids that a cell of the table of controllers means."""
+    if cell == "none":
+        return {}
+    assert cell.startswith("all")
+    other = dict(re.findall(r"`(\w+)` (\w+)", cell))
+    return {**EQUIPPED, **{key: False if value == "off" else value for key, value in other.items()}}
+
+
+def test_the_table_of_controllers_has_their_parts_and_aids():
     rows = next(rows for _, header, rows in tables(read("methods.md")) if header[:2] == ["controller", "estimator"])
-    assert {names(row[0])[0] for row in rows} == set(registry.CONTROLLERS)
-    for controller, estimator, law, _, truth in rows:
-        entry = registry.find_controller(names(controller)[0])
-        assert entry.needs_truth == (truth == "yes")
-        if names(estimator):
+    assert sorted(name for row in rows for name in names(row[0])) == sorted(registry.CONTROLLERS)
+    for controllers, estimator, law, aids, networks, truth in rows:
+        for name in names(controllers):
+            entry = registry.find_controller(name)
+            assert entry.needs_truth == (truth == "yes")
+            if not names(estimator):
+                continue
             config = entry.config()
             assert type(config.estimator) is ESTIMATORS[names(estimator)[0]].config
             assert type(config.law) is LAWS[names(law)[0]].config
+            assert config.aids == AidsConfig(**({} if name.endswith(":published") else told_aids(aids)))
+            assert hasattr(config, "training") == (networks != "none")
 
 
 @pytest.fixture(scope="module")
 def short_runs():
-    """A short run of each estimator, each law, what is no pair of them, and all aids."""
-    controllers = (
-        [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS] + ["nmpc_calibrated", "map_mfac"]
-    )
+    """A short run of each estimator, each law, the aids, and what is no pair."""
+    pairs = [f"pid+{name}" for name in ESTIMATORS] + [f"{name}+constant" for name in LAWS]
+    controllers = [*pairs, "map_mfac", "nmpc_calibrated"]
     settings = read_settings(None, ["exp2.duration=0.2", "run.full_jacobian=true"])
     return [
         run_experiment(RunRequest("kinematic", controller, "exp2", "moderate", 0), settings)
