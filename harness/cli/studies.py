@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from servobench.harness.studies.tuning.files import TunedValues
     from servobench.harness.studies.tuning.objective import TuningSet
 
-DEFAULT_CONTROLLERS = "rbfnn_mfac_plus,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
+DEFAULT_CONTROLLERS = "arm_mfac,map_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
 EXIT_DIFFERENT = 1
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from servobench.harness.config.registry import FORMER_NAMES
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.settings import NonNegative, Positive, ShareBelowOne, settings
@@ -72,7 +73,8 @@ class RunRequest:
     period: float | None = None  # [s] of control; None for that of the section `run`
 
     def __post_init__(self) -> None:
-        """Read a mismatch that came as text."""
+        """Read a mismatch that came as text, and a former name of a controller."""
+        object.__setattr__(self, "controller", FORMER_NAMES.get(self.controller, self.controller))
         given: object = self.mismatch
         if isinstance(given, str):
             object.__setattr__(self, "mismatch", read_mismatch(given))

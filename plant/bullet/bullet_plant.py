@@ -287,9 +287,13 @@ class BulletWorld(World):
         return q
 
     def _reported(self) -> FloatArray:
-        """Return the joint positions in steps of the encoders, (n,) rad."""
+        """Return the joint positions in steps of the encoders, (n,) rad; a stop is the end of the scale."""
         q, resolution = self._joint_position(), self._config.encoder_resolution
-        return np.asarray(np.round(q / resolution) * resolution) if resolution > 0.0 else q
+        if resolution == 0.0:
+            return q
+        lower, upper, half = self.spec.joint_lower, self.spec.joint_upper, resolution / 2.0
+        steps = np.where(q >= upper - half, upper, np.round(q / resolution) * resolution)
+        return np.where(q <= lower + half, lower, steps)
 
     def _render(self) -> tuple[ByteArray, FloatArray]:
         return self._scene.render(self._camera, self._model.X_BC)

@@ -5,9 +5,9 @@ Everything else keeps the default of its class, and is the same for all: limits,
 
 Every best equipped method has all words of the section `aids` as switches, but for those that its law brings itself,
 and the same three numbers of the aids. The posture is no choice: a run of some seconds gains nothing by it, and without
-it an arm drifts to its stops in half an hour. A delay or response that is given by a number is no choice: it would be a guess
-where latencies differ. `NAME:published` has the numbers of its law as printed and of its estimator, and no aid. A
-combination that cannot be built has the worst score without a run.
+it an arm drifts to its stops in half an hour. A delay or response that is given by a number is no choice: it would be a
+guess where latencies differ. `NAME:published` has the numbers of its law as printed and of its estimator, and no aid.
+A combination that cannot be built has the worst score without a run.
 
 The bounds `constant` and `calibrated` have their gains only, `nmpc_calibrated` has no space: it never looks at the
 camera, and tuned where its model of the delay is exact it gains nothing (0.071 against 0.072) and then cycles around
