@@ -3,8 +3,10 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from kit.toy import PERIOD, Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
@@ -41,6 +43,21 @@ def test_with_the_exact_jacobian_and_no_weight_an_affine_plant_arrives_in_one_st
     law, ref = fresh(6, 3, gain=math.inf, step_weight=1e-13), rng.normal(size=(2, 3))
     u = law.command(Estimate(J), seen(np.zeros(6), y), ref)
     np.testing.assert_allclose(y + J @ u * 0.05, ref[0], atol=1e-10)
+
+
+@given(seed=st.integers(0, 10**6), degrees=st.integers(0, 180), share=st.floats(0.01, 0.99))
+def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_methods_says(seed, degrees, share):
+    rng, turn = np.random.default_rng(seed), math.radians(degrees)
+    J, R = rng.normal(size=(3, 6)), Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
+    law = fresh(6, 3, gain=-math.log1p(-share) / PERIOD, step_weight=1e-13)
+    across, along = np.array([math.cos(seed), math.sin(seed), 0.0]), np.array([0.0, 0.0, 1.0])
+    factors = []
+    for error in (across, along):
+        u = law.command(Estimate(J), seen(np.zeros(6), -error), np.zeros((2, 3)))
+        factors.append(np.linalg.norm(error - R @ J @ u * PERIOD))
+    assert factors[0] == pytest.approx(abs(1.0 - share * np.exp(1j * turn)), rel=1e-6)
+    assert factors[1] == pytest.approx(1.0 - share, rel=1e-6)
+    assert (factors[0] < 1.0) == (share < 2.0 * math.cos(turn)) or abs(share - 2.0 * math.cos(turn)) < 1e-6
 
 
 def test_the_first_step_equals_the_one_computed_by_hand():
