@@ -34,7 +34,6 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import methods_table
-
 import stored_tables
 from page_studies import STUDIES
 from servobench.fmus.export import arm_layout

@@ -177,5 +177,9 @@ def test_earlier_keys_are_refused_with_the_new_ones(name):
     kind = find_plant(name).config
     with pytest.raises(ValueError, match="no setting 'command_delay_periods' any more: it is now command_delay, in s"):
         kind(command_delay_periods=1)
+    with pytest.raises(
+        ValueError, match=r"no setting 'latency_periods' any more: it is now sensing\.latency, in seconds"
+    ):
+        kind(latency_periods=1)
     with pytest.raises(ValueError, match="no setting 'latency_periods' any more: it is now latency, in seconds"):
         SensingConfig(latency_periods=1)
