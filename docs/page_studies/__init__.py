@@ -5,16 +5,16 @@ from __future__ import annotations
 from page_studies.audit import AUDIT
 from page_studies.claims import CLAIMS
 from page_studies.failures import FAILURES
-from page_studies.held_out import HELD_OUT
+from page_studies.held_out import HELD_OUT, RENDERED_STUDY, TUNING_STUDIES
 from page_studies.performance import PERFORMANCE
 from page_studies.physical import DYNAMICS, ENDS, LONG, RATES_STUDY
 from page_studies.readme import README
-from page_studies.worlds import MAP, PAIRS_STUDY, WORLDS
+from page_studies.worlds import LEARNING, MAP, PAIRS_STUDY, WORLDS
 
 STUDIES = {
     study.name: study
     for study in (
-        HELD_OUT, AUDIT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS, PAIRS_STUDY, MAP, README, FAILURES,
-        PERFORMANCE,
+        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AUDIT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS, LEARNING,
+        PAIRS_STUDY, MAP, README, FAILURES, PERFORMANCE,
     )
 }  # fmt: skip

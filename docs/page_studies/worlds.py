@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pandas as pd
 from PIL import Image
 
-from page_studies.methods import BOTH, FIVE, by_method, quoted, settled
+from page_studies.methods import BOTH, FIVE, by_method, millimetres, quoted, settled, settling, short
 from page_studies.study import Study, sweep
+from servobench.controllers.aids import EQUIPPED
 from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.harness.analysis.statistics import median_with_interval
 from servobench.harness.batch.results import load_runs
 from servobench.harness.run.episode import COMPLETED
 
@@ -24,6 +27,9 @@ MISMATCHES = (
 )
 MOVED = "moderate+camera_move=45deg"
 PAIRS = tuple(f"{law}+{estimator}" for law in LAWS for estimator in ESTIMATORS)
+WITHOUT = "mfac+constant"  # the map alone
+LEARNERS = (WITHOUT, "mfac+arm", "mfac+ukf", "mfac+rbf", "mfac+true")
+LEARNING_WORLDS = "moderate,gear_ratio=20%,severe+gear_ratio=20%+joint_offsets=15deg"
 COLOURS = 128  # of a picture's palette
 
 
@@ -45,6 +51,26 @@ def worlds_table(folder: Path) -> dict[str, pd.DataFrame]:
     return {"worlds": pd.DataFrame(rows)}
 
 
+def learning_table(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return what each learner does to the error on the circle and to moves, in chains that differ in nothing else."""
+    circles, moves = load_runs(folder / "circles"), load_runs(folder / "moves")
+    rows = []
+    for world, own in circles.groupby("mismatch", sort=False):
+        without = own[own["controller"] == WITHOUT].set_index("seed")["rms_error_evaluated"]
+        for name, each in by_method(own):
+            move = moves[(moves["mismatch"] == world) & (moves["controller"] == name)]
+            ratio = each.set_index("seed")["rms_error_evaluated"] / without
+            rows.append({
+                "world": f"`{world}`",
+                "estimator": quoted(name.partition("+")[2]),
+                "circle, RMS of the second lap, mm": millimetres(each, digits=2),
+                "over that of `constant`": short(median_with_interval(ratio), 2),
+                "moves settled": str(settled(move)),
+                "settling time, s": settling(move),
+            })  # fmt: skip
+    return {"learning": pd.DataFrame(rows)}
+
+
 def pairs_table(folder: Path) -> dict[str, pd.DataFrame]:
     """Return how the runs of every pair of law and estimator ended."""
     rows = []
@@ -60,6 +86,16 @@ def map_pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
     for path in sorted((folder / "map" / "figures").glob("*.png")):
         with Image.open(path) as picture:
             yield f"pictures/{path.name}", small(picture)
+
+
+def chain(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the settings of the same chain for all pairs; the true Jacobian needs no map."""
+    values = {**{f"aids.{key}": word for key, word in EQUIPPED.items()}, "law.gain": 27.7, "law.step_weight": 4e-4}
+    options: list[str] = []
+    for name in names:
+        own = values | {"aids.model": "own"} if name.endswith("+true") else values
+        options += [word for key, value in own.items() for word in ("--set", f"{name}.{key}={json.dumps(value)}")]
+    return tuple(options)
 
 
 def small(picture: Image.Image) -> bytes:
@@ -79,6 +115,16 @@ WORLDS = Study(
         "moved": sweep("fmu", BOTH, "random", SEEDS, "--mismatch", MOVED, "--set", "random.duration=16"),
     },
     worlds_table,
+)
+LEARNING = Study(
+    "learning",
+    "what learned parts win where a map cannot do: 100 robots a world, chains that differ in the estimator only",
+    5,
+    {
+        part: sweep("kinematic", LEARNERS, task, "9400:9500", "--mismatch", LEARNING_WORLDS, *chain(LEARNERS))
+        for part, task in (("circles", "circle"), ("moves", "random"))
+    },
+    learning_table,
 )
 PAIRS_STUDY = Study(
     "pairs",
