@@ -126,7 +126,7 @@ def test_cells_may_differ_as_rounding_makes_them(found, wanted, same):
 
 
 def test_an_unknown_study_is_one_line_that_names_them_all():
-    with pytest.raises(SystemExit, match="no study is called nonsense; there are held_out, audit, "):
+    with pytest.raises(SystemExit, match="no study is called nonsense; there are held_out, rendered, "):
         renewal.main(["nonsense"])
 
 
