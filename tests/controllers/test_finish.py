@@ -28,7 +28,7 @@ def test_feedforward_and_posture_by_hand():
     q, r, wanted = np.full(N, 0.1), np.array([0.001, 0.0, 0.002]), np.linspace(-0.1, 0.1, N)
     pinv = np.linalg.pinv(A)
     posture = (1.0 - np.exp(-0.2 * PERIOD)) * (np.eye(N) - pinv @ A) @ (0.5 - q)
-    aids = {"feedforward": True, "posture": True, "damping": 1e-9}
+    aids = {"feedforward": True, "posture": True, "posture_gain": 0.2, "damping": 1e-9}
     u, limited = finish(wanted, q, r, knowledge=knowledge, **aids)
     np.testing.assert_allclose(u, wanted + (pinv @ r + posture) / PERIOD, atol=1e-8)
     assert not limited
@@ -49,7 +49,7 @@ def test_the_posture_does_not_move_the_feature_and_comes_nearer_to_the_middle():
     q = np.linspace(-1.0, 1.0, N)
     y, null = A @ q, np.eye(N) - np.linalg.pinv(A) @ A
     for _ in range(200):
-        u, _ = finish(np.zeros(N), q, posture=True, damping=1e-9)
+        u, _ = finish(np.zeros(N), q, posture=True, posture_gain=0.2, damping=1e-9)
         q = q + u * PERIOD
         np.testing.assert_allclose(A @ q, y, atol=1e-7)
     np.testing.assert_allclose(null @ q, np.exp(-0.2 * 200 * PERIOD) * null @ np.linspace(-1.0, 1.0, N), atol=1e-6)
