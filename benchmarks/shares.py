@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 
 from measuring import METHODS, PERIODS, WIDTH, resolved_runs, table, write_picture
 
-PARTS = ("plant", "truth", "estimator", "law", "log", "judging", "building", "rest")
+PARTS = ("plant", "truth", "estimator", "law", "aids", "log", "judging", "building", "rest")
 SIDES = {"before": "before, single runs", "single": "now, single runs", "block": "now, side by side"}
 Costs = dict[str, dict[str, float]]  # [µs a period] by method and part
 
@@ -83,9 +83,14 @@ def measure(together: bool, runs: int) -> Costs:
         resolved = resolved_runs("kinematic", method, runs)
         controller: Any = build(resolved[0]).controller
         servo = getattr(controller, "servo", controller)
-        for name in ("update", "estimate", "jacobian"):
-            clock.wrap(type(servo.estimator), name, "estimator")
         clock.wrap(type(servo.law), "command", "law")
+        if hasattr(servo, "estimation"):
+            clock.wrap(type(servo.estimation), "update", "estimator")
+            clock.wrap(type(servo.finish), "finish", "aids")
+            clock.wrap(type(servo.predictor), "predict", "aids")
+        else:  # a checkout before the aids
+            for name in ("update", "estimate", "jacobian"):
+                clock.wrap(type(servo.estimator), name, "estimator")
         clock.wrap(type(controller), "diagnostics", "log")
         episode.carry_out(resolved[0], steps=False)
         clock.switch()
@@ -113,7 +118,17 @@ def draw(sides: dict[str, Costs], path: Path) -> None:
     """Draw a panel for each side."""
     from servobench.harness.pictures import style
 
-    colours = (style.BLUE, style.SKY, style.VERMILION, style.ORANGE, style.GREEN, style.YELLOW, style.PURPLE, "#BBBBBB")
+    colours = (
+        style.BLUE,
+        style.SKY,
+        style.VERMILION,
+        style.ORANGE,
+        style.GREEN,
+        style.YELLOW,
+        style.PURPLE,
+        style.WINE,
+        "#BBBBBB",
+    )
     with style.figure_style():
         figure = Figure(figsize=(WIDTH, 2.7), layout="constrained")
         for axes, (side, costs) in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides.items(), strict=True):

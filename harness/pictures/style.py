@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
+from servobench.controllers.methods import METHODS, PUBLISHED
 from servobench.plant.checks import FloatArray
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
@@ -54,6 +55,7 @@ class MethodStyle:
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
     "map_mfac": MethodStyle(WINE, "-", "*"),
+    "arm_mfac": MethodStyle(WINE, "--", "H"),
     "ukf_mfac": MethodStyle(BLUE, "--", "s"),
     "ukf_mpc": MethodStyle(GREEN, "-.", "^"),
     "rbf_pid": MethodStyle(ORANGE, (0, (5, 1)), "D"),
@@ -63,6 +65,9 @@ _STYLES = {
     "broyden": MethodStyle(PURPLE, "--", "P"),
     "rls": MethodStyle(SKY, "-.", "X"),
     "cfdl_mfac": MethodStyle(YELLOW, (0, (3, 1, 1, 1)), "*"),
+}
+_STYLES |= {
+    name + PUBLISHED: replace(_STYLES[name], line=(0, (1, 1))) for name in _STYLES if name + PUBLISHED in METHODS
 }
 _OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
 _OTHER_LINES = ((0, (1, 1)), (0, (4, 2)), (0, (6, 1, 1, 1)), "-", "--")

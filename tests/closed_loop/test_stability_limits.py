@@ -9,12 +9,16 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
 
-PUBLISHED = ("pid+true", "mfac+ukf", "mpc+true", "rbf_pid:published", "rbfnn_mfac:published")
+PUBLISHED = ("pid+true", "mfac+ukf", "mpc+true", "rbf_pid:published")
+# The law of rbfnn_mfac is not among them: what it learns grows with the error, which no linear model has.
 # A posture term moves the arm all the time, so that the gain of the feature filter is not that of the rest.
 NO_POSTURE = {"aids": {"posture": False}}
 
 
-@pytest.mark.parametrize(("controller", "settings"), [*((name, {}) for name in PUBLISHED), ("map_mfac", NO_POSTURE)])
+@pytest.mark.parametrize(
+    ("controller", "settings"),
+    [*((name, {}) for name in PUBLISHED), ("map_mfac", NO_POSTURE)],
+)
 def test_predicted_limits_are_those_of_small_motions(controller, settings):
     run = resolve(RunRequest("kinematic", controller, "random", "none", 0), Settings({controller: settings}))
     predicted, warm = analyse_loop(run), warm_up(run)

@@ -107,9 +107,9 @@ def test_the_defaults_come_first_and_no_two_trials_are_alike(made_up, tmp_path):
 
 
 def test_the_sampler_finds_better_values_than_what_is_known_and_the_search_still_better_ones(made_up, tmp_path):
-    known = len(first_points("rls"))
-    few = outcomes(tmp_path / "few", plan_of("rls", trials=known))[0][0]
-    more = outcomes(tmp_path / "more", plan_of("rls", trials=known + 25, search=40))[0][0]
+    known = len(first_points("broyden"))
+    few = outcomes(tmp_path / "few", plan_of("broyden", trials=known))[0][0]
+    more = outcomes(tmp_path / "more", plan_of("broyden", trials=known + 25, search=120))[0][0]
     assert more.best_trial >= known
     assert more.found.score < more.best_trial_score < few.best_trial_score
 

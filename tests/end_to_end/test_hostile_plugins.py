@@ -85,7 +85,7 @@ def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_pa
     assert "Traceback" not in output
     if command == "tune":
         assert 0.0 < read_tuned(out / "constant.toml").score < 2.0
-        assert "[2.0" in (out / "constant.journal").read_text() or ", 2.0" in (out / "constant.journal").read_text()
+        assert "2.0" in (out / "constant.jsonl").read_text()
         return
     runs = results.load_runs(out)
     failed = runs[runs["status"] != "completed"]

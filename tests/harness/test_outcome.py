@@ -91,13 +91,13 @@ def test_a_target_out_of_reach_counts_before_a_joint_at_its_stop(target, at_stop
 
 
 def test_outcomes_of_runs_side_by_side_are_those_of_each_alone_however_few_fit_into_memory(monkeypatch):
-    settings = {"random": {"duration": 2.0}}
+    settings = {"random": {"duration": 1.0}}
     runs = [run("ukf_mfac", "random", settings, seed, "severe") for seed in range(40001, 40008)]
     alone = [carry_out(each, steps=False).row["outcome"] for each in runs]
     assert len(set(alone)) > 1
     together = carry_out_together(runs)
     assert [each.row["outcome"] for each in together] == alone
-    monkeypatch.setattr(episode, "ROWS_AT_ONCE", 3 * 40)
+    monkeypatch.setattr(episode, "ROWS_AT_ONCE", 3 * 20)
     for few, many in zip(carry_out_together(runs), together, strict=True):
         np.testing.assert_equal(few.row, many.row)
 

@@ -64,7 +64,7 @@ def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkey
     command = MfacLaw.command
 
     def fragile(self, state, estimate, observation, reference):
-        bad = (observation.time > 1.0) & (observation.feature[..., 0] > 0.05)
+        bad = (observation.time > 0.3) & (observation.feature[..., 0] > 0.05)
         if np.any(bad):
             raise kind(f"the feature is at {observation.feature[..., 0].tolist()}")
         return command(self, state, estimate, observation, reference)

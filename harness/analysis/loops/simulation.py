@@ -20,6 +20,7 @@ from servobench.plant.signals import Command
 
 OFFSET = 1e-4  # [m] of the desired feature in each axis, from which the motions begin
 WINDOWS = 4  # of the run; a stable one has a smaller error in the last than in the second, and than at the begin
+NEGLIGIBLE = 0.01  # [1] of the first error; rounding and slow learning may make a smaller one grow
 DURATION = 20.0  # [s]
 MOST_LATE = 3.0  # [s] largest latency that is tried
 MOST_GAIN = 32.0  # largest factor that is tried
@@ -54,7 +55,8 @@ class SmallLoop:
         errors = np.linalg.norm(moved - rested - OFFSET, axis=-1)
         length = len(errors) // WINDOWS
         last = errors[-length:].max()
-        return bool(last < min(errors[length : 2 * length].max(), errors[0]))
+        gone = last < NEGLIGIBLE * errors[0]
+        return bool(gone or last < min(errors[length : 2 * length].max(), errors[0]))
 
     def latency_limit(self) -> float:
         """Return the largest latency, in whole periods more than that of the plant, before one that is unstable [s]."""
