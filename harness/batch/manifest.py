@@ -30,6 +30,9 @@ PACKAGES = (
 )
 
 
+CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
+
+
 def describe_batch(
     runs: Survey, sections: Mapping[str, Any], side_by_side: Mapping[str, list[str]], *, steps: bool = False
 ) -> dict[str, Any]:
@@ -69,13 +72,17 @@ def _version(name: str) -> str | None:
 
 
 def _git_commit() -> str | None:
-    """Return the commit of the checkout this code lies in, marked where files differ from it; None outside one."""
-    here = Path(__file__).resolve().parents[1]
-    if not (here.parent / ".git").exists():
+    """Return the commit of the checkout this code lies in, marked where code differs from it; None outside one."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
         return None
+    commit, changed = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
+    return f"{commit}-dirty" if commit and changed else commit
+
+
+def _git(root: Path, *words: str) -> str | None:
     try:
-        command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-        answer = subprocess.run(command, cwd=here, capture_output=True, text=True, timeout=10, check=True)
+        answer = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     return answer.stdout.strip() or None
