@@ -79,7 +79,7 @@ def plugin(tmp_path) -> Path:
 def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how, workers):
     out = tmp_path / "out"
     arguments = ("--plants", "hostile", "--controllers", "constant", "--workers", workers, *COMMANDS[command])
-    limit = ("--run-timeout", "8") if how == "hang" else ()
+    limit = ("--run-timeout", "3" if command == "tune" else "8") if how == "hang" else ()
     code, output = finish(start(command, *arguments, *limit, "--out", str(out), path=plugin, HOSTILE=how))
     assert code == 0, output
     assert "Traceback" not in output
