@@ -127,7 +127,7 @@ class ArmEstimator(Estimator[ArmState]):
         first, last = J[..., 0, :, :], J[..., -1, :, :]
         by_gear = last * poses[..., -1, None, :] - first * poses[..., 0, None, :]
         H = np.concatenate([by_gear, last - first], axis=-1)
-        r = 2.0 * noise**2 + config.model_error**2 * np.vecdot(predicted, predicted)
+        r = 2.0 * noise * noise + config.model_error**2 * np.vecdot(predicted, predicted)
         R, Q = (
             r[..., None, None] * np.eye(H.shape[-2]),
             config.walk**2 * state.duration[..., None, None] * np.eye(2 * n),

@@ -134,7 +134,8 @@ class RbfEstimator(Estimator[RbfState]):
         config, network = self._config, self._network
         epsilon: FloatArray | float = config.epsilon
         if motion.noise is not None:
-            epsilon = epsilon * (motion.noise / USUAL_NOISE) ** 2
+            ratio = motion.noise / USUAL_NOISE
+            epsilon = epsilon * (ratio * ratio)
         theta = self._features.at(motion.joint_position)[..., None, :, :]
         joint_steps, feature_steps = motion.joint_step[..., None, :], motion.feature_step[..., None, :]
         if config.window > 1:

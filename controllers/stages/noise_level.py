@@ -65,7 +65,8 @@ class NoiseLevel(NamedTuple):
 def _learned(level: NoiseLevel, square: FloatArray, multiple: float, other: FloatArray) -> NoiseLevel:
     variance, weight_sum, sample_sum, floor = level
     own = multiple * variance
-    weight = (own / (own + other)) ** 2
+    share = own / (own + other)
+    weight = share * share  # a power of a number has other bits than that of an array
     cap = MAX_SAMPLE_RATIO * np.maximum(1.0, WARM_UP_SAMPLES / weight_sum) * variance
     sample_sum = FORGETTING * sample_sum + weight * np.minimum((square - other) / multiple, cap)
     weight_sum = FORGETTING * weight_sum + weight

@@ -27,7 +27,7 @@ def test_one_sample_of_noise_by_hand():
 def test_a_jump_counts_at_most_nine_times_the_noise_and_at_first_ninety_times():
     level = NoiseLevel.guess(1.0).learn(1e6, 1.0, 0.0)
     assert level.variance == pytest.approx((0.99 + 90.0) / 1.99)
-    for _ in range(1000):
+    for _ in range(LANES):
         level = level.learn(1.0, 1.0, 0.0)
     before = level.variance
     assert before == pytest.approx(1.0, rel=0.01)
@@ -52,3 +52,15 @@ def test_lanes_learn_each_for_itself_and_a_repeated_frame_teaches_nothing():
     for array, numbers in zip(lanes, zip(*single, strict=True), strict=True):
         np.testing.assert_array_equal(array, numbers)
     assert lanes.variance[1] == 0.001**2
+
+
+LANES = 20_000  # numpy's power of a number differs from that of an array once in so many
+
+
+def test_many_lanes_have_the_bits_of_each_alone():
+    generator = np.random.default_rng(1)
+    square, other = 10.0 ** generator.uniform(-8, -4, (2, LANES))
+    level = NoiseLevel.guess(0.001, (LANES,)).learn(square, 2.0, other).learn(other, 1.0, square)
+    for lane in range(LANES):
+        alone = NoiseLevel.guess(0.001).learn(square[lane], 2.0, other[lane]).learn(other[lane], 1.0, square[lane])
+        assert [x[lane] for x in level] == list(alone)
