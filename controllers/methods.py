@@ -138,7 +138,7 @@ _ROWS = (
     ),
     Method(
         "arm_mfac", "mfac", "arm",
-        "the same with gear ratios and joint zeros of the nominal model identified",
+        "as map_mfac, with the gear ratios and joint zeros of the arm estimated as well",
         {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
     Method(

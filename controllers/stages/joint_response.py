@@ -87,7 +87,7 @@ class JointResponse(NamedTuple):
         lead = joint_position.shape[:-1]
         left = np.broadcast_to(remaining_share(delay, lag, period, length), (*lead, length))
         state = cls.immediate(1, joint_position, period, length)
-        return state._replace(left=left, lead=np.full(lead, np.add.reduce(left[..., :], axis=-1))[()])
+        return state._replace(left=left, lead=np.full(lead, np.add.reduce(left, axis=-1))[()])
 
     def command(self, joint_step: FloatArray) -> JointResponse:
         """Return the state after the joint step (..., n), rad, was commanded."""

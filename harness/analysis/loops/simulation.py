@@ -22,8 +22,8 @@ OFFSET = 1e-4  # [m] of the desired feature in each axis, from which the motions
 WINDOWS = 4  # of the run; a stable one has a smaller error in the last than in the second, and than at the begin
 NEGLIGIBLE = 0.01  # [1] of the first error; rounding and slow learning may make a smaller one grow
 DURATION = 20.0  # [s]
-MOST_LATE = 3.0  # [s] largest latency that is tried
-MOST_GAIN = 32.0  # largest factor that is tried
+MAX_LATENCY = 3.0  # [s] largest latency that is tried
+MAX_GAIN = 32.0  # largest factor that is tried
 TIME_DIGITS = 3  # of a latency [s], as worlds advance in whole milliseconds
 PRECISION = 0.02  # [1] of the limit of the gain
 
@@ -63,13 +63,13 @@ class SmallLoop:
         latency = self.latency
         if not self.is_stable():
             return 0.0
-        while latency < MOST_LATE and self.is_stable(latency=latency + self._period):
+        while latency < MAX_LATENCY and self.is_stable(latency=latency + self._period):
             latency += self._period
         return latency
 
     def gain_limit(self) -> float:
-        """Return the factor on the command above which the loop is unstable, up to `MOST_GAIN`."""
-        stable, unstable = 1.0 / MOST_GAIN, MOST_GAIN
+        """Return the factor on the command above which the loop is unstable, up to `MAX_GAIN`."""
+        stable, unstable = 1.0 / MAX_GAIN, MAX_GAIN
         while unstable / stable > 1.0 + PRECISION:
             middle = float(np.sqrt(stable * unstable))
             stable, unstable = (middle, unstable) if self.is_stable(middle) else (stable, middle)

@@ -18,12 +18,13 @@ from servobench.harness.analysis.loops.loop_analysis import delay_margin
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.defaults import apply_settings, default_config, file_stem
 from servobench.harness.config.settings import ConfigurationError, flatten
-from servobench.harness.run.experiment import build
+from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunSettings
 from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.ledger import LEDGER, Ledger
 from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate
 from servobench.harness.studies.tuning.spaces import Point, find_tunable, nested_settings
+from servobench.plant.faults import RunFault
 
 SECOND: Final = ".second"  # of the name of the ledger of the second set
 Wanted: TypeAlias = tuple["Ledger", str, Point]
@@ -100,11 +101,9 @@ def refusal(trial: Trial, runs: TuningSet) -> str | None:
     Whatever else fails is left to the runs, whose cost says so.
     """
     try:
-        build(trial.resolved(runs.runs()[:1])[0]).plant.close()
+        build_once(trial.resolved(runs.runs()[:1])[0])
     except ConfigurationError as error:
         return str(error)
-    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
-        return None
     return None
 
 
@@ -118,7 +117,7 @@ def bears_delay(trial: Trial) -> bool:
         return True
     try:
         return delay_margin(trial.config, trial.controller) >= objective.MIN_DELAY_MARGIN
-    except Exception:  # noqa: BLE001 - whatever fails in it fails in the runs, whose cost says so
+    except (ArithmeticError, ValueError, RunFault):  # it fails in the runs, too, whose cost says so
         return True
 
 
