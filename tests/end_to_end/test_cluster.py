@@ -18,7 +18,8 @@ from servobench.harness.config.settings import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
-SWEEP = ("sweep", "--controllers", "constant,broyden", "--seeds", "40", "--set", "random.duration=2")
+SWEEP = ("sweep", "--controllers", "broyden,rls", "--seeds", "300", "--set", "random.duration=4")
+RUNS = 600  # six blocks: the first is there long before the last
 
 
 @pytest.fixture
@@ -56,12 +57,12 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
     local = start(*SWEEP, "--out", str(tmp_path / "local"), "--workers", "1")
     remote = start(*SWEEP, "--out", str(tmp_path / "remote"), "--scheduler", scheduler)
     wait_for(lambda: part_count(tmp_path / "remote") > 0)
-    finished_before = len(results.load_runs(tmp_path / "remote"))
     os.killpg(workers[0].pid, signal.SIGKILL)
+    finished_before = len(results.load_runs(tmp_path / "remote"))
     for process in (local, remote):
         code, output = finish(process)
         assert code == 0, output
-    assert 0 < finished_before < 80
+    assert 0 < finished_before < RUNS
     tables = [judged(results.load_runs(tmp_path / name)) for name in ("remote", "local")]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
 
