@@ -69,6 +69,7 @@ class Method:
         law_defaults: settings of the law that differ from its own defaults.
         aids: settings of the aids that differ from none.
         printed: settings of the law as published that differ from its own defaults; None: it is not published.
+        estimator_defaults: settings of the estimator that differ from its own defaults where there are aids.
     """
 
     name: str
@@ -78,18 +79,21 @@ class Method:
     law_defaults: Mapping[str, object] = field(default_factory=dict)
     aids: Mapping[str, Any] = field(default_factory=dict)
     printed: Mapping[str, object] | None = None
+    estimator_defaults: Mapping[str, object] = field(default_factory=dict)
 
     def divisions(self) -> list[Method]:
         """Return the method best equipped and, where there is one, as published: without aids, its law as printed."""
         if self.printed is None:
             return [self]
         summary = f"{self.summary}; as published, without aids"
-        return [self, replace(self, name=self.name + PUBLISHED, summary=summary, law_defaults=self.printed, aids={})]
+        printed = replace(self, law_defaults=self.printed, aids={}, estimator_defaults={})
+        return [self, replace(printed, name=self.name + PUBLISHED, summary=summary)]
 
     def config(self) -> MethodConfig:
         """Return the default settings."""
         law, estimator = self._parts()
-        settings = estimator.config(), law.config(**self.law_defaults), InitialConfig(), AidsConfig(**self.aids)
+        parts = estimator.config(**self.estimator_defaults), law.config(**self.law_defaults)
+        settings = *parts, InitialConfig(), AidsConfig(**self.aids)
         if law.trained or estimator.trained:
             return TrainedMethodConfig(*settings, TrainingConfig())
         return MethodConfig(*settings)
@@ -121,7 +125,6 @@ class Method:
 
 
 _OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}  # it brings these
-_OF_RBFNN = {key: word for key, word in EQUIPPED.items() if key != "posture"}  # its network brings it
 _GIVEN = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
 _PRINTED_MPC = {"mode": "constant", "use_preview": False, "limit_position": False}
 
@@ -129,7 +132,7 @@ _ROWS = (
     Method(
         "rbfnn_mfac", "rbfnn", "rbf",
         "the proposed method: a controller network and a Jacobian network that learn online (eqs. 7-39)",
-        {"preview": False}, _OF_RBFNN, printed={},
+        {"preview": False}, EQUIPPED, printed={}, estimator_defaults={"leak": 0.1},
     ),
     Method(
         "map_mfac", "mfac", "constant",

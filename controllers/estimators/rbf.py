@@ -31,6 +31,8 @@ class RbfConfig:
     epsilon: NonNegative = 1e-3
     """[rad²] ε, joint motion (squared, summed over the window) below which learning fades. It holds at `USUAL_NOISE`;
     where the noise is identified it grows with its variance."""
+    leak: NonNegative = 0.0
+    """[1/s] at which what was learned fades (σ-modification); 0 as in the paper."""
 
 
 def window_step(
@@ -104,7 +106,10 @@ class RbfEstimator(Estimator[RbfState]):
 
     Departures from the paper: α₂ > 0 (the paper's is negative and enters with a minus sign); ε, in joint motion per
     unit of ‖θ‖², without which the step grows without bound as the arm comes to rest and noise rewrites the network
-    there; the sum in α₂ runs over the same window as the gradient (the paper's has one term more).
+    there; the leak σ, W ← W − (1 − exp(−σ Δt)) (W − W(0)), without which an estimated map (aid `model`) and the network
+    turn against each other, since many pairs of them give the same Ĵ: in half an hour on a circle the map turned by
+    0.8 rad and the network turned back; the sum in α₂ runs over the same window as the gradient (the paper's has one
+    term more).
     """
 
     brings_model = True
@@ -148,6 +153,9 @@ class RbfEstimator(Estimator[RbfState]):
         step = window_step(sizes, joint_steps, filled, config.k2, epsilon)
         rows = network.gradient(step[..., None, None] * errors, joint_steps, theta)
         np.add(rows, state.rows, out=rows)
+        if config.leak:
+            gone = -np.expm1(-config.leak * motion.duration)
+            rows -= gone[..., None, None, None] * (rows - network.rows)
         past = theta[..., 1:, :, :], joint_steps[..., 1:, :], feature_steps[..., 1:, :]
         return RbfState(rows, *past, filled, errors, step)
 

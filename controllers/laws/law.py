@@ -14,7 +14,7 @@ from servobench.controllers.estimate import Estimate
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import BoolArray, Observation
 
-Stage: TypeAlias = Literal["predict", "preview", "posture", "limit"]
+Stage: TypeAlias = Literal["predict", "preview", "limit"]
 State = TypeVar("State")
 
 

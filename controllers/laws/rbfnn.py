@@ -108,7 +108,7 @@ class RbfnnLaw(Law[RbfnnState]):
             check_preview(config.horizon * network.step, knowledge.preview, spec.period, "the law's horizon")
         self._config = config
         self._network = network
-        own: tuple[Stage, ...] = ("posture", "preview") if config.preview else ("posture",)
+        own: tuple[Stage, ...] = ("preview",) if config.preview else ()
         self.owns = frozenset(own)
         self._period, self._step = spec.period, network.step
         self._step_limit = spec.joint_velocity_limit * network.step

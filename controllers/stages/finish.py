@@ -38,11 +38,7 @@ class Finish:
         Raises:
             ValueError: a stage that the law brings itself, or a feedforward without a preview.
         """
-        for stage, asked in (
-            ("preview", aids.feedforward),
-            ("posture", aids.posture),
-            ("limit", aids.limit != "scale"),
-        ):
+        for stage, asked in (("preview", aids.feedforward), ("limit", aids.limit != "scale")):
             if asked and stage in owns:
                 raise ValueError(f"aids: {law} brings its own {stage}; leave that aid off")
         if aids.feedforward and knowledge.preview < 1:

@@ -189,8 +189,8 @@ def test_laws_declare_the_stages_that_they_bring():
         ("mfac", {}, set()),
         ("mpc", {}, {"limit", "preview"}),
         ("mpc", {"use_preview": False, "delay": 0.1}, {"limit", "predict"}),
-        ("rbfnn", {}, {"posture", "preview"}),
-        ("rbfnn", {"preview": False}, {"posture"}),
+        ("rbfnn", {}, {"preview"}),
+        ("rbfnn", {"preview": False}, set()),
     ):
         part = LAWS[name]
         made = part.make(part.config(**config), KNOWLEDGE, *([networks()] if part.trained else []))

@@ -128,6 +128,17 @@ def test_only_the_last_motions_of_the_window_count():
     np.testing.assert_allclose(estimator.state.rows, expected, atol=1e-13)
 
 
+def test_what_was_learned_fades_by_its_leak_per_second():
+    net, leak = network(), 0.4
+    keeping, fading = (started(RbfConfig(leak=each), net) for each in (0.0, leak))
+    moved = motion([0.1, -0.2, 0.05], [0.01, 0.02])
+    for estimator in (keeping, fading):
+        estimator.update(moved)
+    learned, kept = (each.state.rows - net.rows for each in (keeping, fading))
+    np.testing.assert_allclose(kept, np.exp(-leak * moved.duration) * learned, rtol=1e-12, atol=1e-15)
+    assert np.abs(learned).max() > 1e-4
+
+
 def test_an_initial_jacobian_of_another_size_is_refused():
     with pytest.raises(ValueError, match=r"jacobian must have shape \(2, 3\), got \(3, 6\)"):
         started(RbfConfig(), network()).estimator.start(np.zeros((3, 6)))

@@ -120,7 +120,7 @@ _RBFNN_SWITCHES: Final[Space] = {
 }
 
 SPACES: Final[Mapping[str, Space]] = {
-    "rbfnn_mfac": {**_aids({"posture", "posture_gain"}), **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
+    "rbfnn_mfac": {**_aids(), **_RBFNN_SWITCHES, **_RBFNN, **_RBF},
     "rbfnn_mfac:published": {**_RBFNN, **_RBF},
     "map_mfac": {**_aids(), **_MFAC},
     "arm_mfac": {**_aids(), **_MFAC, **_ARM},
