@@ -98,7 +98,7 @@ def test_settings_are_nested_and_rounded_to_three_digits():
 @pytest.mark.parametrize("name", SPACES)
 def test_best_equipped_methods_have_the_words_of_the_aids_as_switches_and_published_ones_none(name):
     words = {key.removeprefix("aids.") for key, values in SPACES[name].items() if key in AIDS and is_switch(values)}
-    own = {"ukf_mpc": {"feedforward", "limit"}, "rbfnn_mfac": {"posture"}}.get(name, set())
+    own = {"ukf_mpc": {"feedforward", "limit"}}.get(name, set())
     bounded = name.endswith(":published") or name in {"constant", "calibrated"}
     assert words == (set() if bounded else set(EQUIPPED) - own - {"posture"})
 
@@ -257,8 +257,15 @@ def test_a_change_that_gains_little_is_no_improvement():
     assert much.gain == pytest.approx(0.035)
 
 
-def test_a_sample_of_the_whole_check_no_other_damping_and_integral_gain_helps_a_calibrated_robot(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "keys", "count"),
+    [
+        ("calibrated", ("law.damping", "law.integral_gain"), 5),
+        ("map_mfac", ("aids.delay", "aids.filter", "aids.feedforward", "aids.limit"), 6),
+    ],
+)
+def test_a_sample_of_the_whole_check_no_other_value_helps(name, keys, count, tmp_path):
     """The whole check, of every value of every method, is part of `make nightly`."""
-    check = Check(tmp_path, ("calibrated",), TuningSet().second(), ("law.damping", "law.integral_gain"))
-    assert len(list(check.carry_out(Workers()))) == len(check) == 5
+    check = Check(tmp_path, (name,), TuningSet().second(), keys)
+    assert len(list(check.carry_out(Workers()))) == len(check) == count
     assert improvements(check.changes()) == []
