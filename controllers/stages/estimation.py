@@ -19,7 +19,7 @@ import numpy as np
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
-from servobench.controllers.stages.pairing import Paired, Pairing, PairState, periods_in
+from servobench.controllers.stages.pairing import Paired, Pairing, PairState, whole_periods
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm
 from servobench.plant.signals import Observation
@@ -89,7 +89,7 @@ class Estimation:
         self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
         self._nominal = None if estimator.brings_model else knowledge.nominal_jacobian
         self._adds = aids.model != "own" and not estimator.brings_model
-        self._shortest = (max(1, periods_in(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
+        self._shortest = (max(1, whole_periods(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
         self.pairing = Pairing(aids, knowledge.spec, delays.latency) if aids.looks_back else None
         self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * knowledge.spec.period
 

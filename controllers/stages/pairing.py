@@ -40,7 +40,7 @@ CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier canno
 NOW_AND_BEFORE = np.array([0, 1])
 
 
-def periods_in(time: float, period: float) -> int:
+def whole_periods(time: float, period: float) -> int:
     """Return the number of control periods that is nearest to a time [s]."""
     return round(time / period)
 
@@ -107,10 +107,10 @@ class Pairing:
             latency: s, of a given delay.
         """
         self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
-        motion = max(1, periods_in(MOTION_TIME, spec.period))
-        longest = periods_in(aids.longest_delay, spec.period)
+        motion = max(1, whole_periods(MOTION_TIME, spec.period))
+        longest = whole_periods(aids.longest_delay, spec.period)
         spacing = max(1, math.ceil(longest / (MAX_CANDIDATES - 1)))
-        given = periods_in(latency, spec.period) if aids.delay == "given" else 0
+        given = whole_periods(latency, spec.period) if aids.delay == "given" else 0
         candidates = np.arange(0, longest + 1, spacing) if aids.delay == "identified" else np.array([given])
         self.delays: npt.NDArray[np.int_] = candidates
         self.gap = MAX_GAP * motion

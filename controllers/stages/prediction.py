@@ -23,7 +23,7 @@ from servobench.controllers.controller import Delays
 from servobench.controllers.stages.feature_filter import FeatureFilter
 from servobench.controllers.stages.joint_response import SPAN, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.pairing import periods_in
+from servobench.controllers.stages.pairing import whole_periods
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch
 from servobench.plant.signals import BoolArray, Observation
@@ -93,8 +93,8 @@ class Predictor:
             delays: of a given response.
         """
         self._aids, self._period, self._delays = aids, period, delays
-        self.span = max(1, periods_in(SPAN, period))
-        self._length = max(1, periods_in(aids.response_length, period * self.span))
+        self.span = max(1, whole_periods(SPAN, period))
+        self._length = max(1, whole_periods(aids.response_length, period * self.span))
 
     def frozen(self) -> Predictor:
         """Return a stage that goes on from a state of this one and identifies nothing more."""

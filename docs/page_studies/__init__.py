@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from page_studies.aids import AIDS
 from page_studies.audit import AUDIT
 from page_studies.claims import CLAIMS
 from page_studies.failures import FAILURES
@@ -14,7 +15,7 @@ from page_studies.worlds import LEARNING, MAP, PAIRS_STUDY, WORLDS
 STUDIES = {
     study.name: study
     for study in (
-        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AUDIT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS, LEARNING,
-        PAIRS_STUDY, MAP, README, FAILURES, PERFORMANCE,
+        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, AUDIT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS,
+        LEARNING, PAIRS_STUDY, MAP, README, FAILURES, PERFORMANCE,
     )
 }  # fmt: skip

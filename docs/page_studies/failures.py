@@ -18,7 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
-from page_studies.methods import FIVE, by_method, quoted, settled
+from page_studies.methods import SIX, by_method, quoted, settled
 from page_studies.study import Study, Words, sweep
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import success_rate
@@ -78,7 +78,7 @@ def repeated(options: Words) -> Callable[[Path], Words]:
     def command(folder: Path) -> Words:
         runs = load_runs(folder / RUNS)
         seeds = sorted(set(runs.loc[settling_times(runs).isna(), "seed"]))
-        return sweep("kinematic", FIVE, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
+        return sweep("kinematic", SIX, "random", ",".join(map(str, seeds)) + ",", *options) if seeds else ()
 
     return command
 
@@ -214,7 +214,7 @@ FAILURES = Study(
     "failures",
     "how often methods fail in ten million periods, and why",
     25,
-    {RUNS: sweep("kinematic", FIVE, "random", "100000:150000")}
+    {RUNS: sweep("kinematic", SIX, "random", "100000:150000")}
     | {part_of(title): repeated(options) for title, options in CHANGES.items()},
     tables,
     pictures,

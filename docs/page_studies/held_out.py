@@ -13,9 +13,9 @@ import pandas as pd
 from page_studies.methods import (
     BETTER,
     BOTH,
-    FIVE,
     MOVE,
     PUBLISHED,
+    SIX,
     SUFFIX,
     by_method,
     difference,
@@ -35,7 +35,7 @@ from servobench.harness.config.defaults import tuned_file
 
 LOST: Final = 1.0  # [m] that a circle counts as which was not completed
 STUDIES: Final = 3  # that a file of tuned values holds
-RENDERED: Final = (*FIVE, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in FIVE))
+RENDERED: Final = (*SIX, *(name for name in PUBLISHED if name.removesuffix(SUFFIX) in SIX))
 
 
 def tables(folder: Path) -> dict[str, pd.DataFrame]:
@@ -75,7 +75,7 @@ def method_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
 
 def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield a row for the better method and each of the paper's, both divisions beside each other."""
-    for name in FIVE:
+    for name in SIX:
         row = {"method": quoted(name)}
         for full in (name, name + SUFFIX):
             own = runs[runs["controller"] == full]

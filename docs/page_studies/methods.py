@@ -16,7 +16,7 @@ from servobench.harness.run.episode import COMPLETED
 
 BETTER: Final = "arm_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper
-FIVE: Final = (BETTER, "map_mfac", *FOUR)
+SIX: Final = (BETTER, "map_mfac", *FOUR)
 TAIL: Final = 0.95
 MOVE: Final = 10.0  # [s] duration of a move, which a run that never settles counts as
 

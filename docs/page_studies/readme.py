@@ -7,7 +7,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from page_studies.methods import FIVE
+from page_studies.methods import SIX
 from page_studies.study import Study
 from page_studies.worlds import small
 from servobench.harness.batch import results
@@ -39,7 +39,7 @@ README = Study(
     6,
     {
         "batch": (
-            "compare", "--plants", "bullet", "--controllers", ",".join((*FIVE, "calibrated")),
+            "compare", "--plants", "bullet", "--controllers", ",".join((*SIX, "calibrated")),
             "--tasks", "exp1,exp2,exp3,exp4,circle", "--mismatch", "moderate", "--seeds", "0:1", "--no-report",
         ),
     },
