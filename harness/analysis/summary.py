@@ -25,6 +25,7 @@ SWEEP_COLUMNS: Final = (
     "rms_error_evaluated",
     *BAND,
 )  # what `sweep_tables` and `outcome_legend` read
+LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
 
 
@@ -39,7 +40,9 @@ def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
 
 def summary_legend(runs: pd.DataFrame) -> str:
     """Return what the words in `summary_tables` mean."""
-    return f"{outcome_legend([runs])}; over: overshoot; numbers are medians over runs"
+    late = f"; {LATE} some steps took longer than the period" if _is_late(runs) else ""
+    switches = "switches: joint commands that change sign between large values within two periods"
+    return f"{outcome_legend([runs])}; over: overshoot; {switches}; numbers are medians over runs{late}"
 
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
@@ -69,8 +72,8 @@ def summary_tables(runs: pd.DataFrame) -> Tables:
                     "outcome": _shares(own),
                     **special,
                     f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
-                    f"largest\n{unit}": _middle(own, "max_error", factor, 0),
-                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0),
+                    "switches": _middle(own, "command_switches", 1.0, 0),
+                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0) + (LATE if _is_late(own) else ""),
                 }
             )
         yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
@@ -129,6 +132,11 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
 
 def _milliseconds(times: pd.Series[float]) -> list[str]:
     return [MISSING if pd.isna(time) else f"{1e3 * time:g}" for time in times]
+
+
+def _is_late(runs: pd.DataFrame) -> bool:
+    """Return whether a step of a controller took longer than the control period."""
+    return bool((column_of(runs, "controller_time_overruns") > 0.0).any())
 
 
 def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:

@@ -40,8 +40,18 @@ Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 
 SWEPT: Final = ("noise_factor", "latency_s", "period_s")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
-COSTS: Final = ("controller_time_median_us", "controller_time_p99_us", "control_effort_rad", "saturation_fraction",
-                "jacobian_error_mean")  # fmt: skip
+COSTS: Final = (
+    "controller_time_median_us",
+    "controller_time_p99_us",
+    "controller_time_overruns",
+    "control_effort_rad",
+    "saturation_fraction",
+    "joint_acceleration_peak_rad_s2",
+    "joint_acceleration_rms_rad_s2",
+    "joint_jerk_rms_rad_s3",
+    "command_switches",
+    "jacobian_error_mean",
+)
 CURVE_MEASURES: Final = ("rms_error_second_lap", "rms_error_evaluated", "max_error", "max_joint_position_rad")
 TAIL: Final = 0.95
 MAX_REASON: Final = 60  # characters of a reason that are shown in a table

@@ -13,7 +13,11 @@
 | max_joint_position_rad | largest |q| of all joints and periods |
 | control_effort_rad | Σ |u| dt over joints and periods |
 | saturation_fraction | share of periods in which a joint is commanded at its speed limit |
+| joint_acceleration_peak_rad_s2, joint_acceleration_rms_rad_s2 | of the commands, over joints and periods |
+| joint_jerk_peak_rad_s3, joint_jerk_rms_rad_s3 | the same of the jerk |
+| command_switches | how often a large joint command is followed by a large one of the other sign, see `sign_switches` |
 | feature_invalid_fraction | share of periods without a valid feature |
+| controller_time_overruns | periods in which the controller's step took longer than the period |
 """
 
 from __future__ import annotations
@@ -34,6 +38,8 @@ SETTLING_BAND = 0.005  # share of the feature's natural size: 5 mm on the UR5
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
+LARGE_COMMAND = 0.1  # share of the joint's speed limit from which on a command counts as large
+SWITCH_PERIODS = 2  # within which a change of sign counts as a switch
 
 
 def settling_time(error: FloatArray, band: npt.ArrayLike, period: float, dwell: float = DWELL) -> FloatArray:
@@ -78,6 +84,37 @@ def path_length(points: FloatArray) -> FloatArray:
     return np.asarray(norm(steps).sum(axis=-1))
 
 
+def sign_switches(command: FloatArray, limit: FloatArray) -> npt.NDArray[np.int_]:
+    """Return how often joints are driven to and fro, summed over joints.
+
+    A joint switches in a period whose command is large, that is at least `LARGE_COMMAND` of the limit, if its previous
+    large command has the other sign and is at most `SWITCH_PERIODS` periods old. A slow reversal is no switch.
+
+    Args:
+        command: (..., n, k) [rad/s].
+        limit: (n,) [rad/s].
+
+    Returns:
+        (...) switches; 0 for a single period.
+    """
+    sign = np.where(np.abs(command) >= LARGE_COMMAND * limit[:, None], np.sign(command), 0.0)
+    before = np.zeros_like(sign)  # sign of the newest large command of the periods that count
+    for back in range(SWITCH_PERIODS, 0, -1):
+        earlier = sign[..., :-back]
+        before[..., back:] = np.where(earlier == 0.0, before[..., back:], earlier)
+    return np.asarray(np.count_nonzero(sign * before < 0.0, axis=(-2, -1)))
+
+
+def command_derivatives(command: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
+    """Return acceleration, (..., n, k − 1) [rad/s²], and jerk, (..., n, k − 2) [rad/s³], of the commands.
+
+    They are differences of consecutive commands (..., n, k) [rad/s] over the period [s]; the step from rest to the
+    first command is none of them.
+    """
+    acceleration = np.diff(command, axis=-1) / period
+    return acceleration, np.diff(acceleration, axis=-1) / period
+
+
 def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan) -> dict[str, FloatArray]:
     """Return the metrics of a run, or of runs side by side.
 
@@ -103,6 +140,7 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
     final = error[..., -max(1, round(FINAL_SPAN / spec.period)) :]
     way = norm(reference[..., 0] - feature[..., 0]) if fixed else path_length(reference)
     effort = np.abs(command)
+    acceleration, jerk = command_derivatives(command, spec.period)
     at_limit = effort >= spec.joint_velocity_limit[:, None] * (1 - 1e-9)
     lanes = error.shape[:-1]
     unknown = np.full(lanes, np.nan)
@@ -119,13 +157,19 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
         "rms_error_evaluated": _rms(evaluated) if evaluated.shape[-1] else unknown,
         "path_length_ratio": path_length_ratio,
         "max_joint_position_rad": np.abs(_columns(steps.joint_position)).max(axis=(-2, -1)),
-        "control_effort_rad": effort.reshape(*effort.shape[:-2], -1).sum(axis=-1) * spec.period,
+        "control_effort_rad": _flat(effort).sum(axis=-1) * spec.period,
         "saturation_fraction": at_limit.any(axis=-2).mean(axis=-1),
+        "joint_acceleration_peak_rad_s2": _peak(acceleration, unknown),
+        "joint_acceleration_rms_rad_s2": _rms(_flat(acceleration)) if acceleration.size else unknown,
+        "joint_jerk_peak_rad_s3": _peak(jerk, unknown),
+        "joint_jerk_rms_rad_s3": _rms(_flat(jerk)) if jerk.size else unknown,
+        "command_switches": sign_switches(command, spec.joint_velocity_limit).astype(np.float64),
         "feature_invalid_fraction": np.mean(_columns(~steps.feature_valid), axis=-1),
         "jacobian_error_mean": _of_known(np.mean, jacobian_error),
         "jacobian_condition_max": _of_known(np.max, condition),
         "controller_time_median_us": np.full(lanes, np.median(steps.controller_time)),
         "controller_time_p99_us": np.full(lanes, np.quantile(steps.controller_time, 0.99)),
+        "controller_time_overruns": np.full(lanes, _overruns(steps.controller_time, spec.period)),
         "plant_time_median_us": np.full(lanes, np.median(steps.plant_time)),
     }
 
@@ -133,6 +177,20 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
 def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return values (k, ...) or (k, ..., m) with the period as the last, contiguous axis."""
     return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+
+
+def _flat(values: FloatArray) -> FloatArray:
+    """Return values (..., n, k) as (..., n k)."""
+    return values.reshape(*values.shape[:-2], -1)
+
+
+def _peak(values: FloatArray, unknown: FloatArray) -> FloatArray:
+    return np.asarray(np.abs(values).max(axis=(-2, -1))) if values.size else unknown
+
+
+def _overruns(times: FloatArray, period: float) -> float:
+    """Return how many of the times (k,) [µs] are longer than the period [s]; NaN where they are not known."""
+    return math.nan if np.isnan(times).any() else float(np.count_nonzero(times > 1e6 * period))
 
 
 def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
 from servobench.harness.analysis.comparison import split_conditions, split_tasks
 from servobench.harness.analysis.folder import describe_folder
-from servobench.harness.analysis.summary import outcome_legend, summary_tables, sweep_tables
+from servobench.harness.analysis.summary import outcome_legend, summary_legend, summary_tables, sweep_tables
 from servobench.harness.analysis.tables import (
     compare_controllers,
     cost_table,
@@ -110,8 +110,21 @@ def test_a_comparison_ends_with_a_table_for_each_task(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
     titles, tables = zip(*summary_tables(runs), strict=True)
     assert titles == tuple(f"{task} on kinematic, moderate" for task in ("exp1", "exp2", "circle"))
-    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "settled", "1.50", "2", "2.0", "500", "130"]
-    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "followed", "–", "–", "2.0", "500", "130"]
+    assert tables[0].iloc[0].tolist() == ["rbfnn_mfac", "settled", "1.50", "2", "2.0", "3", "130"]
+    assert tables[2].iloc[0].tolist() == ["rbfnn_mfac", "followed", "–", "–", "2.0", "3", "130"]
+
+
+def test_a_controller_slower_than_the_period_is_marked_and_counted():
+    rows = [made_up_row("a", controller="slow", controller_time_overruns=7.0), made_up_row("b", controller="quick")]
+    runs = pd.DataFrame(rows)
+    ((_, table),) = summary_tables(runs)
+    assert table["step\nµs"].tolist() == ["130*", "130"]
+    assert summary_legend(runs).endswith("; * some steps took longer than the period")
+    assert "period" not in summary_legend(runs.tail(1)).removesuffix("periods; numbers are medians over runs")
+    costs = cost_table(runs).set_index("controller")
+    assert costs["steps over the period"].tolist() == [7.0, 0.0]
+    assert costs["sign switches"].tolist() == [3.0, 3.0]
+    assert costs["RMS jerk [rad/s³]"].tolist() == [12.0, 12.0]
 
 
 def test_the_outcomes_of_several_runs_are_shares():

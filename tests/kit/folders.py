@@ -41,7 +41,9 @@ def made_up_row(run_id: str, **values: object) -> dict[str, object]:
         "run_id": run_id, "plant": "kinematic", "controller": "ukf_mfac", "task": "exp1", "seed": 0,
         "mismatch": "moderate", "status": "completed", "settling_time_s": 1.5, "overshoot": 0.02,
         "steady_state_error": 0.001, "rms_error_evaluated": 0.002, "max_error": 0.5, "control_effort_rad": 3.0,
-        "saturation_fraction": 0.1, "jacobian_error_mean": 0.3, "controller_time_median_us": 130.0,
+        "saturation_fraction": 0.1, "command_switches": 3.0, "joint_jerk_rms_rad_s3": 12.0,
+        "joint_acceleration_rms_rad_s2": 1.5, "joint_acceleration_peak_rad_s2": 8.0, "controller_time_overruns": 0.0,
+        "jacobian_error_mean": 0.3, "controller_time_median_us": 130.0,
         "controller_time_p99_us": 159.0, "periods": 60, "reason": "", "mismatch_values": "{}",
         "task_kind": "point_to_point", "feature_unit": "m", "settling_band": 0.005,
     }  # fmt: skip

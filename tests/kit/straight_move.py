@@ -12,10 +12,10 @@ CONDITION = (1.0, 3.0, 2.0, 1.0)
 ESTIMATE = (1.2, 1.4, None, None)  # times the true Jacobian
 
 
-def straight_move(diagnostics=({}, {}, {}, {})):
-    """Return the log, full; the last period has no valid feature."""
+def straight_move(diagnostics=({}, {}, {}, {}), periods=4, milliseconds=(0.001, 0.002, 0.003, 0.004)):
+    """Return the log of so many periods; the fourth has no valid feature. A step of the controller takes so long."""
     log = StepLog(SPEC, 4)
-    for k in range(4):
+    for k in range(periods):
         jacobian = np.diag([CONDITION[k], 1.0])
         log.add(
             Observation(float(k), [0.1 * k, 0.0], [X[k] + 0.01, 0.0], k < 3),
@@ -24,6 +24,6 @@ def straight_move(diagnostics=({}, {}, {}, {})):
             Truth(np.array([X[k], 0.0]), jacobian),
             None if ESTIMATE[k] is None else ESTIMATE[k] * jacobian,
             diagnostics[k],
-            (1000 * (k + 1), 5000),
+            (int(1e6 * milliseconds[k]), 5000),
         )
     return log
