@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import subprocess
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch.survey import Survey
 from servobench.harness.config.settings import flatten
+from servobench.harness.config.version import git_commit, installed_version
 
 PACKAGES = (
     "servobench",
@@ -28,9 +26,6 @@ PACKAGES = (
     "opencv-python-headless",
     "pebble",
 )
-
-
-CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
 
 
 def describe_batch(
@@ -54,35 +49,11 @@ def describe_batch(
         "mismatches": list(runs.mismatches),
         "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
         "configuration": configuration,
-        "packages": {name: _version(name) for name in PACKAGES},
+        "packages": {name: installed_version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "git_commit": _git_commit(),
+        "git_commit": git_commit(),
         "side_by_side": dict(side_by_side),
         "run_count": runs.count,
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),
     }
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
-
-
-def _git_commit() -> str | None:
-    """Return the commit of the checkout this code lies in, marked where code differs from it; None outside one."""
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
-        return None
-    commit, changed = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
-    return f"{commit}-dirty" if commit and changed else commit
-
-
-def _git(root: Path, *words: str) -> str | None:
-    try:
-        answer = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return answer.stdout.strip() or None

@@ -37,7 +37,10 @@ def analyse(
     overrides: options.Overrides = options.OVERRIDES,
     out: Annotated[Path, typer.Option(help="Folder for table, pictures and page.")] = Path("results") / "analyse",
 ) -> None:
-    """Analyse the loop around a rest: margins, sensitivity, Bode, Nyquist, step, stability over gain and latency."""
+    """Analyse the loop at rest: margins, Bode, Nyquist, step.
+
+    Also sensitivity, and stability over gain and latency.
+    """
     from servobench.harness.analysis.loops.loop_analysis import analyse_loop
     from servobench.harness.analysis.loops.table import LEGEND, loop_table, printed
     from servobench.harness.config.settings import ConfigurationError

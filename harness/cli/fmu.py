@@ -9,7 +9,7 @@ import typer
 
 from servobench.harness.cli.terminal import console
 
-fmu_app = typer.Typer(help="Export the UR5 as an FMU, check FMUs, show what is in them.", no_args_is_help=True)
+fmu_app = typer.Typer(help="Export the UR5 as an FMU; check and show FMUs.", no_args_is_help=True)
 
 FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 
@@ -46,7 +46,7 @@ def export(
 
 @fmu_app.command()
 def validate(file: FileArgument) -> None:
-    """Check archive, description and, where it brings one, the reference run."""
+    """Check archive and description, and repeat its reference run."""
     from servobench.fmus.validate import validate_fmu
     from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.faults import FmuError

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.main
+from rich.markup import escape
 
 from servobench.harness.cli import runs, show, studies
 from servobench.harness.cli.analyse import analyse
@@ -13,47 +17,83 @@ from servobench.harness.cli.options import INTERRUPTED, grouped
 from servobench.harness.cli.sweep import sweep
 
 INPUT_ERROR = 2  # exit code
+PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
+    "First steps": (runs.run, runs.compare, show.statistics, show.report, show.record),
+    "What there is": (show.plants, show.controllers, show.tasks),
+    "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
+    "Tools": (runs.train, runs.collect),
+}
+COMPLETION_HELP = {  # by the option that typer adds
+    "install_completion": "Let this shell complete names.",
+    "show_completion": "Print what that would install.",
+}
 
-app = typer.Typer(
-    help="The bench on which uncalibrated visual-servoing controllers are compared.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-for command in (
-    show.plants,
-    show.controllers,
-    show.tasks,
-    runs.run,
-    runs.compare,
-    sweep,
-    show.statistics,
-    show.report,
-    show.record,
-    analyse,
-    studies.robustness,
-    studies.claims,
-    studies.tune,
-    runs.train,
-    runs.collect,
-):
-    app.command()(grouped(command))
-app.add_typer(fmu_app, name="fmu")
+app = typer.Typer(context_settings={"help_option_names": ["-h", "--help"]}, pretty_exceptions_enable=False)
+for panel, commands in PANELS.items():
+    for command in commands:
+        app.command(rich_help_panel=panel)(grouped(command))
+app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
+
+
+def _print_version(wanted: bool) -> None:
+    from servobench.harness.config.version import version_line
+
+    if wanted:
+        typer.echo(version_line())
+        raise typer.Exit
+
+
+@app.callback()
+def servobench(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print version and commit.")
+    ] = False,
+) -> None:
+    """Compare uncalibrated visual-servoing controllers: servobench COMMAND --help says more."""
+
+
+def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public name
+    """Return the command with all subcommands; help texts are taken as they stand, `[s]` is a unit and no markup."""
+    root: Any = typer.main.get_command(app)
+    waiting = [root]
+    while waiting:
+        each = waiting.pop()
+        waiting += getattr(each, "commands", {}).values()
+        for option in each.params:
+            option.help = COMPLETION_HELP.get(option.name) or escape(option.help or "")
+    return root
 
 
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
     try:
-        app()
-    except KeyboardInterrupt:
-        sys.stderr.write("servobench: interrupted\n")
-        sys.exit(INTERRUPTED)
+        code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
+    except KeyboardInterrupt:  # before the command began
+        code = INTERRUPTED
+    except typer.TyperException as error:
+        _refuse(_usage_line(error))
     except (ValueError, ImportError) as error:
         line = _line_for_user(error)
         if line is None:
             raise
+        _refuse(line)
+    if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that say more end by themselves
+        sys.stderr.write("servobench: interrupted\n")
+    sys.exit(code)
+
+
+def _refuse(line: str) -> NoReturn:
+    if line:
         sys.stderr.write(f"servobench: {line}\n")
-        sys.exit(INPUT_ERROR)
+    sys.exit(INPUT_ERROR)
+
+
+def _usage_line(error: typer.TyperException) -> str:
+    """Return what a command that cannot be understood is told with; nothing where its help was printed."""
+    context = getattr(error, "ctx", None)
+    help_ = f"; see {context.command_path} --help" if context else ""
+    words = " ".join(error.format_message().split())
+    return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""
 
 
 def _line_for_user(error: ValueError | ImportError) -> str | None:

@@ -22,6 +22,7 @@ from rich.status import Status
 from rich.text import Text
 
 from servobench.harness.batch.campaign import Observer, Row
+from servobench.harness.cli.options import INTERRUPTED
 
 
 class RateColumn(ProgressColumn):
@@ -98,7 +99,10 @@ def watching(console: Console, folder: Path) -> Iterator[Observer]:
     except KeyboardInterrupt:
         observer.close()
         if folder.exists():
-            sys.stderr.write(f"servobench: finished runs are kept in {folder}; the same call with --resume continues\n")
+            sys.stderr.write(
+                f"servobench: interrupted; finished runs are kept in {folder}, the same call with --resume continues\n"
+            )
+            raise SystemExit(INTERRUPTED) from None
         raise
     finally:
         observer.close()

@@ -38,7 +38,7 @@ def run(
     out: OutOption = None,
     with_report: ReportOption = False,
 ) -> None:
-    """Carry out one run."""
+    """Carry out one run and show what came of it."""
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.settings import ConfigurationError
@@ -62,7 +62,7 @@ def compare(
     out: OutOption = None,
     with_report: ReportOption = True,
 ) -> None:
-    """Run every combination and compare the controllers."""
+    """Compare controllers: run every combination."""
     from servobench.harness.batch.campaign import comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.settings import ConfigurationError
@@ -84,7 +84,10 @@ def train(
     controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
-    """Train the networks of a controller on the nominal model, unless they are kept already; print their errors."""
+    """Train the networks of a controller.
+
+    On the nominal model, unless they are kept already; prints their errors.
+    """
     from rich.table import Table
 
     from servobench.harness.cli.progress import run_progress
@@ -108,7 +111,7 @@ def train(
 
 
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
-    """Put the finished runs of a killed batch together into its tables."""
+    """Make the tables of a batch that was killed."""
     from servobench.harness.batch import results
 
     results.check_folder(folder)

@@ -80,7 +80,10 @@ def statistics(
     ] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
 ) -> None:
-    """Judge the controllers of a folder: rates, medians, tails, failures, paired differences, with 95 % intervals."""
+    """Judge the controllers of a folder, with 95 % intervals.
+
+    Rates, medians, tails, failures and paired differences.
+    """
     from servobench.harness.analysis.tables import statistics_tables
     from servobench.harness.batch import results
 
@@ -92,7 +95,10 @@ def report(
     folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
     out: Annotated[Path | None, typer.Option(help="The page; default report.html in the folder.")] = None,
 ) -> None:
-    """Write one page about a results folder: figures, sortable tables and paths to turn; it needs no network."""
+    """Write one page about a results folder.
+
+    With figures, sortable tables and paths to turn; it needs no network.
+    """
     make_report(folder, out)
 
 
@@ -131,7 +137,10 @@ def record(
         Path | None, typer.Option(help="Folder for the films; default recordings below the results folder.")
     ] = None,
 ) -> None:
-    """Show a run: film (MP4, GIF) and snapshots of the rendered arm, its camera's view and the error."""
+    """Show a run as film (MP4, GIF) and snapshots.
+
+    They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
+    """
     from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
 

@@ -35,7 +35,10 @@ def robustness(
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
-    """Draw the robustness map: success and settling time along seven axes, each varied by itself."""
+    """Draw success and settling time along seven axes.
+
+    The robustness map; each axis of the mismatch is varied by itself.
+    """
     from servobench.harness.batch.compare import parse_seeds
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.robustness import make_map
@@ -56,7 +59,10 @@ def claims(
     running: options.Running = options.RUNNING,
     check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
 ) -> None:
-    """Answer the paper's seven claims with statistics, and draw the figure behind each answer."""
+    """Answer the paper's seven claims with statistics.
+
+    The figure behind each answer is drawn as well.
+    """
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
     from servobench.harness.studies.claims.studies import find_divisions
@@ -94,7 +100,10 @@ def tune(
         Path("results") / "tuning"
     ),
 ) -> None:
-    """Search for the best settings of each method, with the same budget on the same training plants."""
+    """Search for the best settings of each method.
+
+    Every method has the same budget on the same training plants.
+    """
     from servobench.harness.batch.lock import locked
     from servobench.harness.batch.workers import open_workers
     from servobench.harness.config.settings import ConfigurationError

@@ -27,7 +27,10 @@ def sweep(
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
-    """Run a Monte Carlo sweep: many runs, a row each, no steps; can be continued."""
+    """Run a Monte Carlo sweep: many runs, a row each.
+
+    No steps are kept. A sweep that was interrupted is continued with --resume.
+    """
     from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out

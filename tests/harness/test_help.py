@@ -1,0 +1,94 @@
+"""What `servobench` says about itself: help, version, and the refusal of calls that cannot be understood."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import typer.main
+
+from kit.command import servobench
+from servobench.harness.cli.main import PANELS, app, command_line
+
+ROOT = command_line()
+COMMANDS = [
+    *(name for name in ROOT.commands if name != "fmu"),
+    *(f"fmu {name}" for name in ROOT.commands["fmu"].commands),
+]
+
+
+def shown(monkeypatch, capsys, *arguments):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert servobench(monkeypatch, *arguments) == 0
+    return capsys.readouterr().out
+
+
+def wide(monkeypatch, capsys, *arguments):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert servobench(monkeypatch, *arguments) == 0
+    return capsys.readouterr().out
+
+
+def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_columns(monkeypatch, capsys):
+    text = shown(monkeypatch, capsys)
+    listed = [line[2:13].strip() for line in text.partition("First steps")[2].splitlines() if line.startswith("│")]
+    assert listed == list(ROOT.commands)
+    assert listed[:2] == ["run", "compare"]
+    assert listed[-1] == "fmu"
+    titles = re.findall(r"─ ([A-Z][a-z ]+) ─", text)
+    assert titles == ["Options", *PANELS]
+
+
+def test_a_group_lists_each_command_in_one_line(monkeypatch, capsys):
+    text = shown(monkeypatch, capsys, "fmu", "--help").partition("Commands")[2]
+    assert [line.split()[1] for line in text.splitlines() if line.startswith("│")] == ["export", "validate", "info"]
+
+
+@pytest.mark.parametrize("option", ["-h", "--help"])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(monkeypatch, capsys, name, option):
+    text = shown(monkeypatch, capsys, *name.split(), option)
+    assert f"Usage: servobench {name} " in text
+    assert "\\" not in text
+
+
+def test_no_word_in_brackets_is_taken_for_markup(monkeypatch, capsys):
+    assert "a [section] a name" in wide(monkeypatch, capsys, "run", "--help")
+    written = typer.main.get_command(app).commands
+    for name in PANELS["First steps"] + PANELS["Studies"]:
+        text = wide(monkeypatch, capsys, name.__name__, "--help")
+        for option in written[name.__name__].params:
+            for words in re.findall(r"\[.*?\]", option.help or ""):
+                assert words in text
+
+
+def test_version_and_commit_are_told(monkeypatch, capsys):
+    assert re.fullmatch(
+        r"servobench \d\S*( \(commit [0-9a-f]{12}(, with changes)?\))?\n", shown(monkeypatch, capsys, "--version")
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("rum",), "no such command 'rum'. Did you mean 'run'?; see servobench --help"),
+        (("run", "--sed", "3"), "no such option: --sed (Possible options: --seed, --set); see servobench run --help"),
+        (("run", "--seed", "x"), "invalid value for '--seed': "),
+        (("sweep",), "missing option '--out'; see servobench sweep --help"),
+        (("fmu", "info"), "missing argument 'file'; see servobench fmu info --help"),
+    ],
+)
+def test_a_call_that_cannot_be_understood_is_one_line(monkeypatch, capsys, arguments, line):
+    assert servobench(monkeypatch, *arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"servobench: {line}")
+    assert error.count("\n") == 1
+
+
+def test_ctrl_c_is_a_line_and_exit_code_130(monkeypatch, capsys):
+    def interrupt(folder):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("servobench.harness.batch.results.check_folder", interrupt)
+    assert servobench(monkeypatch, "collect", ".") == 130
+    assert capsys.readouterr().err == "servobench: interrupted\n"
