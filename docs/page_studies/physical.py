@@ -27,7 +27,7 @@ from page_studies.study import Study, sweep
 from servobench.harness.analysis.comparison import column_of, outcomes, settling_times
 from servobench.harness.analysis.statistics import median_with_interval, success_rate
 from servobench.harness.batch.results import load_runs
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 
 RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
 PERIODS: Final = ",".join(f"{1.0 / rate:g}" for rate in RATES)

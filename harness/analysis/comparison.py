@@ -29,7 +29,7 @@ from servobench.harness.analysis.statistics import (
     signed_rank_p_value,
     success_rate,
 )
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
 from servobench.plant.checks import FloatArray
 

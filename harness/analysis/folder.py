@@ -9,7 +9,7 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.harness.batch import results
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 
 DESCRIBED: Final = ("plant", "controller", "task", "mismatch", "noise_factor", "latency_s", "period_s")
 MAX_LISTED: Final = 15  # values of a column

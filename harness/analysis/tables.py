@@ -31,7 +31,7 @@ from servobench.harness.analysis.statistics import (
     tail_mean,
 )
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.plant.settings import suggest
 

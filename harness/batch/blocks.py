@@ -17,7 +17,7 @@ import pickle
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
@@ -27,7 +27,8 @@ from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run import episode
-from servobench.harness.run.episode import CRASHED, TIMED_OUT, RunResult, describe_error, failed_row
+from servobench.harness.run.ending import CRASHED, TIMED_OUT, Ending
+from servobench.harness.run.episode import RunResult, failed
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun
 
@@ -102,7 +103,7 @@ def cut(
 
 
 def carry_out_blocks(
-    blocks: Iterable[Block], workers: Workers, *, steps: bool = False, keep: Path | None = None
+    blocks: Iterable[Block], workers: Workers, *, steps: bool = False, keep: Path | None = None, debug: bool = False
 ) -> Iterator[tuple[Block, list[RunResult]]]:
     """Carry out blocks and yield each, whole or run by run, with its results as it finishes, in any order.
 
@@ -111,10 +112,11 @@ def carry_out_blocks(
         workers: where.
         steps: return the tables of steps too.
         keep: results folder in which trained networks are kept beside the runs.
+        debug: raise what makes a run crash; runs stay in this process.
     """
-    if workers.submit is None:
+    if workers.submit is None or debug:
         for block in blocks:
-            yield block, _carry_out(block, steps, keep)
+            yield block, _carry_out(block, steps, keep, debug)
         return
     waiting, again = iter(blocks), deque[Block]()
     finished: SimpleQueue[tuple[Block, Any]] = SimpleQueue()
@@ -138,21 +140,19 @@ def carry_out_blocks(
 def _outcome(block: Block, future: Any, workers: Workers) -> list[RunResult] | None:  # noqa: ANN401 - of pebble or Dask
     """Return the results of a block; None if it died with several runs, which are to be carried out one by one."""
     try:
-        answer: list[RunResult] | str = future.result()
+        answer: list[RunResult] | Ending = future.result()
     except workers.lost:
-        status, reason = CRASHED, LOST
+        answer = Ending(CRASHED, LOST)
     except TimeoutError:
-        status, reason = TIMED_OUT, f"the run took longer than {workers.run_timeout:g} s"
+        answer = Ending(TIMED_OUT, f"the run took longer than {workers.run_timeout:g} s")
     except BrokenProcessPool as error:
         raise ConfigurationError(
             "the worker processes cannot be started; a script that starts several must keep its calls below "
             "`if __name__ == '__main__':`"
         ) from error
-    else:
-        if not isinstance(answer, str):
-            return answer
-        status, reason = CRASHED, answer
-    return [_failed(block.jobs[0].cell, status, reason)] if len(block.jobs) == 1 else None
+    if not isinstance(answer, Ending):
+        return answer
+    return [_failed(block.jobs[0].cell, answer)] if len(block.jobs) == 1 else None
 
 
 def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
@@ -163,35 +163,38 @@ def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
         raise ConfigurationError(f"{what}: {error}; use one worker") from error
 
 
-def _unpack(task: bytes) -> list[RunResult] | str:
+def _unpack(task: bytes) -> list[RunResult] | Ending:
     """Carry out a task in a worker; where it cannot be read, such as without its plug-in, return why."""
     try:
         block, steps, keep = pickle.loads(task)
     except Exception as error:  # noqa: BLE001 - of a plug-in
-        return describe_error(error)
+        return Ending.of(error)
     return _carry_out(block, steps, keep)
 
 
-def _carry_out(block: Block, steps: bool, keep: Path | None) -> list[RunResult]:
+def _carry_out(block: Block, steps: bool, keep: Path | None, debug: bool = False) -> list[RunResult]:
     with offering(block.entries):
         if block.together:
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
             with contextlib.suppress(Exception, SystemExit):
                 together = episode.carry_out_together([job.run for job in block.jobs], keep=keep)
                 return [_with_columns(job.cell, result) for job, result in zip(block.jobs, together, strict=True)]
-        return [_carry_out_run(job, steps, keep) for job in block.jobs]
+        return [_carry_out_run(job, steps, keep, debug) for job in block.jobs]
 
 
-def _carry_out_run(job: Job, steps: bool, keep: Path | None) -> RunResult:
+def _carry_out_run(job: Job, steps: bool, keep: Path | None, debug: bool) -> RunResult:
     try:
-        return _with_columns(job.cell, episode.carry_out(job.run, steps=steps, picture=job.cell.picture, keep=keep))
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a plug-in does, the others go on
-        return _failed(job.cell, CRASHED, describe_error(error))
+        result = episode.carry_out(job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug)
+    except (Exception, SystemExit) as error:
+        if debug:
+            raise
+        return _failed(job.cell, Ending.of(error))  # whatever a plug-in does, the others go on
+    return _with_columns(job.cell, result)
 
 
 def _with_columns(cell: Cell, result: RunResult) -> RunResult:
-    return RunResult({**result.row, **cell.columns}, result.steps, result.picture)
+    return replace(result, row={**result.row, **cell.columns})
 
 
-def _failed(cell: Cell, status: str, reason: str) -> RunResult:
-    return RunResult({**failed_row(cell.request, status, reason), **cell.columns}, None)
+def _failed(cell: Cell, ending: Ending) -> RunResult:
+    return _with_columns(cell, failed(cell.request, ending))

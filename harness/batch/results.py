@@ -1,4 +1,4 @@
-"""A folder of results: `runs.parquet` (a row a run), `steps.parquet` (a row a period), `manifest.json`.
+"""A folder of results: `runs.parquet` (a row a run), `steps.parquet` (a row a period), `manifest.json`, `failures.log`.
 
 While runs are under way, finished ones lie below `parts/`: a pair of files for each run or block of runs, each written
 atomically, steps first, so that a part counts once its rows are there. At the end the parts are put together. If the
@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 
 from servobench.harness.batch.lock import check_empty
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.ending import log_entry
 from servobench.plant.files import write_atomically
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ PARTS = "parts"
 PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
+FAILURES = "failures.log"
 MANIFEST = "manifest.json"
 ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
 
@@ -56,7 +58,7 @@ def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     """Write `manifest.json` atomically; JSON has no infinity, so a setting without limit reads "inf"."""
     content = json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2, allow_nan=False)
-    write_atomically(folder / MANIFEST, lambda file: file.write_text(content + "\n", encoding="utf-8"))
+    _write_text(folder / MANIFEST, content + "\n")
 
 
 def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
@@ -68,7 +70,7 @@ def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
 
 
 def write_part(folder: Path, index: int, outcome: Sequence[RunResult]) -> None:
-    """Write finished runs as one part, pictures and steps before the rows that make it count.
+    """Write finished runs as one part, all else before the rows that make it count.
 
     Args:
         folder: a results folder.
@@ -81,6 +83,9 @@ def write_part(folder: Path, index: int, outcome: Sequence[RunResult]) -> None:
     steps = [result.steps for result in outcome if result.steps is not None and len(result.steps)]
     if steps:
         _write_frame(pd.concat(steps, ignore_index=True), folder / PARTS / f"{index:08d}.{STEPS}")
+    failures = "".join(log_entry(result.row, result.trace) for result in outcome)
+    if failures:
+        _write_text(folder / PARTS / f"{index:08d}.{FAILURES}", failures)
     rows = _table([result.row for result in outcome])
     write_atomically(folder / PARTS / f"{index:08d}.{RUNS}", partial(pq.write_table, rows))
 
@@ -125,7 +130,7 @@ def finished_runs(folder: Path) -> list[range]:
 
 
 def collect(folder: Path) -> int:
-    """Put the parts together into the two tables and, unless runs are missing, remove them.
+    """Put the parts together into the two tables and the log and, unless runs are missing, remove them.
 
     Returns:
         Number of runs.
@@ -145,6 +150,9 @@ def collect(folder: Path) -> int:
         files = _part_files(folder, kind)
         if files:
             write_atomically(folder / kind, partial(_join, files))
+    failures = [path.read_text(encoding="utf-8") for path in _part_files(folder, FAILURES)]
+    if failures:
+        _write_text(folder / FAILURES, "".join(failures))
     count = int(pq.read_metadata(folder / RUNS).num_rows)
     if count >= wanted:
         shutil.rmtree(folder / PARTS)
@@ -273,3 +281,7 @@ def _join(paths: Sequence[Path], path: Path) -> None:
 
 def _write_frame(frame: pd.DataFrame, path: Path) -> None:
     write_atomically(path, lambda file: pq.write_table(pa.Table.from_pandas(frame, preserve_index=False), file))
+
+
+def _write_text(path: Path, text: str) -> None:
+    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8", errors="backslashreplace"))

@@ -13,11 +13,9 @@ import typer
 
 from servobench.harness.cli import options
 from servobench.harness.cli.show import make_report
-from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.terminal import console, print_faults, print_tables
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from servobench.harness.batch.campaign import Campaign, Execution
 
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
@@ -140,7 +138,7 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
     results.collect(folder)
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
-    _print_faults(runs)
+    print_faults(folder, runs)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
     if out is None:
@@ -155,8 +153,3 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
         except (ConfigurationError, ImportError) as error:  # the runs are safe; `servobench report` can be called again
             missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
             console.print(f"no report: {missing or error}", soft_wrap=True, markup=False)
-
-
-def _print_faults(runs: pd.DataFrame) -> None:
-    for row in runs[runs["reason"] != ""].to_dict("records"):
-        console.print(f"{row['run_id']}: {row['status']}: {row['reason']}", soft_wrap=True, markup=False)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.pictures.panels import Styles, add_legend
 from servobench.harness.pictures.tracks import Track, Tracks, each
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 
 EFFORT = (("control_effort_rad", 1.0, "control effort [rad]"), ("saturation_fraction", 100.0, "saturated periods [%]"))
 COMMAND = "joint_velocity_command_"

@@ -13,7 +13,7 @@ import pandas as pd
 from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 from servobench.plant.checks import FloatArray
 
 FEATURE = "feature_"

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.settings import Settings
+from servobench.harness.run.ending import COMPLETED, Ending, is_defect
 from servobench.harness.run.experiment import Drawn, build, draw
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import run_loop
@@ -25,15 +26,9 @@ from servobench.harness.run.tasks import Scenario
 from servobench.harness.run.threads import one_thread
 from servobench.harness.run.together import Together, build_together
 from servobench.plant.checks import FloatArray
-from servobench.plant.faults import RunFault
 from servobench.plant.plant import ImageArray
 
-COMPLETED = "completed"
-NUMERICAL_ERROR = "numerical_error"
-CRASHED = "crashed"
-TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the time limit
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
-STATUSES = (COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT)  # besides those of the kinds of `RunFault`
 
 
 @dataclass(frozen=True)
@@ -44,11 +39,13 @@ class RunResult:
         row: the run's row in the table of runs.
         steps: one row a period; None where it was not asked for.
         picture: what the camera saw last; None without a camera or where it was not asked for.
+        trace: of the error that ended the run, for the log of failures; empty without one.
     """
 
     row: dict[str, Any]
     steps: pd.DataFrame | None
     picture: ImageArray | None = field(default=None, repr=False)
+    trace: str = ""
 
 
 def run_experiment(
@@ -70,26 +67,36 @@ def run_experiment(
 
 
 def carry_out(
-    resolved: ResolvedRun, *, steps: bool = True, picture: bool = False, keep: Path | None = None
+    resolved: ResolvedRun,
+    *,
+    steps: bool = True,
+    picture: bool = False,
+    keep: Path | None = None,
+    debug: bool = False,
 ) -> RunResult:
-    """Carry out a run whose settings are resolved; arguments and errors as in `run_experiment`."""
+    """Carry out a run whose settings are resolved; arguments and errors as in `run_experiment`.
+
+    With `debug`, an error that is no `RunFault` is raised instead of noted.
+    """
     experiment = build(resolved, keep=keep)
     plant, scenario = experiment.plant, experiment.scenario
     log = StepLog(plant.spec, experiment.periods)
-    status, reason = COMPLETED, ""
+    ending = Ending()
     try:
         with _careful():
             desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview_rows)
             run_loop(plant, experiment.controller, desired, experiment.loop, resolved.request.seed, log)
-    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the batch goes on and the row says what
-        status, reason = _ending(error)
+    except (Exception, SystemExit) as error:
+        if debug and is_defect(error):
+            raise
+        ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row says what
     finally:
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
         plant.close()
-    row = _row(experiment.drawn, resolved.request, (status, reason), _numbers(_judge(logged, scenario)), logged)
+    row = _row(experiment.drawn, resolved.request, ending, _numbers(_judge(logged, scenario)), logged)
     table = logged.table(resolved.request.run_id, full_jacobian=experiment.run.full_jacobian) if steps else None
-    return RunResult(row, table, image)
+    return RunResult(row, table, image, ending.trace)
 
 
 def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None) -> list[RunResult]:
@@ -130,11 +137,11 @@ def _judge_together(runs: Sequence[ResolvedRun], many: Together, ends: Ends, log
     for lane, (run, drawn) in enumerate(zip(runs, many.drawn, strict=True)):
         if lane in ends.faults:
             own = logged.run(lane, ends.rows[lane])
-            row = _row(drawn, run.request, _ending(ends.faults[lane]), _numbers(_judge(own, task)), own)
+            ending, values = Ending.of(ends.faults[lane]), _numbers(_judge(own, task))
         else:
-            values = {name: column[lane] for name, column in columns.items()}
-            row = _row(drawn, run.request, (COMPLETED, ""), values, logged.run(lane, len(logged)))
-        results.append(RunResult(row, None))
+            own = logged.run(lane, len(logged))
+            ending, values = Ending(), {name: column[lane] for name, column in columns.items()}
+        results.append(RunResult(_row(drawn, run.request, ending, values, own), None, trace=ending.trace))
     return results
 
 
@@ -150,23 +157,12 @@ def _careful() -> Iterator[None]:
         yield
 
 
-def _ending(error: Exception) -> tuple[str, str]:
-    """Return status and reason of a run that an error ended."""
-    if isinstance(error, RunFault):
-        return error.status, _one_line(error)
-    if isinstance(error, FloatingPointError):
-        return NUMERICAL_ERROR, _one_line(error)
-    return CRASHED, describe_error(error)
-
-
 def _numbers(metrics: dict[str, FloatArray]) -> dict[str, float]:
     return {name: float(value) for name, value in metrics.items()}
 
 
-def _row(
-    drawn: Drawn, request: RunRequest, ending: tuple[str, str], metrics: dict[str, float], logged: Steps
-) -> dict[str, Any]:
-    spec, (status, reason) = logged.spec, ending
+def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, float], logged: Steps) -> dict[str, Any]:
+    spec, status = logged.spec, ending.status
     outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
     return {
         **request.as_row(),
@@ -177,7 +173,7 @@ def _row(
         "outcome": outcome,
         **metrics,
         "periods": len(logged),
-        "reason": reason,
+        "reason": ending.reason,
         "mismatch_values": json.dumps(drawn.sample.as_record() if drawn.sample else {}),
     }
 
@@ -187,22 +183,14 @@ def _outcome(drawn: Drawn, metrics: dict[str, float], logged: Steps) -> str:
     return find_outcome(logged, drawn.scenario, *times, drawn.final)
 
 
-def failed_row(request: RunRequest, status: str, reason: str) -> dict[str, Any]:
-    """Return the row of a run of which nothing is left but why it failed."""
-    return {
+def failed(request: RunRequest, ending: Ending) -> RunResult:
+    """Return what is left of a run of which nothing is known but why it failed."""
+    row = {
         **request.as_row(),
-        "status": status,
-        "outcome": status,
+        "status": ending.status,
+        "outcome": ending.status,
         "periods": 0,
-        "reason": reason,
+        "reason": ending.reason,
         "mismatch_values": "{}",
     }
-
-
-def describe_error(error: BaseException) -> str:
-    """Return the kind and the message of an error as one line."""
-    return f"{type(error).__name__}: {_one_line(error)}"
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+    return RunResult(row, None, trace=ending.trace)

@@ -18,7 +18,8 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config import registry
 from servobench.harness.config.settings import flatten, read_settings
-from servobench.harness.run.episode import STATUSES, run_experiment
+from servobench.harness.run.ending import STATUSES
+from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.faults import RunFault

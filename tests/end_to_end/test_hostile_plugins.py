@@ -47,10 +47,18 @@ def build(config, setup):
 
 ENTRY = replace(KINEMATIC, name="hostile", build=build)
 """
+
+
+def place(words: str, function: str) -> str:
+    """Return how a reason names the line of the plug-in that raises with `words`."""
+    line = next(i for i, line in enumerate(HOSTILE.splitlines(), 1) if f'("{words}")' in line)
+    return f"(hostile.py:{line} in {function})"
+
+
 REASONS = {
     "exit": ("crashed", "the run killed the process that carried it out"),
-    "build": ("crashed", "RuntimeError: no licence"),
-    "close": ("crashed", "RuntimeError: the window is gone"),
+    "build": ("crashed", f"RuntimeError: no licence {place('no licence', 'build')}"),
+    "close": ("crashed", f"RuntimeError: the window is gone {place('the window is gone', 'fail')}"),
     "hang": ("timed_out", "the run took longer than 8 s"),
 }
 COMMANDS = {
@@ -93,3 +101,6 @@ def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_pa
     assert 0 < len(failed) < 4
     assert set(zip(failed["status"], failed["reason"], strict=True)) == {REASONS[how]}
     assert not (out / results.PARTS).exists()
+    log = (out / results.FAILURES).read_text()
+    assert [line.split(":")[0] for line in log.splitlines() if line.startswith("hostile-")] == failed["run_id"].tolist()
+    assert log.count("hostile.py") == (2 * len(failed) if how in ("build", "close") else 0)

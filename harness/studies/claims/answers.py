@@ -26,7 +26,7 @@ import pandas as pd
 
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.statistics import median_with_interval, signed_rank_p_value, success_rate
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 from servobench.harness.studies.claims.measurements import (
     DURATION,
     LEVEL,

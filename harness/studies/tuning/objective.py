@@ -33,7 +33,7 @@ from servobench.harness.batch.compare import TUNING, tuning_seeds
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.episode import COMPLETED
+from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
 from servobench.harness.run.together import side_by_side_key
