@@ -118,7 +118,7 @@ class Replay:
             run: what to show.
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
-        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet prints a banner when it is imported
+        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet loads slowly
 
         self._run, self._fineness = run, fineness
         self._scene: Scene = Scene(run.model.arm, scenery=True, window=False)

@@ -146,7 +146,7 @@ class BulletWorld(World):
             ValueError: a start of the wrong size, a period that physics steps do not divide, an arm that is not like a
                 UR5, a gear ratio of 0, or a window without a display.
         """
-        # PyBullet prints a banner when it is imported.
+        # PyBullet loads slowly.
         from servobench.plant.bullet.mechanics import Mechanics  # noqa: PLC0415
         from servobench.plant.bullet.scene import Scene  # noqa: PLC0415
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pybullet
 
 from servobench.plant.bullet.drives import RigidBody
+from servobench.plant.bullet.engine import pybullet
 from servobench.plant.bullet.urdf import Box, arm_mechanics, boxes_urdf, room_boxes
 
 if TYPE_CHECKING:

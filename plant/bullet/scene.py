@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pybullet
 
+from servobench.plant.bullet.engine import pybullet
 from servobench.plant.bullet.meshes import sphere_obj
 from servobench.plant.bullet.urdf import Box, arm_urdf, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
