@@ -194,6 +194,8 @@ class PlantEntry:
         own_robot: it brings a robot and a start of its own: tasks taught on the UR5 and mismatches do not apply, and
             no nominal model is known.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
+        needs: top-level modules that only an extra brings.
+        engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
     """
 
     name: str
@@ -202,3 +204,5 @@ class PlantEntry:
     build: Callable[[Any, PlantSetup], Plant]
     own_robot: bool = False
     side_by_side: bool = False
+    needs: tuple[str, ...] = ()
+    engine: Callable[[], str] | None = None

@@ -104,6 +104,8 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         jobs = _Jobs(campaign, sections, together=how.block > 1)
         side_by_side = jobs.side_by_side(runs.examples)
         manifest = describe_batch(runs, sections, side_by_side, steps=campaign.steps)
+        for name, engine in manifest["engines"].items():
+            how.observer.note(f"{name}: {engine}")
         if how.resume:
             results.read_manifest(folder)
         with (
@@ -149,7 +151,7 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
     there = results.read_manifest(folder)
     if there.get("campaign") != manifest["campaign"]:
         raise ConfigurationError(f"{folder} holds results of other runs or settings; name another folder with --out")
-    for key, what in (("git_commit", "commit"), ("packages", "packages")):
+    for key, what in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
             observer.note(f"note: {folder} was begun with other {what}; later runs may differ")
 

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from servobench.harness.batch.survey import Survey
+from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
 
@@ -49,6 +50,7 @@ def describe_batch(
         "mismatches": list(runs.mismatches),
         "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
         "configuration": configuration,
+        "engines": {name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine},
         "packages": {name: installed_version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "platform": platform.platform(),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
     from servobench.harness.config.settings import Settings
 
+DEFAULT_PLANT = "bullet, or kinematic where PyBullet is not installed"
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
@@ -116,6 +117,19 @@ def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str]
     for name in names:
         find(name)
     return names
+
+
+def default_plant() -> str:
+    """Return the plant of a run for which none is named; a line says if it is not the first choice, and why."""
+    from servobench.harness.cli.terminal import console
+    from servobench.harness.config.registry import default_plant
+
+    name, why = default_plant()
+    if why:
+        console.print(
+            f"no plant is named, so this run is on {name}: {why}", soft_wrap=True, markup=False, highlight=False
+        )
+    return name
 
 
 def split_plants(text: str, option: str = "plants") -> tuple[str, ...]:

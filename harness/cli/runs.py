@@ -23,7 +23,7 @@ ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also m
 
 
 def run(
-    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "bullet",
+    plant: Annotated[str | None, typer.Option(help=f"Name of the plant; default {options.DEFAULT_PLANT}.")] = None,
     controller: Annotated[str, typer.Option(help="Name of the controller, or of a law with --estimator.")] = "ukf_mfac",
     estimator: Annotated[str | None, typer.Option(help="Compose the law --controller with this estimator.")] = None,
     task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",
@@ -41,6 +41,7 @@ def run(
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.settings import ConfigurationError
 
+    plant = plant or options.default_plant()
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = f"{controller}+{estimator}" if estimator else controller

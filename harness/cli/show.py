@@ -26,9 +26,9 @@ NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of t
 
 def plants(name: NameArgument = None) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.config.registry import find_plant, plant_names
+    from servobench.harness.config.registry import find_plant, installed_plant, plant_names
 
-    _show("plants", name, plant_names(), find_plant, lambda entry: entry.config())
+    _show("plants", name, plant_names(), find_plant if name else installed_plant, lambda entry: entry.config())
 
 
 def controllers(name: NameArgument = None) -> None:
@@ -54,6 +54,7 @@ def _show(
     kind: str, name: str | None, names: Sequence[str], find: Callable[[str], Any], default: Callable[[Any], Any]
 ) -> None:
     """Print names with their summaries, or the settings of one with their defaults."""
+    from rich.markup import escape
     from rich.table import Table
 
     from servobench.harness.config.settings import ConfigurationError, flatten
@@ -66,7 +67,7 @@ def _show(
         try:
             table.add_row(known, find(known).summary)
         except ConfigurationError as error:  # an extra is missing, or a plug-in is broken; the others are usable
-            table.add_row(known, str(error))
+            table.add_row(known, escape(str(error)))
     console.print(table)
 
 
@@ -141,10 +142,12 @@ def record(
 
     They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
+    from servobench.harness.config.extras import check_installed
     from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
+    check_installed(("pybullet",), "a film of the rendered arm")
     new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "seed": seed}
     given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
     with console.status("reading") as status:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from importlib.util import find_spec
 from typing import Final
 
+from servobench.harness.config.settings import ConfigurationError
+
 EXTRAS: Final = {  # top-level module -> extra
+    "pybullet": "bullet",
     "jinja2": "report",
     "plotly": "report",
     "itables": "report",
@@ -12,6 +17,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "distributed": "cluster",
     "imageio_ffmpeg": "animation",
 }
+NO_WHEELS: Final = (3, 12)  # first version of Python for which PyBullet 3.2 offers none
 
 
 def missing_extra(error: ImportError, what: str) -> str | None:
@@ -22,4 +28,27 @@ def missing_extra(error: ImportError, what: str) -> str | None:
         what: what needs the module, such as "a film".
     """
     module = (error.name or "").partition(".")[0]
-    return f"{what} needs {module}: pip install 'servobench[{EXTRAS[module]}]'" if module in EXTRAS else None
+    return _line(module, what) if module in EXTRAS else None
+
+
+def check_installed(modules: tuple[str, ...], what: str) -> None:
+    """Check that the modules of extras are there, without importing them.
+
+    Args:
+        modules: top-level names.
+        what: what needs them, such as "plant 'bullet'".
+
+    Raises:
+        ConfigurationError: one is missing; the message says what to install.
+    """
+    for module in modules:
+        if find_spec(module) is None:
+            raise ConfigurationError(_line(module, what))
+
+
+def _line(module: str, what: str) -> str:
+    line = f"{what} needs {module}: pip install 'servobench[{EXTRAS[module]}]'"
+    if module == "pybullet" and sys.version_info >= NO_WHEELS:
+        version = ".".join(map(str, sys.version_info[:2]))
+        line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"
+    return line

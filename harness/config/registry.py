@@ -14,6 +14,7 @@ from pathlib import Path
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
+from servobench.harness.config.extras import check_installed
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
@@ -26,6 +27,7 @@ PLANTS = {
     "bullet": "servobench.plant.bullet.bullet_plant:ENTRY",
     "fmu": "servobench.fmus.ur5_plant:ENTRY",
 }
+DEFAULT_PLANTS = ("bullet", "kinematic")  # the first one that is installed
 MAPPED = "fmu:"
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
@@ -76,6 +78,27 @@ def find_plant(name: str) -> PlantEntry:
             f"plant {name!r} is published as {type(entry).__name__}, wanted a servobench.plant.plant.PlantEntry"
         )
     return entry
+
+
+def installed_plant(name: str) -> PlantEntry:
+    """Return the plant called `name` if all that it needs is installed.
+
+    Raises:
+        ConfigurationError: as `find_plant`, or an extra is missing; the message says what to install.
+    """
+    entry = find_plant(name)
+    check_installed(entry.needs, f"plant {name!r}")
+    return entry
+
+
+def default_plant() -> tuple[str, str]:
+    """Return the plant of a run for which none is named, and why it is not the first choice; empty if it is."""
+    first, second = DEFAULT_PLANTS
+    try:
+        installed_plant(first)
+    except ConfigurationError as error:
+        return second, str(error)
+    return first, ""
 
 
 def find_controller(name: str) -> ControllerEntry:

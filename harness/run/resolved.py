@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import controller_names, find_controller, find_plant, plant_names
+from servobench.harness.config.registry import controller_names, find_controller, installed_plant, plant_names
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS, find_task
@@ -43,7 +43,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict
     """
     defaults = {"run": RunSettings()}
     requests = list(requests)
-    defaults |= {name: find_plant(name).config() for name in dict.fromkeys(each.plant for each in requests)}
+    defaults |= {name: installed_plant(name).config() for name in dict.fromkeys(each.plant for each in requests)}
     defaults |= {
         name: default_config(find_controller(name)) for name in dict.fromkeys(each.controller for each in requests)
     }

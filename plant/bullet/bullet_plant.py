@@ -315,9 +315,18 @@ def build_bullet(config: BulletConfig, setup: PlantSetup) -> Bench:
     return build_bench(partial(BulletWorld, config), setup, config.command_delay, config.sensing)
 
 
+def rendering_engine() -> str:
+    """Return which engine renders the images, and how they arrive."""
+    from servobench.plant.bullet.scene import describe_renderer  # noqa: PLC0415
+
+    return describe_renderer()
+
+
 ENTRY = PlantEntry(
     name="bullet",
     summary="PyBullet arm with dynamics; the ball is found in the rendered images of a depth camera",
     config=BulletConfig,
     build=build_bullet,
+    needs=("pybullet",),
+    engine=rendering_engine,
 )

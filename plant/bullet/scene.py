@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,12 @@ if TYPE_CHECKING:
 
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 BALL_MESH = "ball.obj"
+
+
+def describe_renderer() -> str:
+    """Return which engine renders images, its version, and how they arrive from it."""
+    images = "" if pybullet.isNumpyEnabled() else ", built without numpy: images arrive as tuples, which is slower"
+    return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
 
 
 class Scene:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
 from kit.folders import comparison
+from kit.plants import NEEDS_BULLET
+from servobench.harness.config import extras
 from servobench.harness.config.extras import EXTRAS
 
 HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", "pybullet", "casadi", "fmpy", "cv2", *EXTRAS)
@@ -58,7 +62,15 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
         ("itables", "report", ("report", "made")),
         ("optuna", "tune", ("tune", "--trials", "1")),
         ("distributed", "cluster", ("sweep", "--out", "out", "--seeds", "1", "--scheduler", "tcp://127.0.0.1:9")),
-        ("imageio_ffmpeg", "animation", ("record", "--plant", "kinematic", "--set", "circle.laps=1")),
+        pytest.param(
+            "imageio_ffmpeg",
+            "animation",
+            ("record", "--plant", "kinematic", "--set", "circle.laps=1"),
+            marks=NEEDS_BULLET,
+        ),
+        ("pybullet", "bullet", ("record", "--plant", "kinematic")),
+        ("pybullet", "bullet", ("run", "--plant", "bullet")),
+        ("pybullet", "bullet", ("compare", "--plants", "kinematic,bullet")),
     ],
 )
 def test_a_missing_extra_is_one_line_that_says_what_to_install(tmp_path, module, extra, arguments):
@@ -68,3 +80,33 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(tmp_path, module,
     assert done.stderr.startswith("servobench: ")
     assert done.stderr.count("\n") == 1
     assert f" needs {module}: pip install 'servobench[{extra}]'" in done.stderr
+
+
+def test_without_pybullet_a_run_that_names_no_plant_takes_the_kinematic_one_and_says_why(tmp_path):
+    done = servobench_without(("pybullet",), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    told, *_, folder = done.stdout.splitlines()
+    assert told.startswith(
+        "no plant is named, so this run is on kinematic: plant 'bullet' needs pybullet: pip install 'servobench[bullet]'"
+    )
+    assert folder.endswith(" in out")
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["engines"] == {}
+    listed = servobench_without(("pybullet",), ("plants",), tmp_path).stdout
+    assert "'servobench[bullet]'" in listed
+
+
+@NEEDS_BULLET
+def test_a_line_and_the_manifest_name_the_engine_that_renders(tmp_path):
+    done = servobench_without((), ("run", "--plant", "bullet", "--set", "exp2.duration=0.1", "--out", "out"), tmp_path)
+    engine = json.loads((tmp_path / "out" / "manifest.json").read_text())["engines"]["bullet"]
+    assert engine.startswith(f"PyBullet {version('pybullet')}, software renderer TinyRenderer")
+    assert f"bullet: {engine}\n" in done.stdout
+
+
+@pytest.mark.parametrize(("running", "compiled"), [((3, 11, 7), False), ((3, 12, 0), True), ((3, 13, 1), True)])
+def test_where_pybullet_has_no_wheel_the_line_says_that_it_is_compiled(monkeypatch, running, compiled):
+    monkeypatch.setattr(extras.sys, "version_info", running)
+    line = extras.missing_extra(ModuleNotFoundError("No module", name="pybullet"), "a film")
+    assert line.startswith("a film needs pybullet: pip install 'servobench[bullet]'")
+    assert ("C++ compiler" in line) == compiled
+    assert (f"Python 3.{running[1]}" in line) == compiled

@@ -1,13 +1,19 @@
 """Robots and settings of plants for tests."""
 
 from dataclasses import fields, replace
+from importlib.util import find_spec
 
 import numpy as np
+import pytest
 
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.sensing import SensingConfig
+
+NEEDS_BULLET = pytest.mark.skipif(
+    find_spec("pybullet") is None, reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
+)
 
 
 def mismatched(text, seed=3):
