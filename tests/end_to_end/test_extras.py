@@ -86,9 +86,7 @@ def test_without_pybullet_a_run_that_names_no_plant_takes_the_kinematic_one_and_
     done = servobench_without(("pybullet",), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     told, *_, folder = done.stdout.splitlines()
-    assert told.startswith(
-        "no plant is named, so this run is on kinematic: plant 'bullet' needs pybullet: pip install 'servobench[bullet]'"
-    )
+    assert told.startswith("no plant is named, so this run is on kinematic: plant 'bullet' needs pybullet: ")
     assert folder.endswith(" in out")
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["engines"] == {}
     listed = servobench_without(("pybullet",), ("plants",), tmp_path).stdout
