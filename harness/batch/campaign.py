@@ -79,6 +79,7 @@ class Execution:
     resume: bool = False  # carry out what is missing in the folder
     observer: Observer = field(default_factory=Observer)  # receives the progress
     block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
+    debug: bool = False  # raise what makes a run crash; the runs go one by one in this process
 
     def of_part(self, folder: Path) -> Execution:
         """Return how a part of a study is carried out: one that was not begun cannot be resumed."""
@@ -101,7 +102,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     with offering(campaign.entries):
         runs = survey(Grid(_request, campaign.cells))
         sections = check_campaign(campaign, runs, how.observer)
-        jobs = _Jobs(campaign, sections, together=how.block > 1)
+        jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
         side_by_side = jobs.side_by_side(runs.examples)
         manifest = describe_batch(runs, sections, side_by_side, steps=campaign.steps)
         for name, engine in manifest["engines"].items():
@@ -205,7 +206,7 @@ def _carry_out_missing(campaign: Campaign, jobs: _Jobs, folder: Path, place: Wor
         campaign.entries,
     )
     keep = folder if campaign.steps and place.local else None
-    for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep):
+    for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):
         results.write_part(folder, block.index, outcome)
         how.observer.finished([result.row for result in outcome])
 

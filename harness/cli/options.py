@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
 
 DEFAULT_PLANT = "bullet, or kinematic where PyBullet is not installed"
+FAILED = 1  # exit code where a run failed, or a check was not passed
 INTERRUPTED = 130  # exit code after Ctrl-C
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
@@ -30,6 +31,8 @@ TimeoutOption = Annotated[
 NamesOption = Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")]
 SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
+DebugOption = Annotated[bool, typer.Option("--debug", help="Stop at the first crash, in this process, with its trace.")]
+StrictOption = Annotated[bool, typer.Option("--strict", help="End with exit code 1 if a run failed.")]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.")]
 
 
@@ -56,6 +59,35 @@ class Running(Place):
 
 
 @dataclass(frozen=True)
+class Judging:
+    """What a command does about runs that fail."""
+
+    debug: DebugOption = False
+    strict: StrictOption = False
+
+    def execution(self, running: Running) -> Execution:
+        """Return how runs are carried out: as asked for, but one by one in this process where they are debugged.
+
+        Raises:
+            ConfigurationError: processes or a time limit for runs that are debugged.
+        """
+        from servobench.harness.config.settings import ConfigurationError
+
+        how = running.execution()
+        if not self.debug:
+            return how
+        given = {
+            "--workers": how.workers not in (None, 1),
+            "--scheduler": how.scheduler,
+            "--run-timeout": how.run_timeout,
+        }
+        for option, value in given.items():
+            if value:
+                raise ConfigurationError(f"--debug carries runs out one by one in this process; leave {option} away")
+        return replace(how, workers=1, debug=True)
+
+
+@dataclass(frozen=True)
 class Overrides:
     """Settings that a user gives."""
 
@@ -69,7 +101,7 @@ class Overrides:
         return read_settings(self.config, [*(self.set_ or []), *further])
 
 
-PLACE, RUNNING, OVERRIDES = Place(), Running(), Overrides()  # defaults of parameters
+PLACE, RUNNING, JUDGING, OVERRIDES = Place(), Running(), Judging(), Overrides()  # defaults of parameters
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:

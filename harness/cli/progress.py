@@ -48,10 +48,15 @@ def run_progress(console: Console, *further: ProgressColumn) -> Progress:
 
 
 class ConsoleObserver(Observer):
-    """Shows what happens before the runs as a line, then a bar with throughput and time left."""
+    """Shows what happens before the runs as a line, then a bar with throughput and time left.
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    Args:
+        console: where.
+        bar: false where a debugger may need the terminal.
+    """
+
+    def __init__(self, console: Console, *, bar: bool = True) -> None:
+        self._console, self._shows_bar = console, bar
         self._status: Status | None = console.status("checking the configuration")
         self._status.start()
         self._bar: Progress | None = None
@@ -64,6 +69,8 @@ class ConsoleObserver(Observer):
     def begin(self, total: int, done: int) -> None:
         """Show the bar."""
         self.close()
+        if not self._shows_bar:
+            return
         self._bar = run_progress(self._console, RateColumn())
         self._bar.add_task("running", total=total, completed=done)
         self._bar.start()
@@ -86,14 +93,15 @@ class ConsoleObserver(Observer):
 
 
 @contextlib.contextmanager
-def watching(console: Console, folder: Path) -> Iterator[Observer]:
+def watching(console: Console, folder: Path, *, bar: bool = True) -> Iterator[Observer]:
     """Yield an observer for one campaign; after Ctrl-C one line says how to continue.
 
     Args:
         console: where it shows the progress.
         folder: what the user named with --out.
+        bar: see `ConsoleObserver`.
     """
-    observer = ConsoleObserver(console)
+    observer = ConsoleObserver(console, bar=bar)
     try:
         yield observer
     except KeyboardInterrupt:

@@ -13,7 +13,8 @@ import typer
 
 from servobench.harness.cli import options
 from servobench.harness.cli.show import make_report
-from servobench.harness.cli.terminal import console, print_faults, print_tables
+from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.verdict import judge, print_faults
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Campaign, Execution
@@ -35,8 +36,12 @@ def run(
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
+    debug: options.DebugOption = False,
 ) -> None:
-    """Carry out one run and show what came of it."""
+    """Carry out one run and show what came of it.
+
+    The exit code is 1 if the run failed.
+    """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.settings import ConfigurationError
@@ -47,7 +52,8 @@ def run(
     name = f"{controller}+{estimator}" if estimator else controller
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
-    _carry_out(campaign, out, Execution(workers=1), with_report=with_report)
+    folder = _carry_out(campaign, out, Execution(workers=1, debug=debug), with_report=with_report)
+    judge(folder, strict=True)
 
 
 def compare(
@@ -60,6 +66,7 @@ def compare(
     overrides: options.Overrides = options.OVERRIDES,
     out: OutOption = None,
     with_report: ReportOption = True,
+    judging: options.Judging = options.JUDGING,
 ) -> None:
     """Compare controllers: run every combination."""
     from servobench.harness.batch.campaign import comparison
@@ -76,7 +83,8 @@ def compare(
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
-    _carry_out(campaign, out, running.execution(), with_report=with_report)
+    folder = _carry_out(campaign, out, judging.execution(running), with_report=with_report)
+    judge(folder, strict=judging.strict)
 
 
 def train(
@@ -117,8 +125,8 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
     console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
 
 
-def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> None:
-    """Check everything, run everything, and leave tables, figures and a report behind."""
+def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> Path:
+    """Check everything, run everything, leave tables, figures and a report behind, and return the folder."""
     from servobench.harness.analysis.summary import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
@@ -129,17 +137,17 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
 
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     interrupted = False
-    with contextlib.closing(ConsoleObserver(console)) as observer:
+    with contextlib.closing(ConsoleObserver(console, bar=not how.debug)) as observer:
         try:
             carry_out(campaign, folder, replace(how, observer=observer))
         except KeyboardInterrupt:
-            if not folder.exists():
+            if not folder.exists() or not results.finished_runs(folder):
                 raise
             interrupted = True
     results.collect(folder)
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
-    print_faults(folder, runs)
+    print_faults(runs)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
     if out is None:
@@ -154,3 +162,4 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
         except (ConfigurationError, ImportError) as error:  # the runs are safe; `servobench report` can be called again
             missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
             console.print(f"no report: {missing or error}", soft_wrap=True, markup=False)
+    return folder

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import typer
 
 from servobench.harness.cli import options
 from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.verdict import judge
 
 
 def sweep(
@@ -26,6 +28,7 @@ def sweep(
     seeds: options.SeedsOption = "10",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
+    judging: options.Judging = options.JUDGING,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each.
 
@@ -52,11 +55,13 @@ def sweep(
         _times("period", period),
     )
     campaign = Campaign(plan.cells(), overrides.settings())
-    with watching(console, out) as observer:
-        carry_out(campaign, out, running.execution(observer))
+    how = judging.execution(running)
+    with watching(console, out, bar=not how.debug) as observer:
+        carry_out(campaign, out, replace(how, observer=observer))
     legend = sweep_legend(results.iterate_runs(out, SWEEP_COLUMNS))
     print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), legend)
     console.print(f"table in {out / results.RUNS}", soft_wrap=True)
+    judge(out, strict=judging.strict)
 
 
 def _times(option: str, text: str) -> tuple[float | None, ...]:

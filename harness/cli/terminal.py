@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -14,8 +13,6 @@ if TYPE_CHECKING:
 LEFT = ("controller", "mismatch", "noise", "latency", "period", "pair", "failures", "outcome")  # columns of words
 WHOLE = ("controller", "pair")  # columns whose words are not broken over lines
 UNBROKEN = ("outcome",)  # columns of which no word is broken
-
-MAX_FAULTS = 10  # runs that failed, each on a line of its own
 
 console = Console()
 
@@ -36,20 +33,6 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
         console.print(table)
     if legend:
         console.print(legend)
-
-
-def print_faults(folder: Path, runs: pd.DataFrame) -> None:
-    """Print why runs failed, a line each and not too many, and where the traces are."""
-    from servobench.harness.batch.results import FAILURES
-    from servobench.harness.run.ending import COMPLETED
-
-    failed = runs[runs["status"] != COMPLETED]
-    for row in failed.head(MAX_FAULTS).to_dict("records"):
-        line = f"{row['run_id']}: {row['status']}: {row['reason']}"
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
-    more = f"{len(failed) - MAX_FAULTS} more runs failed; " if len(failed) > MAX_FAULTS else ""
-    if len(failed) and (folder / FAILURES).is_file():
-        console.print(f"{more}why, with traces: {folder / FAILURES}", soft_wrap=True, markup=False, highlight=False)
 
 
 def print_markdown(tables: Iterable[tuple[str, pd.DataFrame]]) -> None:

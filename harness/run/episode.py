@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.settings import Settings
+from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.ending import COMPLETED, Ending, is_defect
 from servobench.harness.run.experiment import Drawn, build, draw
 from servobench.harness.run.log import StepLog, Steps
@@ -85,7 +86,8 @@ def carry_out(
     try:
         with _careful():
             desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview_rows)
-            run_loop(plant, experiment.controller, desired, experiment.loop, resolved.request.seed, log)
+            pair = held_to_contract(plant, experiment.controller)
+            run_loop(*pair, desired, experiment.loop, resolved.request.seed, log)
     except (Exception, SystemExit) as error:
         if debug and is_defect(error):
             raise

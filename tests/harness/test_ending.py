@@ -184,3 +184,72 @@ def test_an_interrupted_batch_that_is_resumed_has_the_log_of_all_runs(tmp_path):
         results.write_part(folder, i, [RunResult(row, None, trace="a\nb")])
         results.collect(folder)
         assert (folder / results.FAILURES).read_text() == "".join(rows)
+
+
+def wrong(name: str, method: str, answer: str) -> type[Controller]:
+    """Return a controller of which one method gives a wrong answer; its code lies in the file wrong.py."""
+    code = f"class {name}(Resting):\n    'Answers wrongly.'\n    def {method}:\n        return {answer}\n"
+    names = {"np": np, "Command": Command, "Resting": Resting, "__name__": "wrong"}
+    exec(compile(code, "/home/somebody/wrong.py", "exec"), names)
+    return names[name]
+
+
+STEP, RESET, LOOK = "step(self, observation, reference)", "reset(self, observation, seed)", "diagnostics(self)"
+TO_WRITE = "write `return Command(joint_velocity)` with 6 joint velocities in rad/s"
+
+
+@pytest.mark.parametrize(
+    ("method", "answer", "words"),
+    [
+        (STEP, "np.zeros(6)", f"step must return a Command, got ndarray of shape (6,); {TO_WRITE}"),
+        (STEP, "None", f"step must return a Command, got None; {TO_WRITE}"),
+        (STEP, "[0.0] * 6", f"step must return a Command, got list; {TO_WRITE}"),
+        (STEP, "Command", f"step must return a Command, got the class Command; {TO_WRITE}"),
+        (STEP, "Command(np.zeros(5))", "step must return a Command of shape (6,), one rad/s a joint, got (5,)"),
+        (STEP, "Command(np.zeros((6, 1)))", "step must return a Command of shape (6,), one rad/s a joint, got (6, 1)"),
+        (
+            "step(self, observation)",
+            "Command(np.zeros(6))",
+            "Wrong.step() takes 2 positional arguments but 3 were given; "
+            "it must be `def step(self, observation, reference)`",
+        ),
+        (
+            "reset(self, observation)",
+            "None",
+            "Wrong.reset() takes 2 positional arguments but 3 were given; "
+            "it must be `def reset(self, observation, seed)`",
+        ),
+        (RESET, "observation", "reset must return nothing, got Observation; keep it in self"),
+        (
+            LOOK,
+            "None",
+            "diagnostics must return a mapping of names to numbers, got None; write `return {}` if there are none",
+        ),
+        (LOOK, "{'error': np.zeros(3)}", "diagnostics must hold numbers, got 'error': ndarray of shape (3,)"),
+        (LOOK, "{'state': 'good'}", "diagnostics must hold numbers, got 'state': str"),
+        (LOOK, "{3: 1.0}", "diagnostics must have texts as names, got 3"),
+        (
+            "estimated_jacobian(self)",
+            "np.zeros((6, 3))",
+            "estimated_jacobian must return an array of shape (3, 6) or None, got ndarray of shape (6, 3)",
+        ),
+    ],
+)
+def test_a_wrong_answer_is_told_with_what_to_write_instead(method, answer, words):
+    kind = wrong("Wrong", method, answer)
+    result = servobench.run(kind, task="exp2", settings=SHORT)
+    name = method.partition("(")[0]
+    assert result.row["reason"] == f"WrongAnswer: {words} (wrong.py:3 in Wrong.{name})"
+    assert '/home/somebody/wrong.py", line 3, in' in result.trace
+
+
+@pytest.mark.parametrize("answer", ["{'a': 1}", "{'a': True}", "{'a': np.float32(2.0)}", "{'a': np.array(2.0)}", "{}"])
+def test_diagnostics_may_be_any_numbers(answer):
+    assert servobench.run(wrong("Right", LOOK, answer), task="exp2", settings=SHORT).row["status"] == "completed"
+
+
+def test_a_type_error_behind_the_call_is_told_as_it_is():
+    kind = wrong("Inner", STEP, "len(3)")
+    assert servobench.run(kind, task="exp2", settings=SHORT).row["reason"] == (
+        "TypeError: object of type 'int' has no len() (wrong.py:4 in Inner.step)"
+    )

@@ -1,0 +1,152 @@
+"""Controllers and plants of third parties, held to their contracts: what a method returns is looked at first.
+
+Without this a step that returns an array ends in an attribute error of the loop, far from the line that is wrong. The
+controllers and plants that this package composes itself are not looked at, so that they cost nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from numbers import Real
+from typing import Any, Final, final
+
+import numpy as np
+
+from servobench.controllers.controller import Controller, Diagnostics
+from servobench.controllers.servo import ServoController
+from servobench.harness.run.ending import WrongAnswer
+from servobench.plant.bench import Bench
+from servobench.plant.checks import FloatArray
+from servobench.plant.plant import Plant
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+
+PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second look
+
+
+def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
+    """Return plant and controller such that each raises `WrongAnswer` where it breaks its contract."""
+    kept = isinstance(plant, Bench), isinstance(controller, ServoController)
+    spec = plant.spec
+    return plant if kept[0] else _HeldPlant(plant), controller if kept[1] else _HeldController(controller, spec)
+
+
+@final
+class _HeldController(Controller):
+    """A controller whose answers are looked at."""
+
+    def __init__(self, controller: Controller, spec: PlantSpec) -> None:
+        self._controller, self._spec = controller, spec
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """See `Controller.reset`."""
+        method = self._controller.reset
+        given = _call(method, "reset(self, observation, seed)", observation, seed)
+        if given is not None:
+            raise WrongAnswer(f"reset must return nothing, got {_kind(given)}; keep it in self", method)
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """See `Controller.step`."""
+        method, n = self._controller.step, self._spec.n
+        command = _call(method, "step(self, observation, reference)", observation, reference)
+        if not isinstance(command, Command):
+            text = f"step must return a Command, got {_kind(command)}; write `return Command(joint_velocity)`"
+            raise WrongAnswer(f"{text} with {n} joint velocities in rad/s", method)
+        if command.joint_velocity.shape != (n,):
+            shape = command.joint_velocity.shape
+            raise WrongAnswer(f"step must return a Command of shape ({n},), one rad/s a joint, got {shape}", method)
+        return command
+
+    def diagnostics(self) -> Diagnostics:
+        """See `Controller.diagnostics`."""
+        method = self._controller.diagnostics
+        given = _call(method, "diagnostics(self)")
+        if not isinstance(given, Mapping):
+            text = "diagnostics must return a mapping of names to numbers"
+            raise WrongAnswer(f"{text}, got {_kind(given)}; write `return {{}}` if there are none", method)
+        for name, value in given.items():
+            if type(value) not in PLAIN and not _is_number(value):
+                raise WrongAnswer(f"diagnostics must hold numbers, got {name!r}: {_kind(value)}", method)
+            if not isinstance(name, str):
+                raise WrongAnswer(f"diagnostics must have texts as names, got {name!r}", method)
+        return given
+
+    def estimated_jacobian(self) -> FloatArray | None:
+        """See `Controller.estimated_jacobian`."""
+        method, wanted = self._controller.estimated_jacobian, (self._spec.m, self._spec.n)
+        estimate = _call(method, "estimated_jacobian(self)")
+        if estimate is not None and (not isinstance(estimate, np.ndarray) or estimate.shape != wanted):
+            text = f"estimated_jacobian must return an array of shape {wanted} or None"
+            raise WrongAnswer(f"{text}, got {_kind(estimate)}", method)
+        return None if estimate is None else np.asarray(estimate)
+
+
+@final
+class _HeldPlant(Plant):
+    """A plant whose answers are looked at."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant, self.spec = plant, plant.spec
+
+    def reset(self, seed: int) -> Observation:
+        """See `Plant.reset`."""
+        return self._observation(self._plant.reset, "reset(self, seed)", seed)
+
+    def step(self, command: Command) -> Observation:
+        """See `Plant.step`."""
+        return self._observation(self._plant.step, "step(self, command)", command)
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        method, m = self._plant.truth, self.spec.m
+        truth = _call(method, "truth(self)")
+        if not isinstance(truth, Truth):
+            raise WrongAnswer(f"truth of the plant must return a Truth, got {_kind(truth)}", method)
+        for name, shape in (("feature", (m,)), ("jacobian", (m, self.spec.n))):
+            value = getattr(truth, name)
+            if value is not None and np.shape(value) != shape:
+                raise WrongAnswer(f"truth of the plant: {name} must have shape {shape}, got {np.shape(value)}", method)
+        return truth
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """See `Plant.move_camera`."""
+        self._plant.move_camera(X_BC)
+
+    def close(self) -> None:
+        """See `Plant.close`."""
+        self._plant.close()
+
+    def _observation(self, method: Callable[..., Any], signature: str, argument: object) -> Observation:
+        seen, name = _call(method, signature, argument), method.__name__
+        if not isinstance(seen, Observation):
+            text = f"{name} of the plant must return an Observation, got {_kind(seen)}"
+            raise WrongAnswer(f"{text}; write `return Observation(time, joint_position, feature)`", method)
+        for what, size in (("joint_position", self.spec.n), ("feature", self.spec.m)):
+            shape = getattr(seen, what).shape
+            if shape != (size,):
+                raise WrongAnswer(f"{name} of the plant: {what} must have shape ({size},), got {shape}", method)
+        return seen
+
+
+def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - what it returns
+    """Call a method; where it does not take these arguments, raise what its signature must be."""
+    try:
+        return method(*arguments)
+    except TypeError as error:
+        trace = error.__traceback__
+        if trace is None or trace.tb_next is not None:  # the call was possible, and something behind it was not
+            raise
+        raise WrongAnswer(f"{error}; it must be `def {signature}`", method) from None
+
+
+def _is_number(value: object) -> bool:
+    array = np.asarray(value)
+    return array.ndim == 0 and (isinstance(array.item(), Real) or array.dtype.kind in "biuf")
+
+
+def _kind(value: object) -> str:
+    """Return what a value is, in a few words."""
+    if isinstance(value, np.ndarray):
+        return f"ndarray of shape {value.shape}"
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    return "None" if value is None else type(value).__name__

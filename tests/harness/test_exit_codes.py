@@ -1,0 +1,106 @@
+"""The exit codes of the table in docs/results.md, and what is printed with them."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from kit.command import servobench
+from servobench.controllers.controller import Controller, ControllerEntry
+from servobench.harness.batch import results
+from servobench.harness.batch.api import NoSettings
+from servobench.harness.config.registry import offering
+from servobench.plant.signals import Command
+
+
+class Ending(Controller):
+    """Rests for three periods and then raises something."""
+
+    def __init__(self, raised, knowledge):
+        self.raised, self.n = raised, knowledge.spec.n
+
+    def reset(self, observation, seed):
+        pass
+
+    def step(self, observation, reference):
+        if observation.time > 0.1:
+            raise self.raised
+        return Command(np.zeros(self.n))
+
+    def diagnostics(self):
+        return {}
+
+
+def ending(name: str, raised: BaseException) -> ControllerEntry:
+    return ControllerEntry(name, "ends", NoSettings, lambda _, knowledge: Ending(raised, knowledge))
+
+
+ENTRIES = (
+    ending("crashing", KeyError("gain")),
+    ending("leaving", SystemExit(3)),
+    ending("interrupted", KeyboardInterrupt()),
+)
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path):
+    """Return a function that runs a command in an empty folder and returns its exit code; it draws nothing."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("servobench.harness.pictures.draw.draw_figures", lambda _: [])
+    with offering(ENTRIES):
+        yield partial(servobench, monkeypatch)
+
+
+EXP2 = ("--set", "exp2.duration=0.5", "--out", "out")
+RUN = ("run", "--plant", "kinematic", *EXP2, "--controller")
+COMPARE = ("compare", "--tasks", "exp2", "--workers", "1", "--no-report", *EXP2, "--controllers")
+SWEEP = ("sweep", "--tasks", "exp2", "--workers", "1", "--seeds", "2", *EXP2, "--controllers")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        ((*RUN, "constant"), 0),
+        ((*RUN, "crashing"), 1),
+        ((*RUN, "leaving"), 1),
+        ((*RUN, "interrupted"), 130),
+        ((*COMPARE, "constant,crashing"), 0),
+        ((*COMPARE, "constant,crashing", "--strict"), 1),
+        ((*COMPARE, "constant", "--strict"), 0),
+        ((*COMPARE, "constant,interrupted", "--strict"), 130),
+        ((*SWEEP, "crashing,constant"), 0),
+        ((*SWEEP, "crashing,constant", "--strict"), 1),
+        ((*SWEEP, "constant", "--strict"), 0),
+        ((*SWEEP, "constant,interrupted"), 130),
+        ((*RUN, "nothing"), 2),
+        ((*COMPARE, "nothing", "--strict"), 2),
+        ((*SWEEP, "constant", "--debug", "--workers", "2"), 2),
+    ],
+)
+def test_exit_codes(call, arguments, code):
+    assert call(*arguments) == code
+
+
+def test_a_run_that_failed_is_told_with_its_place_and_where_the_trace_is(call, capsys):
+    call(*RUN, "crashing")
+    lines = capsys.readouterr().out.splitlines()
+    reason = next(line for line in lines if line.startswith("kinematic-crashing-exp2-moderate-0: "))
+    assert reason.startswith("kinematic-crashing-exp2-moderate-0: crashed: KeyError: 'gain' (test_exit_codes.py:")
+    assert reason.endswith(" in Ending.step)")
+    assert lines[-1] == f"1 of 1 run failed; why, with traces: out/{results.FAILURES}"
+
+
+@pytest.mark.parametrize("command", [RUN, COMPARE, SWEEP])
+def test_debug_raises_in_this_process(call, monkeypatch, command):
+    monkeypatch.setattr("sys.argv", ["servobench", *command, "crashing", "--debug"])
+    from servobench.harness.cli.main import main
+
+    with pytest.raises(KeyError, match="gain") as caught:
+        main()
+    assert caught.traceback[-1].name == "step"
+
+
+def test_debug_carries_on_where_nothing_crashes(call):
+    assert call(*COMPARE, "constant", "--debug") == 0
