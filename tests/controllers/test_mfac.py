@@ -46,7 +46,7 @@ def test_with_the_exact_jacobian_and_no_weight_an_affine_plant_arrives_in_one_st
 
 
 @given(seed=st.integers(0, 10**6), degrees=st.integers(0, 180), share=st.floats(0.01, 0.99))
-def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_methods_says(seed, degrees, share):
+def test_behind_a_turned_camera_the_error_shrinks_as_the_page_of_derivations_says(seed, degrees, share):
     rng, turn = np.random.default_rng(seed), math.radians(degrees)
     J, R = rng.normal(size=(3, 6)), Rotation.from_rotvec([0.0, 0.0, turn]).as_matrix()
     law = fresh(6, 3, gain=-math.log1p(-share) / PERIOD, step_weight=1e-13)

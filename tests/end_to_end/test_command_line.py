@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 
 from kit.command import finish, judged, part_count, servobench, start, wait_for
+from kit.plants import NEEDS_BULLET
 from servobench.harness.batch import results
 
 
@@ -50,7 +51,7 @@ def test_a_run_leaves_tables_a_manifest_and_figures(monkeypatch, capsys, tmp_pat
     assert json.loads(runs["mismatch_values"][0])["camera_angle"] != 0.0
 
 
-@pytest.mark.parametrize("plant", ["kinematic", "bullet"])
+@pytest.mark.parametrize("plant", ["kinematic", pytest.param("bullet", marks=NEEDS_BULLET)])
 def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_two_workers(
     monkeypatch, tmp_path, plant
 ):
@@ -81,14 +82,16 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
         (("run", "--mismatch", "factory=none.yaml"), "none.yaml cannot be read"),
         (("run", "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
         (("run", "--plant", "kinematic", "--view"), "--view shows the plant bullet only, got --plant kinematic"),
-        (
+        pytest.param(
             ("run", "--plant", "bullet", "--set", "run.period=0.0333"),
             "period must be a whole number of milliseconds, because latency is no multiple of the control",
+            marks=NEEDS_BULLET,
         ),
         (("run", "--set", "run.period=-1"), "run.period must be above 0, got -1"),
-        (
+        pytest.param(
             ("run", "--plant", "bullet", "--set", "bullet.sensing.feature_noise=-1"),
             "bullet.sensing.feature_noise must be",
+            marks=NEEDS_BULLET,
         ),
         (("run", "--set", "kinematc.lag=1"), "unknown section 'kinematc': did you mean 'kinematic'?"),
         (("run", "--set", "kinematic.lagg=1", "--plant", "kinematic"), "kinematic has no setting 'lagg'"),

@@ -60,7 +60,7 @@ def test_everything_registered_has_a_row_and_nothing_else_has():
     assert first_column("methods.md", "controller") == set(registry.CONTROLLERS)
     assert first_column("plants.md", "plant") == {*registry.PLANTS, "fmu:PATH.toml"}
     assert first_column("plants.md", "task") == set(TASKS)
-    assert set(LAWS) | set(ESTIMATORS) <= set(names(section(read("methods.md"), "Estimator and law")))
+    assert set(LAWS) | set(ESTIMATORS) <= set(names(read("methods_parts.md")))
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def installed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("controller", ["nominal_rate", "nominal_broyden"])
 def test_the_controllers_of_the_example_settle_on_a_real_plant(installed, controller):
-    installed(section(read("methods.md"), "Your own controller"))
+    installed(read("own_controller.md"))
     assert controller in registry.controller_names()
     request = RunRequest("kinematic", controller, "exp2", "moderate", 3)
     settings = read_settings(None, ["nominal_rate.gain=1.5", "nominal_broyden.law.proportional_gain=1.5"])
@@ -155,7 +155,7 @@ def test_the_table_of_equations_has_each_once_and_the_code_names_it_too():
             found += range(int(first), int(last or first) + 1)
         return found
 
-    rows = next(rows for _, header, rows in tables(read("methods.md")) if header[0] == "equation")
+    rows = next(rows for _, header, rows in tables(read("methods_paper.md")) if header[0] == "equation")
     assert sorted(number for row in rows for number in numbers(row[0])) == list(range(1, 47))
     for equations, _, where in rows:
         for path, _ in PLACE.findall(where):

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from kit.command import servobench
+from kit.plants import NEEDS_BULLET
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures import film
@@ -21,6 +22,7 @@ from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 
+pytestmark = NEEDS_BULLET  # it renders what is shown
 REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kit.plants import NEEDS_BULLET
 from servobench.controllers.laws.mfac import MfacLaw
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.settings import Settings
@@ -88,6 +89,7 @@ def test_times_of_runs_side_by_side_are_unknown():
     assert np.isnan([row[name] for name in row if "_time_" in name and "settling" not in name]).all()
 
 
+@NEEDS_BULLET
 def test_plug_ins_and_rendered_plants_go_alone():
     assert side_by_side_key(runs("nmpc_calibrated", {})[0]) is None
     assert side_by_side_key(runs("ukf_mfac", {}, plant="bullet")[0]) is None

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from servobench.harness.config.registry import plant_names
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
@@ -14,6 +15,8 @@ from servobench.plant.sensing import SensingConfig
 NEEDS_BULLET = pytest.mark.skipif(
     find_spec("pybullet") is None, reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
 )
+
+ALL_PLANTS = [pytest.param(name, marks=NEEDS_BULLET) if name == "bullet" else name for name in plant_names()]
 
 
 def mismatched(text, seed=3):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.harness.config.registry import find_plant, plant_names
+from kit.plants import ALL_PLANTS
+from servobench.harness.config.registry import find_plant
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
@@ -16,7 +17,7 @@ PERIOD = 0.05
 COMMANDS = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 6))
 
 
-@pytest.fixture(params=plant_names())
+@pytest.fixture(params=ALL_PLANTS)
 def entry(request) -> PlantEntry:
     return find_plant(request.param)
 

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from kit.plants import configure, setup
+from kit.plants import NEEDS_BULLET, configure, setup
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench import Bench
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
@@ -66,6 +66,7 @@ def test_the_physical_world_is_the_same_at_every_rate(build, command_delay):
         np.testing.assert_allclose(features, walks[250][1], rtol=0.0, atol=1e-9)
 
 
+@NEEDS_BULLET
 def test_the_rendered_world_is_the_same_at_two_rates():
     entry, walks = find_plant("bullet"), []
     late = {"command_delay": 0.05, "latency": 0.07, "drop_probability": 0.0, "depth_noise": "none", "scenery": False}

@@ -1,13 +1,14 @@
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pybullet
 import pytest
 
 from servobench.plant.bullet.meshes import rectangles_obj, sphere_obj
 from servobench.plant.bullet.urdf import arm_mechanics, arm_urdf, bench_files, rpy_along
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
+
+pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
 BALL = 7  # link number: six joints, the flange, the ball
 
