@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-import inspect
 import pickle
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import pandas as pd
 
-from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
-from servobench.harness.config.registry import controller_names, offering
+from servobench.harness.config.own import OwnController, own_object
+from servobench.harness.config.registry import choose_controller, offer, offered, offering
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.plant.settings import settings as settings_class
 
-AnyController: TypeAlias = str | type[Controller] | ControllerEntry
+AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
 
 
@@ -53,8 +51,10 @@ def run(
     """Carry out one run in this process.
 
     Args:
-        controller: a name such as "ukf_mfac" or "mfac+rls"; a subclass of `Controller`, which is constructed as
-            `cls(knowledge)` with a `RobotKnowledge`; or a `ControllerEntry`, for one with settings.
+        controller: a name such as "ukf_mfac" or "mfac+rls"; a place such as "./mine.py" or "./mine.py:Mine"; a
+            subclass of `Controller`, which is constructed as `cls(knowledge)` with a `RobotKnowledge`, or as
+            `cls(config, knowledge)` where `config` is annotated with a dataclass of settings; an object of such a
+            class, of which each run gets a copy; or a `ControllerEntry`.
         plant: name of the plant.
         task: name of the task.
         mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
@@ -67,9 +67,9 @@ def run(
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
-    name, entries = _named([controller])
-    with offering(entries):
-        return run_experiment(RunRequest(plant, name[0], task, read_mismatch(mismatch), seed), Settings(settings or {}))
+    with offering():
+        name = _name(controller)
+        return run_experiment(RunRequest(plant, name, task, read_mismatch(mismatch), seed), Settings(settings or {}))
 
 
 def compare(
@@ -91,7 +91,7 @@ def compare(
     Controllers that cannot be pickled, or that are defined in a notebook, are carried out in this process.
 
     Args:
-        controllers: names, classes or entries; see `run`.
+        controllers: names, places, classes, objects or entries; see `run`.
         plants: names of plants.
         tasks: names of tasks.
         mismatches: such as "moderate".
@@ -108,23 +108,24 @@ def compare(
     Raises:
         ConfigurationError: something that cannot be used; it is a ValueError.
     """
-    names, entries = _named(controllers)
     chosen = range(seeds) if isinstance(seeds, int) else tuple(seeds)
-    batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen)
-    for what, values in (("controllers", names), ("plants", plants), ("tasks", tasks), ("mismatches", mismatches),
+    for what, values in (("controllers", controllers), ("plants", plants), ("tasks", tasks), ("mismatches", mismatches),
                          ("seeds", chosen)):  # fmt: skip
         if not len(values):
             raise ConfigurationError(f"{what} must name at least one, got none")
-    if not _can_travel(entries):
-        workers, run_timeout = 1, None
-    how, whole = Execution(workers, None, run_timeout, resume), Settings(settings or {})
-    if out is not None:
-        carry_out(comparison(batch, whole, entries), Path(out), how)
-        return results.load_runs(Path(out))
-    with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
-        campaign = Campaign(Grid(Cell, batch.requests()), whole, entries=entries)
-        carry_out(campaign, Path(folder), replace(how, resume=False))
-        return results.load_runs(Path(folder))
+    with offering():
+        names = tuple(_name(each) for each in controllers)
+        batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen)
+        if not _can_travel(offered(names)):
+            workers, run_timeout = 1, None
+        how, whole = Execution(workers, None, run_timeout, resume), Settings(settings or {})
+        if out is not None:
+            carry_out(comparison(batch, whole), Path(out), how)
+            return results.load_runs(Path(out))
+        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+            campaign = Campaign(Grid(Cell, batch.requests()), whole)
+            carry_out(campaign, Path(folder), replace(how, resume=False))
+            return results.load_runs(Path(folder))
 
 
 def load(folder: Path | str) -> Results:
@@ -139,43 +140,15 @@ def load(folder: Path | str) -> Results:
     return Results(runs, steps, results.read_manifest(path))
 
 
-@settings_class
-class NoSettings:
-    """The settings of a controller that is given as a class: none."""
+def _name(given: AnyController) -> str:
+    """Return the name by which a controller is found, one given as an object from now on."""
+    return choose_controller(given) if isinstance(given, str) else offer(own_object(given))
 
 
-def _construct(
-    kind: Callable[[RobotKnowledge], Controller], _settings: NoSettings, robot: RobotKnowledge
-) -> Controller:
-    return kind(robot)
-
-
-def _named(controllers: Sequence[AnyController]) -> tuple[tuple[str, ...], tuple[ControllerEntry, ...]]:
-    """Return the names of controllers, and entries for those that are given as objects."""
-    names: list[str] = []
-    entries: list[ControllerEntry] = []
-    for given in controllers:
-        if isinstance(given, str):
-            names.append(given)
-            continue
-        if isinstance(given, ControllerEntry):
-            entry = given
-        elif isinstance(given, type) and issubclass(given, Controller):
-            summary = (inspect.getdoc(given) or given.__name__).splitlines()[0]
-            entry = ControllerEntry(given.__name__, summary, NoSettings, partial(_construct, given))
-        else:
-            raise ConfigurationError(f"controller must be a name, a subclass of Controller or an entry, got {given!r}")
-        if entry.name in controller_names():
-            raise ConfigurationError(f"a controller called {entry.name!r} exists already; give yours another name")
-        names.append(entry.name)
-        entries.append(entry)
-    return tuple(names), tuple(entries)
-
-
-def _can_travel(entries: tuple[ControllerEntry, ...]) -> bool:
-    """Return whether a worker process can receive these entries."""
+def _can_travel(own: tuple[OwnController, ...]) -> bool:
+    """Return whether a worker process can receive these controllers."""
     try:
-        text = pickle.dumps(entries)
+        text = pickle.dumps(own)
     except (pickle.PicklingError, AttributeError, TypeError):
         return False
     return b"__main__" not in text or hasattr(sys.modules["__main__"], "__file__")

@@ -22,8 +22,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
-from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch.workers import Workers
+from servobench.harness.config.own import OwnController
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run import episode
@@ -58,10 +58,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive runs, and controllers that the registry does not know."""
+    """Consecutive runs, and controllers that users gave."""
 
     jobs: tuple[Job, ...]
-    entries: tuple[ControllerEntry, ...] = ()
+    own: tuple[OwnController, ...] = ()
     together: bool = False  # whether the runs advance together
 
     @property
@@ -71,7 +71,7 @@ class Block:
 
     def singly(self) -> list[Block]:
         """Return each run as a block of its own."""
-        return [Block((job,), self.entries) for job in self.jobs]
+        return [Block((job,), self.own) for job in self.jobs]
 
 
 def even_size(count: int, workers: int, most: int = BLOCK) -> int:
@@ -80,26 +80,25 @@ def even_size(count: int, workers: int, most: int = BLOCK) -> int:
     return math.ceil(count / (workers * max(rounds, 1)))
 
 
-def cut(
-    jobs: Iterable[Job], size: int, chunk: int = CHUNK, entries: tuple[ControllerEntry, ...] = ()
-) -> Iterator[Block]:
+def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[OwnController, ...] = ()) -> Iterator[Block]:
     """Yield jobs in blocks of one kind and consecutive indices.
 
     Args:
         jobs: the runs, in the order of their indices.
         size: at most so many runs advance together.
         chunk: at most so many runs that go one by one are in a block.
-        entries: controllers that the registry does not know.
+        own: controllers that users gave.
     """
-    own: list[Job] = []
+    gathered: list[Job] = []
     for job in jobs:
         most = chunk if job.kind is None else size
-        if own and (len(own) >= most or job.index != own[-1].index + 1 or job.kind != own[-1].kind):
-            yield Block(tuple(own), entries, own[0].kind is not None)
-            own = []
-        own.append(job)
-    if own:
-        yield Block(tuple(own), entries, own[0].kind is not None)
+        last = gathered[-1] if gathered else job
+        if gathered and (len(gathered) >= most or job.index != last.index + 1 or job.kind != last.kind):
+            yield Block(tuple(gathered), own, last.kind is not None)
+            gathered = []
+        gathered.append(job)
+    if gathered:
+        yield Block(tuple(gathered), own, gathered[0].kind is not None)
 
 
 def carry_out_blocks(
@@ -156,8 +155,9 @@ def _outcome(block: Block, future: Any, workers: Workers) -> list[RunResult] | N
 
 
 def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
+    sources = tuple(each.source for each in block.own if each.source is not None)
     try:
-        return pickle.dumps((block, steps, keep))
+        return pickle.dumps((sources, pickle.dumps((block, steps, keep))))
     except Exception as error:
         what = f"the run {block.jobs[0].cell.request.run_id} cannot be sent to another process"
         raise ConfigurationError(f"{what}: {error}; use one worker") from error
@@ -166,14 +166,17 @@ def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
 def _unpack(task: bytes) -> list[RunResult] | Ending:
     """Carry out a task in a worker; where it cannot be read, such as without its plug-in, return why."""
     try:
-        block, steps, keep = pickle.loads(task)
+        sources, content = pickle.loads(task)
+        for source in sources:
+            source.load()  # so that the classes of its settings are found
+        block, steps, keep = pickle.loads(content)
     except Exception as error:  # noqa: BLE001 - of a plug-in
         return Ending.of(error)
     return _carry_out(block, steps, keep)
 
 
 def _carry_out(block: Block, steps: bool, keep: Path | None, debug: bool = False) -> list[RunResult]:
-    with offering(block.entries):
+    with offering(block.own):
         if block.together:
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
             with contextlib.suppress(Exception, SystemExit):

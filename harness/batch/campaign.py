@@ -14,16 +14,16 @@ from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
-from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import BLOCK, CHUNK, Cell, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.lock import locked
-from servobench.harness.batch.manifest import describe_batch
+from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Workers, open_workers
-from servobench.harness.config.registry import offering
+from servobench.harness.config.own import OwnController
+from servobench.harness.config.registry import offered
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
@@ -40,17 +40,16 @@ class Campaign:
     cells: Sequence[Cell]  # in the order of the table
     settings: Settings  # overrides of the defaults
     steps: bool = False  # keep the table of steps, too
-    entries: tuple[ControllerEntry, ...] = ()  # controllers that the registry does not know
 
 
-def comparison(batch: Batch, settings: Settings, entries: tuple[ControllerEntry, ...] = ()) -> Campaign:
+def comparison(batch: Batch, settings: Settings) -> Campaign:
     """Return the campaign of a comparison, with steps and, for the first seed, what the camera saw last."""
     first = min(batch.seeds)
 
     def cell(request: RunRequest) -> Cell:
         return Cell(request, picture=request.seed == first)
 
-    return Campaign(Grid(cell, batch.requests()), settings, steps=True, entries=entries)
+    return Campaign(Grid(cell, batch.requests()), settings, steps=True)
 
 
 class Observer:
@@ -99,29 +98,29 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     Raises:
         ConfigurationError: a campaign that cannot be carried out, or a folder that cannot be used.
     """
-    with offering(campaign.entries):
-        runs = survey(Grid(_request, campaign.cells))
-        sections = check_campaign(campaign, runs, how.observer)
-        jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
-        side_by_side = jobs.side_by_side(runs.examples)
-        manifest = describe_batch(runs, sections, side_by_side, steps=campaign.steps)
-        for name, engine in manifest["engines"].items():
-            how.observer.note(f"{name}: {engine}")
+    runs = survey(Grid(_request, campaign.cells))
+    sections = check_campaign(campaign, runs, how.observer)
+    jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
+    side_by_side = jobs.side_by_side(runs.examples)
+    own = offered(runs.controllers)
+    manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
+    for name, engine in manifest["engines"].items():
+        how.observer.note(f"{name}: {engine}")
+    if how.resume:
+        results.read_manifest(folder)
+    with (
+        open_workers(
+            how.workers, how.scheduler, how.run_timeout, plants=runs.plants, controllers=runs.controllers, own=own
+        ) as place,
+        locked(folder, new=not how.resume),
+    ):
         if how.resume:
-            results.read_manifest(folder)
-        with (
-            open_workers(
-                how.workers, how.scheduler, how.run_timeout, plants=runs.plants, controllers=runs.controllers
-            ) as place,
-            locked(folder, new=not how.resume),
-        ):
-            if how.resume:
-                check_same_campaign(folder, manifest, how.observer)
-            else:
-                results.create_folder(folder, manifest)
-            if (folder / results.PARTS).is_dir():
-                _carry_out_missing(campaign, jobs, folder, place, how)
-            results.collect(folder)
+            check_same_campaign(folder, manifest, how.observer)
+        else:
+            results.create_folder(folder, manifest)
+        if (folder / results.PARTS).is_dir():
+            _carry_out_missing(campaign, jobs, own, folder, place, how)
+        results.collect(folder)
 
 
 def check_campaign(campaign: Campaign, runs: Survey, observer: Observer) -> dict[str, Any]:
@@ -152,6 +151,11 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
     there = results.read_manifest(folder)
     if there.get("campaign") != manifest["campaign"]:
         raise ConfigurationError(f"{folder} holds results of other runs or settings; name another folder with --out")
+    for name, record in manifest[OWN].items():
+        if record["sha256"] != there.get(OWN, {}).get(name, record)["sha256"]:
+            raise ConfigurationError(
+                f"{folder} was begun with another text of {record['place']}; name another folder with --out"
+            )
     for key, what in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
             observer.note(f"note: {folder} was begun with other {what}; later runs may differ")
@@ -192,7 +196,9 @@ class _Jobs:
         return ResolvedRun(request, *settings), kind
 
 
-def _carry_out_missing(campaign: Campaign, jobs: _Jobs, folder: Path, place: Workers, how: Execution) -> None:
+def _carry_out_missing(
+    campaign: Campaign, jobs: _Jobs, own: tuple[OwnController, ...], folder: Path, place: Workers, how: Execution
+) -> None:
     """Carry out the runs whose part is not in the folder."""
     total = len(campaign.cells)
     done = results.finished_runs(folder)
@@ -203,7 +209,7 @@ def _carry_out_missing(campaign: Campaign, jobs: _Jobs, folder: Path, place: Wor
         jobs.at(chain.from_iterable(gaps)),
         even_size(missing, place.count, how.block),
         1 if campaign.steps or how.run_timeout is not None else CHUNK,
-        campaign.entries,
+        own,
     )
     keep = folder if campaign.steps and place.local else None
     for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 from servobench.harness.batch.survey import Survey
+from servobench.harness.config.own import OwnController
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
@@ -29,8 +30,16 @@ PACKAGES = (
 )
 
 
+OWN = "own_controllers"  # key of the place and the hash of each controller that users gave as a file or an object
+
+
 def describe_batch(
-    runs: Survey, sections: Mapping[str, Any], side_by_side: Mapping[str, list[str]], *, steps: bool = False
+    runs: Survey,
+    sections: Mapping[str, Any],
+    side_by_side: Mapping[str, list[str]],
+    own: Sequence[OwnController] = (),
+    *,
+    steps: bool = False,
 ) -> dict[str, Any]:
     """Return the manifest of a batch; by the digest `campaign`, `resume` recognises the same runs and settings.
 
@@ -38,6 +47,7 @@ def describe_batch(
         runs: what was asked for.
         sections: their typed settings by section, as `servobench.harness.run.resolved.resolve_sections` returns them.
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
+        own: controllers that users gave.
         steps: the table of steps is kept, too.
     """
     configuration = {name: flatten(config) for name, config in sections.items()}
@@ -46,6 +56,7 @@ def describe_batch(
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
+        OWN: {each.name: each.record() for each in own},
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),

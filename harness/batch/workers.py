@@ -18,8 +18,10 @@ from typing import Any, Final
 
 from pebble import ProcessExpired, ProcessPool
 
+from servobench.harness.config.own import OwnController
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import SourceFile
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
@@ -60,6 +62,7 @@ def open_workers(
     *,
     plants: Iterable[str] = (),
     controllers: Iterable[str] = (),
+    own: Sequence[OwnController] = (),
 ) -> Iterator[Workers]:
     """Yield workers; their processes start with the first task and end with the context.
 
@@ -70,6 +73,7 @@ def open_workers(
         run_timeout: [s] time limit of a run, after which its process is ended; None for no limit.
         plants: names of plants that a process imports before its first run, outside the time limit.
         controllers: names of controllers, likewise.
+        own: controllers that users gave, likewise.
 
     Raises:
         ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a time limit is
@@ -84,7 +88,7 @@ def open_workers(
     elif count == 1 and run_timeout is None:
         yield Workers()
     else:
-        names = (tuple(plants), tuple(controllers))
+        names = (tuple(plants), tuple(controllers), tuple(each.source for each in own if each.source is not None))
         pool = ProcessPool(count, context=get_context("spawn"), initializer=_warm_up, initargs=names)
 
         def submit(function: Callable[..., Any], *arguments: object) -> Any:  # noqa: ANN401 - a future
@@ -98,13 +102,16 @@ def open_workers(
             pool.join()
 
 
-def _warm_up(plants: Sequence[str], controllers: Sequence[str]) -> None:
+def _warm_up(plants: Sequence[str], controllers: Sequence[str], sources: Sequence[SourceFile]) -> None:
     """Import what runs need; what cannot be imported is left to the run, whose row says so."""
     import_module("servobench.harness.run.episode")
     for find, names in ((find_plant, plants), (find_controller, controllers)):
         for name in names:
             with contextlib.suppress(Exception):
                 find(name)
+    for source in sources:
+        with contextlib.suppress(ConfigurationError):
+            source.load()
 
 
 @contextlib.contextmanager

@@ -90,8 +90,8 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, settings: Settin
 
     if seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {seed}")
-    settings.check_sections([*known_sections(), *controllers])
     names = options.split_controllers(",".join(controllers))
+    settings.check_sections([*known_sections(), *names])
     return [resolve(RunRequest(PLANT, name, TASK, read_mismatch(mismatch), seed), settings) for name in names]
 
 

@@ -66,8 +66,11 @@ def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public 
 
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
+    from servobench.harness.config.registry import offering
+
     try:
-        code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
+        with offering():
+            code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
         code = INTERRUPTED
     except typer.TyperException as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
@@ -164,18 +165,37 @@ def default_plant() -> str:
     return name
 
 
+def _usable(names: Sequence[str], find: Callable[[str], Any], text: str) -> list[str]:
+    """Return `names`; where `text` asks for all of them only those that can be used, with a line for each other."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    usable = []
+    for name in names:
+        try:
+            if text.strip() == "all":
+                find(name)
+        except ConfigurationError as error:
+            sys.stderr.write(f"servobench: left out: {error}\n")
+        else:
+            usable.append(name)
+    return usable
+
+
 def split_plants(text: str, option: str = "plants") -> tuple[str, ...]:
     """Return the plants that a user named."""
     from servobench.harness.config.registry import find_plant, plant_names
 
-    return split_names(option, text, plant_names(), find_plant)
+    return split_names(option, text, _usable(plant_names(), find_plant, text), find_plant)
 
 
 def split_controllers(text: str) -> tuple[str, ...]:
-    """Return the controllers that a user named."""
-    from servobench.harness.config.registry import controller_names, find_controller
+    """Return the names of the controllers that a user named, or whose place was given, such as ./mine.py:Mine."""
+    from servobench.harness.config.registry import choose_controller, controller_names, find_controller
 
-    return split_names("controllers", text, controller_names(), find_controller)
+    known, names = controller_names(), list[str]()
+    for word in split_words(text):
+        names += _usable(known, find_controller, word) if word == "all" else [choose_controller(word)]
+    return split_names("controllers", ",".join(names), known, find_controller)
 
 
 def split_tasks(text: str) -> tuple[str, ...]:

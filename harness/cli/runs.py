@@ -44,12 +44,13 @@ def run(
     """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
+    from servobench.harness.config.registry import choose_controller
     from servobench.harness.config.settings import ConfigurationError
 
     plant = plant or options.default_plant()
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
-    name = f"{controller}+{estimator}" if estimator else controller
+    name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     folder = _carry_out(campaign, out, Execution(workers=1, debug=debug), with_report=with_report)
@@ -98,11 +99,12 @@ def train(
     from rich.table import Table
 
     from servobench.harness.cli.progress import run_progress
+    from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import cache_folder
     from servobench.harness.run.resolved import known_sections
 
-    settings = overrides.settings()
+    settings, controller = overrides.settings(), choose_controller(controller)
     settings.check_sections([*known_sections(), controller])
     with run_progress(console) as progress:
         bar = progress.add_task("training", total=1.0)

@@ -35,8 +35,9 @@ def controllers(name: NameArgument = None) -> None:
     """List the controllers, or show the settings of one."""
     from servobench.controllers.parts import ESTIMATORS, LAWS
     from servobench.harness.config.defaults import default_config
-    from servobench.harness.config.registry import controller_names, find_controller
+    from servobench.harness.config.registry import choose_controller, controller_names, find_controller
 
+    name = choose_controller(name) if name else None
     _show("controllers", name, controller_names(), find_controller, default_config)
     if not name:
         console.print(f"or any law with any estimator, such as mfac+rls: laws {', '.join(LAWS)};", soft_wrap=True)
@@ -192,6 +193,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     """Carry out a run to be shown."""
+    from servobench.harness.config.registry import choose_controller
     from servobench.harness.config.settings import ConfigurationError, flatten
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
@@ -199,7 +201,8 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     from servobench.harness.run.resolved import known_sections
     from servobench.plant.bullet.bullet_plant import BulletConfig
 
-    request = RunRequest(**asked | {"mismatch": read_mismatch(asked["mismatch"])})
+    chosen = {"mismatch": read_mismatch(asked["mismatch"]), "controller": choose_controller(asked["controller"])}
+    request = RunRequest(**asked | chosen)
     if request.seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {request.seed}")
     settings.check_sections([*known_sections(), request.plant, request.controller])

@@ -1,7 +1,8 @@
 """Plants, controllers and tasks by name: those of this package and those that other distributions publish.
 
-A third party publishes a `PlantEntry` or `ControllerEntry` under the entry-point group `servobench.plants` or
-`servobench.controllers`; a name of this package cannot be taken over.
+A third party publishes a `PlantEntry` or `ControllerEntry`, or a subclass of `Controller`, under the entry-point group
+`servobench.plants` or `servobench.controllers`; a name of this package cannot be taken over. Controllers that a user
+gives as files or objects are offered under a name for as long as a command or call takes.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from pathlib import Path
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
+from servobench.harness.config.entries import make_entry
 from servobench.harness.config.extras import check_installed
+from servobench.harness.config.own import OwnController, describe_import, is_place, read_own
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
@@ -34,19 +37,51 @@ CONTROLLERS = (*METHODS, *NOT_COMPOSED)
 FORMER_NAMES = {"rbfnn_mfac_plus": "map_mfac"}  # understood until 0.3.0
 
 
-_OFFERED: dict[str, ControllerEntry] = {}
+_OFFERED: dict[str, OwnController] = {}
 
 
 @contextlib.contextmanager
-def offering(entries: Iterable[ControllerEntry]) -> Iterator[None]:
-    """Let `find_controller` find further controllers within the context."""
+def offering(controllers: Iterable[OwnController] = ()) -> Iterator[None]:
+    """Let `find_controller` find further controllers, these and those that are offered within the context."""
     before = dict(_OFFERED)
-    _OFFERED.update((entry.name, entry) for entry in entries)
+    _OFFERED.update((each.name, each) for each in controllers)
     try:
         yield
     finally:
         _OFFERED.clear()
         _OFFERED.update(before)
+
+
+def offer(own: OwnController) -> str:
+    """Let `find_controller` find a controller of a user, and return its name.
+
+    Raises:
+        ConfigurationError: another controller has this name.
+    """
+    name, other = own.name, _OFFERED.get(own.name)
+    if name in controller_names() or name in FORMER_NAMES:
+        raise ConfigurationError(f"a controller called {name!r} exists already; {_rename(own)}")
+    if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
+        raise ConfigurationError(f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}")
+    _OFFERED[name] = own
+    return name
+
+
+def offered(names: Iterable[str]) -> tuple[OwnController, ...]:
+    """Return those of the controllers `names` that users gave."""
+    return tuple(_OFFERED[name] for name in names if name in _OFFERED)
+
+
+def choose_controller(text: str) -> str:
+    """Return the name of the controller that a user names, or whose place is given, such as ./mine.py:Mine.
+
+    Raises:
+        ConfigurationError: there is no such controller, or it cannot be used; one line with file and line number.
+    """
+    if text not in (*_OFFERED, *controller_names()) and is_place(text):
+        return offer(read_own(text))
+    find_controller(text)
+    return text
 
 
 def plant_names() -> list[str]:
@@ -114,13 +149,29 @@ def find_controller(name: str) -> ControllerEntry:
             return compose(law, estimator)
         except ValueError as error:
             raise ConfigurationError(f"controller {name!r}: {error}") from error
-    entry = _OFFERED.get(name) or METHODS.get(name) or _load(CONTROLLER_GROUP, "controller", name)
-    if not isinstance(entry, ControllerEntry):
-        raise ConfigurationError(
-            f"controller {name!r} is published as {type(entry).__name__}, "
-            "wanted a servobench.controllers.controller.ControllerEntry"
-        )
-    return entry
+    if name in _OFFERED:
+        return _OFFERED[name].entry
+    if name in METHODS:
+        return METHODS[name]
+    return _load_controller(name)
+
+
+def _rename(own: OwnController) -> str:
+    if own.given:
+        return "give yours another name, as a class of that name or in a ControllerEntry"
+    return f"give yours another name, such as my_{own.name.replace(':', '_')}={own.place}"
+
+
+@cache
+def _load_controller(name: str) -> ControllerEntry:
+    given = _load(CONTROLLER_GROUP, "controller", name)
+    if name in NOT_COMPOSED and isinstance(given, ControllerEntry):
+        return given
+    value = _points(CONTROLLER_GROUP)[name].value
+    try:
+        return make_entry(given, value, name)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"controller {name!r} ({value}) cannot be used: {error}") from error
 
 
 @cache
@@ -144,8 +195,12 @@ def _load(group: str, kind: str, name: str) -> object:
     points = _points(group)
     if name not in points:
         known = plant_names() if group == PLANT_GROUP else controller_names()
+        if group == CONTROLLER_GROUP and Path(f"{name}.py").is_file():
+            raise ConfigurationError(f"unknown controller {name!r}: did you mean your file './{name}.py'?")
         raise ConfigurationError(f"unknown {kind} {name!r}: {suggest(name, known)}")
+    point = points[name]
     try:
-        return points[name].load()
-    except (ImportError, AttributeError) as error:
-        raise ConfigurationError(f"{kind} {name!r} ({points[name].value}) cannot be loaded: {error}") from error
+        return point.load()
+    except (Exception, SystemExit) as error:
+        why = describe_import(error, point.module)
+        raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {why}") from error

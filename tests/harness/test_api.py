@@ -11,6 +11,7 @@ import pytest
 
 import servobench
 from kit.command import PACKAGE
+from servobench.harness.config.entries import NoSettings
 
 SHORT = {"exp1": {"duration": 0.5}}
 
@@ -63,9 +64,12 @@ def test_one_run_has_its_row_and_steps():
 
 
 def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
-    with pytest.raises(ValueError, match="controller must be a name, a subclass of Controller or an entry, got 3"):
+    with pytest.raises(
+        ValueError,
+        match="controller is of type int, wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
+    ):
         servobench.run(3)
-    taken = servobench.ControllerEntry("ukf_mfac", "", object, lambda _config, knowledge: Still(knowledge))
+    taken = servobench.ControllerEntry("ukf_mfac", "", NoSettings, lambda _config, knowledge: Still(knowledge))
     with pytest.raises(ValueError, match="a controller called 'ukf_mfac' exists already"):
         servobench.compare([taken])
     with pytest.raises(ValueError, match="seeds must name at least one"):

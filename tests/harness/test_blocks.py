@@ -88,7 +88,7 @@ def dying_workers(how: Exception, sizes: list[int]) -> Workers:
     """Return workers that lose each task which holds the run of one seed, and note how many runs tasks have."""
 
     def submit(function, task):
-        block = blocks.pickle.loads(task)[0]
+        block = blocks.pickle.loads(blocks.pickle.loads(task)[1])[0]
         sizes.append(len(block.jobs))
         future = Future()
         if any(job.cell.request.seed == SEED_OF_A_CRASH for job in block.jobs):

@@ -1,0 +1,165 @@
+"""Controllers of users: classes, objects and entries, given in Python or by the place of their code.
+
+A place is a file, `./mine.py`, with `:NAME` if it defines several, or a module and a name, `package.module:NAME`. What
+stands there is a `ControllerEntry`, a subclass of `Controller`, or an object of one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Final
+
+from servobench.controllers.controller import Controller, ControllerEntry
+from servobench.harness.config.entries import make_entry
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import SourceFile, describe_at, make_importable
+from servobench.plant.settings import suggest
+
+PLACE: Final = re.compile(
+    r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.py)(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
+)
+
+
+@dataclass(frozen=True)
+class OwnController:
+    """A controller that is no part of servobench and no entry point.
+
+    Attributes:
+        entry: what it is built by.
+        place: where it stands, for messages.
+        source: its file; None where other processes import its module.
+        file: path of the code; empty for what was typed into an interpreter.
+        digest: SHA-256 of the code; empty where it cannot be read.
+        given: whether it was given as an object in Python.
+    """
+
+    entry: ControllerEntry
+    place: str
+    source: SourceFile | None = None
+    file: str = ""
+    digest: str = ""
+    given: bool = False
+
+    @property
+    def name(self) -> str:
+        """What it is called in tables."""
+        return self.entry.name
+
+    def record(self) -> dict[str, str]:
+        """Return what the manifest of a results folder says about it."""
+        return {"place": self.place, "file": self.file, "sha256": self.digest}
+
+
+def is_place(text: str) -> bool:
+    """Return whether a text says where code stands, and is no name; of a module, whether there is such a one."""
+    found = PLACE.fullmatch(text)
+    if found is None:
+        return False
+    return found["file"] is not None or _can_import(found["module"])
+
+
+def read_own(text: str) -> OwnController:
+    """Return the controller at a place, `[NAME=]FILE.py[:NAME]` or `[NAME=]MODULE:NAME`.
+
+    Raises:
+        ConfigurationError: whatever is wrong with it, as one line with file and line number.
+    """
+    found = PLACE.fullmatch(text)
+    if found is None:
+        raise ConfigurationError(f"{text!r} is no place of a controller, such as ./mine.py or ./mine.py:Mine")
+    place = text.partition("=")[2] if found["alias"] else text
+    if found["file"]:
+        source = SourceFile.read(found["file"])
+        given = _pick(source.load(), found["file"], found["name"])
+        file, digest = source.path, source.digest
+    else:
+        source, module = None, _import(found["module"])
+        given = _pick(module, found["module"], found["attribute"])
+        file = Path(module.__file__ or found["module"])
+        digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+    entry = make_entry(given, place, found["alias"])
+    return OwnController(entry, place, source, str(file), digest)
+
+
+def own_object(given: object) -> OwnController:
+    """Return a controller that is given in Python: a class, an object or an entry.
+
+    Raises:
+        ConfigurationError: it is none of these, or cannot be used.
+    """
+    code = given.build if isinstance(given, ControllerEntry) else given
+    kind = code if isinstance(code, type) else type(code)
+    entry = make_entry(given, "controller")
+    try:
+        file, text = inspect.getfile(kind), inspect.getsource(kind)
+    except (OSError, TypeError):  # typed into an interpreter
+        return OwnController(entry, kind.__qualname__, given=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return OwnController(entry, kind.__qualname__, None, file, digest, given=True)
+
+
+def _pick(module: ModuleType, where: str, name: str | None) -> object:
+    """Return what a module calls `name`, or without a name its only controller."""
+    if name is not None:
+        if not hasattr(module, name):
+            raise ConfigurationError(f"{where} has no {name!r}: {_choice(module, name)}")
+        return getattr(module, name)
+    if hasattr(module, "ENTRY"):
+        return module.ENTRY
+    found = _controllers(module)
+    if len(found) == 1:
+        return next(iter(found.values()))
+    if not found:
+        raise ConfigurationError(f"{where} defines no controller: no subclass of servobench.Controller and no ENTRY")
+    first, *_ = found
+    raise ConfigurationError(f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}")
+
+
+def _choice(module: ModuleType, name: str) -> str:
+    found = _controllers(module)
+    return suggest(name, found) if found else "it defines no controller"
+
+
+def _controllers(module: ModuleType) -> dict[str, object]:
+    """Return the controllers that a module defines itself; classes that lack methods only if there are no others."""
+    found: dict[str, object] = {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, ControllerEntry)
+        or (isinstance(value, type) and issubclass(value, Controller) and value.__module__ == module.__name__)
+    }
+    whole = {name: value for name, value in found.items() if not inspect.isabstract(value)}
+    return whole or found
+
+
+def _can_import(module: str) -> bool:
+    make_importable(Path.cwd())
+    try:
+        return importlib.util.find_spec(module.partition(".")[0]) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def _import(module: str) -> ModuleType:
+    make_importable(Path.cwd())
+    try:
+        return importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        raise ConfigurationError(describe_import(error, module)) from error
+
+
+def describe_import(error: BaseException, module: str) -> str:
+    """Return why a module cannot be imported, as one line with the place in it where there is one."""
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(module.partition(".")[0])
+    origin = spec.origin if spec is not None and spec.has_location and spec.origin else None
+    return describe_at(error, Path(origin).parent if origin else Path.cwd())

@@ -1,0 +1,115 @@
+"""Python files of users: read, carried out as modules, sent to other processes; their errors as one line."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import traceback
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+
+from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.settings import suggest
+
+PACKAGES = "site-packages"  # folder of installed packages, which may lie below that of a user's file
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A Python file as it was read. It can be pickled: a process that receives it carries out the same text.
+
+    Attributes:
+        path: of the file, absolute.
+        text: what it holds.
+    """
+
+    path: Path
+    text: str
+
+    @classmethod
+    def read(cls, given: str) -> SourceFile:
+        """Read a file.
+
+        Raises:
+            ConfigurationError: it cannot be read; names the nearest file beside it.
+        """
+        path = Path(given).expanduser().resolve()
+        try:
+            return cls(path, path.read_text(encoding="utf-8"))
+        except FileNotFoundError as error:
+            beside = [each.name for each in path.parent.glob("*.py")] if path.parent.is_dir() else []
+            hint = suggest(path.name, beside) if beside else f"{show(path.parent)} holds no Python file"
+            raise ConfigurationError(f"there is no file {given}: {hint}") from error
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(f"{given} cannot be read: {error}") from error
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def module_name(self) -> str:
+        """Name of the module, the same in every process; other files and other texts have other names."""
+        place = hashlib.sha256(f"{self.path}\n{self.digest}".encode()).hexdigest()[:12]
+        return f"servobench_file_{self.path.stem}_{place}"
+
+    def load(self) -> ModuleType:
+        """Carry out the file, once in a process, and return its module; files beside it can be imported.
+
+        Raises:
+            ConfigurationError: whatever goes wrong, as one line with file and line number.
+        """
+        name = self.module_name
+        if name in sys.modules:
+            return sys.modules[name]
+        make_importable(self.path.parent)
+        module = ModuleType(name)
+        module.__file__, module.__package__ = str(self.path), ""
+        sys.modules[name] = module
+        try:
+            exec(compile(self.text, str(self.path), "exec"), vars(module))
+        except BaseException as error:
+            del sys.modules[name]
+            if isinstance(error, Exception | SystemExit):
+                raise ConfigurationError(describe_at(error, self.path.parent)) from error
+            raise
+        return module
+
+
+def make_importable(folder: Path) -> None:
+    """Let modules in a folder be imported; those that can be imported without it come first."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+def describe_at(error: BaseException, folder: Path) -> str:
+    """Return an error as one line, `FILE:LINE: KIND: MESSAGE`, with the last place in code of the user.
+
+    Args:
+        error: what was raised.
+        folder: that of the user's code.
+    """
+    if isinstance(error, SyntaxError) and error.filename:
+        place, message = f"{show(Path(error.filename))}:{error.lineno}: ", error.msg
+    else:
+        found = place_of(error, folder)
+        place, message = f"{found}: " if found else "", str(error)
+    return place + " ".join(f"{type(error).__name__}: {message}".split()).rstrip(":")
+
+
+def place_of(error: BaseException, folder: Path) -> str:
+    """Return `FILE:LINE` of the last place below `folder` at which an error was raised or passed on; "" if none."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if path.is_relative_to(folder) and PACKAGES not in path.relative_to(folder).parts:
+            return f"{show(path)}:{frame.lineno}"
+    return ""
+
+
+def show(path: Path) -> str:
+    """Return a path as a user reads it best: relative to the present folder where it lies below it."""
+    here = Path.cwd()
+    return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
