@@ -34,12 +34,12 @@ from servobench.plant.world import World
 
 @settings
 class KinematicConfig:
-    """Settings of the kinematic plant; defaults are those of a UR5 under a stereo camera."""
+    """Settings of the kinematic plant; defaults are those of an arm under a stereo camera."""
 
     max_joint_speed: Positive = 1.0
-    """[rad/s] limit of every joint; a cautious share of the vendor's limit of π."""
+    """[rad/s] limit of every joint, beside its maker's; a cautious share of a UR5's π."""
     joint_range: Positive = 2 * math.pi
-    """[rad] largest joint position each way; the vendor's range."""
+    """[rad] largest joint position each way, beside its maker's limits; a UR5's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     command_delay: NonNegative = 0.05
@@ -91,7 +91,7 @@ class KinematicWorld(World):
             ValueError: a start of the wrong size, or a period that is not positive.
         """
         model, start = setup.robot()
-        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
+        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
         self.lead, self._first = model.lead, KinematicState(model, start, np.zeros(start.shape))
         self._model, self._q, self._v = self._first
         self._truth: Truth | None = None

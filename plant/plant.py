@@ -20,6 +20,8 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.faults import RunFault
 from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.limits import JointLimits
+from servobench.plant.robot.robot import Robot
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -164,11 +166,19 @@ class PlantSetup:
             side by side its arrays have a leading axis.
         start: (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
         period: control period, s.
+        nominal: the robot by its maker's description: limits, links and bench; None for a plant that brings its own,
+            or where only the model is known.
     """
 
     model: HandEyeModel | None
     start: FloatArray | None
     period: float
+    nominal: Robot | None = None
+
+    @property
+    def limits(self) -> JointLimits | None:
+        """The maker's joint limits, where they are known."""
+        return None if self.nominal is None else self.nominal.limits
 
     def robot(self) -> tuple[HandEyeModel, FloatArray]:
         """Return model and start, (..., n), for a plant that needs them.
@@ -191,8 +201,9 @@ class PlantEntry:
         config: settings class with a default for every field; its noise and latency can be varied if it has a field
             `sensing` of class `servobench.plant.bench.SensingConfig`.
         build: makes the plant from its settings and the setup.
-        own_robot: it brings a robot and a start of its own: tasks taught on the UR5 and mismatches do not apply, and
+        own_robot: it brings a robot and a start of its own: taught tasks, `--robot` and mismatches do not apply, and
             no nominal model is known.
+        config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
         engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
@@ -206,3 +217,4 @@ class PlantEntry:
     side_by_side: bool = False
     needs: tuple[str, ...] = ()
     engine: Callable[[], str] | None = None
+    config_for: Callable[[Robot], Any] | None = None

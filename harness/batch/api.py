@@ -20,6 +20,7 @@ from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.config.own import OwnController, own_object
 from servobench.harness.config.registry import choose_controller, offer, offered, offering
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
@@ -45,6 +46,7 @@ def run(
     *,
     task: str = "exp1",
     mismatch: str = "moderate",
+    robot: str = DEFAULT_ROBOT,
     seed: int = 0,
     settings: Sections | None = None,
 ) -> RunResult:
@@ -58,6 +60,7 @@ def run(
         plant: name of the plant.
         task: name of the task.
         mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
+        robot: name such as "ur10e" or "panda", or the path of a file: a factory calibration, a DH table or a URDF.
         seed: of everything random in the run.
         settings: section -> key -> value, such as {"kinematic": {"lag": 0.1}}.
 
@@ -68,8 +71,8 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        name = _name(controller)
-        return run_experiment(RunRequest(plant, name, task, read_mismatch(mismatch), seed), Settings(settings or {}))
+        request = RunRequest(plant, _name(controller), task, read_mismatch(mismatch), seed, robot=robot)
+        return run_experiment(request, Settings(settings or {}))
 
 
 def compare(
@@ -79,6 +82,7 @@ def compare(
     *,
     mismatches: Sequence[str] = ("moderate",),
     seeds: int | Iterable[int] = 1,
+    robot: str = DEFAULT_ROBOT,
     settings: Sections | None = None,
     out: Path | str | None = None,
     workers: int = 1,
@@ -96,6 +100,7 @@ def compare(
         tasks: names of tasks.
         mismatches: such as "moderate".
         seeds: a number of seeds from 0 on, or the seeds.
+        robot: see `run`.
         settings: section -> key -> value.
         out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
         workers: number of processes.
@@ -115,7 +120,7 @@ def compare(
             raise ConfigurationError(f"{what} must name at least one, got none")
     with offering():
         names = tuple(_name(each) for each in controllers)
-        batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen)
+        batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen, robot)
         if not _can_travel(offered(names)):
             workers, run_timeout = 1, None
         how, whole = Execution(workers, None, run_timeout, resume), Settings(settings or {})

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from servobench.harness.batch.grid import Grid
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.plant.robot.mismatch import Mismatch
@@ -27,10 +29,12 @@ class Batch:
     tasks: tuple[str, ...]
     mismatches: tuple[str, ...]
     seeds: Sequence[int]
+    robot: str = DEFAULT_ROBOT
+    """a name or the path of a file; all runs of a batch have one"""
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
-        return Grid(_request, *self.axes())
+        return Grid(partial(_request, self.robot), *self.axes())
 
     def axes(self) -> tuple[Sequence[Any], ...]:
         """Return plants, tasks, mismatches, controllers and seeds."""
@@ -38,8 +42,8 @@ class Batch:
         return self.plants, self.tasks, mismatches, self.controllers, self.seeds
 
 
-def _request(plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
-    return RunRequest(plant, controller, task, mismatch, seed)
+def _request(robot: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
+    return RunRequest(plant, controller, task, mismatch, seed, robot=robot)
 
 
 def parse_seeds(text: str) -> Sequence[int]:

@@ -12,6 +12,7 @@ from typing import Any
 from servobench.harness.batch.survey import Survey
 from servobench.harness.config.own import OwnController
 from servobench.harness.config.registry import find_plant
+from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
 
@@ -59,6 +60,7 @@ def describe_batch(
         OWN: {each.name: each.record() for each in own},
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
+        "robots": [describe_robot(name) for name in runs.robots],
         "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
         "configuration": configuration,
         "engines": {name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine},
@@ -70,3 +72,22 @@ def describe_batch(
         "run_count": runs.count,
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),
     }
+
+
+def describe_robot(name: str) -> dict[str, Any]:
+    """Return what a manifest says about a robot: the nominal arm, its source and what was assumed."""
+    robot = find_robot(name)
+    arm, limits, work = robot.arm, robot.limits, robot.workspace
+    numbers = {
+        "translation_m": arm.translation,
+        "rpy_rad": arm.rpy,
+        "joint_offset_rad": arm.joint_offset,
+        "tool_m": arm.tool,
+        "joint_lower_rad": limits.lower,
+        "joint_upper_rad": limits.upper,
+        "joint_speed_rad_s": limits.speed,
+        "home_rad": work.home,
+        "workspace_centre_m": work.centre,
+    }
+    listed = {key: value.tolist() for key, value in numbers.items()}
+    return {"name": name, "title": robot.title, "source": robot.source, "note": robot.note, **listed}

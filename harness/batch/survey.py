@@ -23,6 +23,7 @@ class Survey:
     controllers: dict[str, None] = field(default_factory=dict)
     tasks: dict[str, None] = field(default_factory=dict)
     mismatches: dict[str, None] = field(default_factory=dict)
+    robots: dict[str, None] = field(default_factory=dict)
     seeds: list[range] = field(default_factory=list)  # in order, without gaps within each
     examples: list[RunRequest] = field(default_factory=list)
     """With every plant in every condition (mismatch, noise, times) and with every controller, and every task."""
@@ -44,7 +45,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         digest.update(f"{run_id}\n".encode())
         names.append(hash(run_id))
         seeds.add(request.seed)
-        condition = (request.mismatch, request.noise_factor, request.latency, request.period)
+        condition = (request.mismatch, request.noise_factor, request.latency, request.period, request.robot)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
         if kind == last:
             continue
@@ -54,7 +55,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
             found.examples.append(request)
     for example in found.examples:
         found.plants[example.plant] = found.controllers[example.controller] = found.tasks[example.task] = None
-        found.mismatches[str(example.mismatch)] = None
+        found.mismatches[str(example.mismatch)] = found.robots[example.robot] = None
     found.digest, found.seeds = digest.hexdigest(), seeds.merged()
     _refuse_repetition(requests, names)
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeAlias
 
 from servobench.harness.batch.blocks import Cell
@@ -30,7 +30,8 @@ class SweepPlan:
     def cells(self) -> Grid[Cell]:
         """Return the runs, seeds varying fastest."""
         places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
-        return Grid(_cell, places or [Place()], self.noise_factors, self.latencies, self.periods, *self.batch.axes())
+        make = partial(_cell, self.batch.robot)
+        return Grid(make, places or [Place()], self.noise_factors, self.latencies, self.periods, *self.batch.axes())
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,14 @@ def parse_variation(text: str) -> Variation:
         raise ConfigurationError(f"--vary: {error}") from error
 
 
-def _cell(place: Place, noise: float, latency: float | None, period: float | None, *names: Any) -> Cell:  # noqa: ANN401 - as `Batch.axes`
+def _cell(
+    robot: str,
+    place: Place,
+    noise: float,
+    latency: float | None,
+    period: float | None,
+    *names: Any,  # noqa: ANN401 - as `Batch.axes`
+) -> Cell:
     plant, task, mismatch, controller, seed = names
-    return Cell(RunRequest(plant, controller, task, place.vary(mismatch), seed, noise, latency, period), place.columns)
+    request = RunRequest(plant, controller, task, place.vary(mismatch), seed, noise, latency, period, robot)
+    return Cell(request, place.columns)

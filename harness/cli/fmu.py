@@ -29,12 +29,12 @@ def export(
     from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
     from servobench.fmus.export import ExportOptions, export_fmu
     from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.robot.catalogue import find_robot
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-    from servobench.plant.robot.ur5 import nominal_ur5
     from servobench.plant.seeds import named_seed
 
     try:
-        model, _ = sample_mismatch(Mismatch.parse(mismatch), nominal_ur5(), named_seed(seed, "mismatch"))
+        model, _ = sample_mismatch(Mismatch.parse(mismatch), find_robot("ur5"), named_seed(seed, "mismatch"))
         words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
         options = ExportOptions(fmi, model, platforms=parse_platforms(platforms), mismatch=words)
         export_fmu(output, options)

@@ -30,6 +30,12 @@ TimeoutOption = Annotated[
     float | None, typer.Option(min=0.001, help="Time limit of a run [s]; a run that takes longer becomes a failed row.")
 ]
 NamesOption = Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")]
+RobotOption = Annotated[
+    str,
+    typer.Option(
+        help="ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf."
+    ),
+]
 SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
 DebugOption = Annotated[bool, typer.Option("--debug", help="Stop at the first crash, in this process, with its trace.")]
@@ -131,6 +137,17 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
         __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
     )
     return call
+
+
+def known_robot(name: str) -> str:
+    """Return the name of a robot that can be found, and print what was assumed about it."""
+    from servobench.harness.cli.terminal import console
+    from servobench.harness.config.robots import find_robot
+
+    note = find_robot(name).note
+    if note:
+        console.print(note, soft_wrap=True, markup=False, highlight=False)
+    return name
 
 
 def split_words(text: str) -> tuple[str, ...]:

@@ -31,6 +31,7 @@ def run(
     mismatch: Annotated[str, typer.Option(help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.")] = (
         "moderate"
     ),
+    robot: options.RobotOption = "ur5",
     seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
     overrides: options.Overrides = options.OVERRIDES,
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
@@ -51,7 +52,7 @@ def run(
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
-    batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"))
+    batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"), options.known_robot(robot))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     folder = _carry_out(campaign, out, Execution(workers=1, debug=debug), with_report=with_report)
     judge(folder, strict=True)
@@ -62,6 +63,7 @@ def compare(
     controllers: options.NamesOption = "all",
     tasks: options.NamesOption = "exp1,exp2,exp3,exp4,circle",
     mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
+    robot: options.RobotOption = "ur5",
     seeds: options.SeedsOption = "1",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
@@ -80,6 +82,7 @@ def compare(
         options.split_tasks(tasks),
         options.split_words(mismatch),
         parse_seeds(seeds),
+        options.known_robot(robot),
     )
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")
@@ -90,6 +93,7 @@ def compare(
 
 def train(
     controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
+    robot: options.RobotOption = "ur5",
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Train the networks of a controller.
@@ -109,7 +113,7 @@ def train(
     with run_progress(console) as progress:
         bar = progress.add_task("training", total=1.0)
         trained = train_networks(
-            controller, settings, lambda share, what: progress.update(bar, completed=share, description=what)
+            controller, settings, lambda share, what: progress.update(bar, completed=share, description=what), robot
         )
         progress.update(bar, completed=1.0, description="done")
     table = Table("network", "held-out error")

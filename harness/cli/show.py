@@ -16,7 +16,14 @@ if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
     from servobench.harness.pictures.replay import LoggedRun
 
-RECORDED = {"plant": "bullet", "controller": "rbfnn_mfac", "task": "circle", "mismatch": "moderate", "seed": 0}
+RECORDED = {
+    "plant": "bullet",
+    "controller": "rbfnn_mfac",
+    "task": "circle",
+    "mismatch": "moderate",
+    "robot": "ur5",
+    "seed": 0,
+}
 RECORDINGS = "recordings"
 SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 
@@ -129,6 +136,7 @@ def record(
     controller: Annotated[str | None, typer.Option(help=_new("controller"))] = None,
     task: Annotated[str | None, typer.Option(help=_new("task"))] = None,
     mismatch: Annotated[str | None, typer.Option(help=_new("mismatch"))] = None,
+    robot: Annotated[str | None, typer.Option(help=_new("robot"))] = None,
     seed: Annotated[int | None, typer.Option(help=_new("seed"))] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
@@ -149,7 +157,7 @@ def record(
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
     check_installed(("pybullet",), "a film of the rendered arm")
-    new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "seed": seed}
+    new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "robot": robot, "seed": seed}
     given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
     with console.status("reading") as status:
         if folder is not None:

@@ -18,6 +18,7 @@ def sweep(
     controllers: options.NamesOption = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
     tasks: options.NamesOption = "random",
     mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
+    robot: options.RobotOption = "ur5",
     vary: Annotated[
         list[str] | None,
         typer.Option(help="Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg."),
@@ -48,6 +49,7 @@ def sweep(
             options.split_tasks(tasks),
             options.split_words(mismatch),
             parse_seeds(seeds),
+            options.known_robot(robot),
         ),
         tuple(parse_variation(text) for text in vary or []),
         tuple(_numbers("noise", noise)),

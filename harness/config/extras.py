@@ -16,6 +16,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "optuna": "tune",
     "distributed": "cluster",
     "imageio_ffmpeg": "animation",
+    "yourdfpy": "urdf",
 }
 NO_WHEELS: Final = (3, 12)  # first version of Python for which PyBullet 3.2 offers none
 

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.registry import find_plant
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
 from servobench.plant.bullet.bullet_plant import BulletConfig
@@ -187,7 +188,8 @@ def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]
     """
     try:
         mismatch = Mismatch.parse(row["mismatch"])
-        model, sample = sample_mismatch(mismatch, ur5.nominal_ur5(), named_seed(int(row["seed"]), "mismatch"))
+        robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
+        model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
     except ValueError as error:
         raise ConfigurationError(f"run {row['run_id']}: {error}") from error
     logged = row.get("mismatch_values") or "{}"
@@ -196,7 +198,7 @@ def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]
             f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "
             "give now; record it with the version of servobench that made it"
         )
-    return model, sample.moved(model)
+    return model, sample.moved(model, robot)
 
 
 def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.network_cache import network_source
@@ -27,7 +26,7 @@ from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.hand_eye import FEATURE, HandEyeModel, TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
-from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
+from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import PlantSpec
 
@@ -111,13 +110,13 @@ def draw(resolved: ResolvedRun) -> Drawn:
     Raises:
         ConfigurationError: a mismatch or a task that cannot be used.
     """
-    request, nominal = resolved.request, nominal_ur5()
+    request, robot = resolved.request, find_robot(resolved.request.robot)
     try:
-        true, sample = sample_mismatch(request.mismatch, nominal, named_seed(request.seed, "mismatch"))
+        true, sample = sample_mismatch(request.mismatch, robot, named_seed(request.seed, "mismatch"))
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
-    moved = sample.moved(true)
-    setting = TaskSetting(true, true.arm.n, FEATURE, named_seed(request.seed, "task"), moved)
+    moved = sample.moved(true, robot)
+    setting = TaskSetting(true, true.arm.n, FEATURE, named_seed(request.seed, "task"), moved, robot)
     return Drawn(_build_scenario(resolved, setting), true, sample, moved)
 
 
@@ -141,10 +140,11 @@ def assemble(
         ConfigurationError: a setting that cannot be used.
     """
     request, run = resolved.request, resolved.run
-    plant = _build_plant(resolved, find_plant(request.plant), PlantSetup(true, start, run.period))
+    robot = find_robot(request.robot)
+    plant = _build_plant(resolved, find_plant(request.plant), PlantSetup(true, start, run.period, robot))
     try:
-        source = network_source(nominal_ur5().jacobian, plant.spec, keep, progress)
-        knowledge = replace(_nominal_knowledge(plant.spec, run), train=source)
+        source = network_source(robot.nominal.jacobian, plant.spec, keep, progress)
+        knowledge = replace(_nominal_knowledge(robot, plant.spec, run), train=source)
         controller = _build_controller(
             request.controller, resolved.controller, knowledge, lambda: plant.with_delays(_equations(true))
         )
@@ -167,7 +167,9 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
         return
 
 
-def train_networks(controller: str, settings: Settings, progress: Progress) -> TrainedNetworks:
+def train_networks(
+    controller: str, settings: Settings, progress: Progress, robot_name: str = DEFAULT_ROBOT
+) -> TrainedNetworks:
     """Return the networks that a controller of this name starts from, trained where the cache has none.
 
     Raises:
@@ -176,8 +178,10 @@ def train_networks(controller: str, settings: Settings, progress: Progress) -> T
     trained: list[TrainedNetworks] = []
     run = settings.resolve("run", RunSettings())
     plant = KinematicConfig()
-    nominal = nominal_ur5()
-    knowledge = _nominal_knowledge(hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range), run)
+    robot = find_robot(robot_name)
+    nominal, limits = robot.nominal, robot.limits
+    spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
+    knowledge = _nominal_knowledge(robot, spec, run)
     source = network_source(nominal.jacobian, knowledge.spec, progress=progress)
 
     def obtain(config: TrainingConfig) -> TrainedNetworks:
@@ -191,13 +195,13 @@ def train_networks(controller: str, settings: Settings, progress: Progress) -> T
     return trained[-1]
 
 
-def _nominal_knowledge(spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
+def _nominal_knowledge(robot: Robot, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     """Return what every controller may know."""
     return RobotKnowledge(
         spec=spec,
         preview=run.preview_rows,
-        nominal_jacobian=nominal_ur5().jacobian,
-        region=(np.array(TRAINING_LOWER), np.array(TRAINING_UPPER)),
+        nominal_jacobian=robot.nominal.jacobian,
+        region=(robot.workspace.lower, robot.workspace.upper),
     )
 
 

@@ -6,9 +6,11 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from servobench.harness.config.registry import FORMER_NAMES
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.settings import NonNegative, Positive, ShareBelowOne, settings
@@ -71,6 +73,7 @@ class RunRequest:
     noise_factor: float = 1.0  # multiplies the sensor noise that the plant is configured with
     latency: float | None = None  # [s] of the camera; None for what the plant is configured with
     period: float | None = None  # [s] of control; None for that of the section `run`
+    robot: str = DEFAULT_ROBOT  # a name, or the path of a file
 
     def __post_init__(self) -> None:
         """Read a mismatch that came as text, and a former name of a controller."""
@@ -87,7 +90,8 @@ class RunRequest:
         )
         noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
         times = "".join(f"-{name}{1e3 * value:g}ms" for name in TIMES if (value := getattr(self, name)) is not None)
-        return f"{plant}-{controller}-{self.task}-{mismatch}{noise}{times}-{self.seed}"
+        robot = "" if self.robot == DEFAULT_ROBOT else f"{UNFIT_FOR_FILES.sub('_', Path(self.robot).name)}-"
+        return f"{plant}-{robot}{controller}-{self.task}-{mismatch}{noise}{times}-{self.seed}"
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""

@@ -9,9 +9,12 @@ from typing import Any
 
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import controller_names, find_controller, installed_plant, plant_names
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS, find_task
+from servobench.harness.run.teaching import taught
+from servobench.plant.robot.robot import Robot
 from servobench.plant.sensing import vary_sensing
 
 
@@ -41,14 +44,30 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict
     Raises:
         ConfigurationError: an unknown name, or a setting that cannot be used.
     """
-    defaults = {"run": RunSettings()}
+    defaults: dict[str, Any] = {"run": RunSettings()}
     requests = list(requests)
-    defaults |= {name: installed_plant(name).config() for name in dict.fromkeys(each.plant for each in requests)}
+    robot = _common_robot(requests)
+    defaults |= {name: _plant_default(name, robot) for name in dict.fromkeys(each.plant for each in requests)}
     defaults |= {
         name: default_config(find_controller(name)) for name in dict.fromkeys(each.controller for each in requests)
     }
-    defaults |= {name: find_task(name).default for name in dict.fromkeys(each.task for each in requests)}
+    defaults |= {name: taught(find_task(name), robot) for name in dict.fromkeys(each.task for each in requests)}
     return {name: settings.resolve(name, default) for name, default in defaults.items()}
+
+
+def _common_robot(requests: Iterable[RunRequest]) -> Robot:
+    """Return the robot of all runs of a batch, which share the settings of plants and tasks."""
+    names = list(dict.fromkeys(each.robot for each in requests)) or [DEFAULT_ROBOT]
+    if len(names) > 1:
+        raise ConfigurationError(f"a batch has one robot, got {', '.join(names)}; use a batch for each")
+    return find_robot(names[0])
+
+
+def _plant_default(name: str, robot: Robot) -> Any:  # noqa: ANN401 - any configuration dataclass
+    entry = installed_plant(name)
+    if entry.own_robot and robot.name != DEFAULT_ROBOT:
+        raise ConfigurationError(f"plant {name} brings a robot of its own, so --robot {robot.name} does not apply")
+    return entry.config() if entry.config_for is None else entry.config_for(robot)
 
 
 def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:

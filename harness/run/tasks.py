@@ -2,14 +2,15 @@
 
 Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
 feature. A target given as joint positions is therefore seen through the true robot, and is always in reach. Curves are
-given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch.
+given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch. The numbers
+here are those of the UR5's bench; `servobench.harness.run.teaching` moves them to that of another arm.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -20,16 +21,15 @@ from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskK
 from servobench.plant.checks import FloatArray, as_vector, check_number
 from servobench.plant.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
+from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import Count, NonNegative, Number, Positive, settings, suggest
 from servobench.plant.signals import Channel
 
 Vector: TypeAlias = tuple[float, ...]
 
-SHOULDER = (0.0, 0.0, 0.09)  # [m] base frame
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
-REACH = (0.35, 0.75)  # [m] from the shoulder to the ball: away from the arm's own column and from the stretched arm
 
 
 @dataclass(frozen=True)
@@ -162,22 +162,23 @@ class TaskSetting:
     feature: Channel  # names and unit of the m features
     seed: int  # for tasks that draw random numbers
     moved: HandEyeModel | None = None  # the true robot once its camera was moved; None if it is not
+    robot: Robot | None = None  # by its maker's description; None for a plant that brings its own
 
     @property
     def m(self) -> int:
         """Number of features."""
         return len(self.feature.names)
 
-    def taught_on(self) -> HandEyeModel:
-        """Return the true robot, for a target that is taught on it.
+    def taught_on(self) -> tuple[Robot, HandEyeModel]:
+        """Return the robot and the true one, for a target that is taught on it.
 
         Raises:
             ValueError: the plant brings a robot of its own.
         """
-        if self.model is None:
-            raise ValueError("it is taught on the UR5, and this plant brings a robot of its own; use one of "
+        if self.model is None or self.robot is None:
+            raise ValueError("it is taught on a known robot, and this plant brings a robot of its own; use one of "
                              f"{', '.join(name for name in TASKS if TASKS[name].any_robot)}")  # fmt: skip
-        return self.model
+        return self.robot, self.model
 
     def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
         """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
@@ -192,12 +193,12 @@ class TaskEntry:
     summary: str  # one line for `servobench tasks`
     default: Any  # its settings
     build: Callable[[Any, TaskSetting], Scenario]  # makes a scenario from settings and the setting of the run
-    any_robot: bool = False  # it needs no UR5: start and target are not given as its joint positions
+    any_robot: bool = False  # it needs no known robot: no target is given as its joint positions
 
 
 def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
     target = as_vector("target", config.target, setting.n)
-    return _move(config.start, FixedPoint(setting.taught_on().feature(target)), config.duration, setting)
+    return _move(config.start, FixedPoint(setting.taught_on()[1].feature(target)), config.duration, setting)
 
 
 def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
@@ -210,27 +211,32 @@ def _move(start: Vector | FloatArray, reference: FixedPoint, duration: float, se
 
 
 def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
-    n, nominal = setting.taught_on().arm.n, nominal_ur5()
+    robot, true = setting.taught_on()
+    n, clear = robot.n, robot.workspace.clear
     lower, upper = as_vector("lower", config.lower, n), as_vector("upper", config.upper, n)
     if not (lower < upper).all():
         raise ValueError("lower must be below upper for every joint")
     generator = named_generator(setting.seed, "start_and_target")
     for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
         pairs = generator.uniform(lower, upper, (DRAWN_AT_ONCE, 2, n))
-        balls = nominal.arm.ball_position(pairs)
+        balls = robot.arm.ball_position(pairs)
         apart = norm(balls[:, 1] - balls[:, 0]) >= config.shortest
-        for start, target in pairs[apart & (balls[:, :, 2] >= config.lowest).all(axis=-1)]:
-            if _stays_in_reach(target, config.lowest, setting):
-                return _move(start, FixedPoint(setting.taught_on().feature(target)), config.duration, setting)
+        fit = apart & (balls[:, :, 2] >= config.lowest).all(axis=-1)
+        if clear is not None:
+            fit &= clear(pairs).all(axis=-1)
+        for start, target in pairs[fit]:
+            point = true.feature(target)
+            if _stays_in_reach(point, config.lowest, setting, robot):
+                return _move(start, FixedPoint(point), config.duration, setting)
     raise ValueError("no start and target in the box are far enough apart and above the table")
 
 
-def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting) -> bool:
-    """Return whether a target (n,), rad, that was taught before the camera's move is in easy reach after it."""
+def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, robot: Robot) -> bool:
+    """Return whether a target (m,) that was taught before the camera's move is in easy reach after it."""
     if setting.moved is None:
         return True
-    point = setting.moved.to_base(setting.taught_on().feature(target))
-    return bool(point[2] >= lowest and REACH[0] <= np.linalg.norm(point - SHOULDER) <= REACH[1])
+    point, (nearest, farthest) = setting.moved.to_base(target), robot.workspace.reach
+    return bool(point[2] >= lowest and nearest <= np.linalg.norm(point - robot.workspace.shoulder) <= farthest)
 
 
 def _build_laps(config: CircleTask, setting: TaskSetting) -> Scenario:
@@ -242,8 +248,12 @@ def _build_laps(config: CircleTask, setting: TaskSetting) -> Scenario:
 
 
 def _build_endurance(config: EnduranceTask, setting: TaskSetting) -> Scenario:
-    shape = LemniscateTask if config.curve == "lemniscate" else CircleTask
-    return _build_laps(shape(start=config.start, lap_time=config.lap_time, laps=config.laps), setting)
+    shape = LemniscateTask() if config.curve == "lemniscate" else CircleTask()
+    scale = 1.0 if setting.robot is None else setting.robot.workspace.scale
+    centre = tuple(scale * value for value in shape.centre)
+    laps = replace(shape, start=config.start, centre=centre, radius=scale * shape.radius, lap_time=config.lap_time,
+                   laps=config.laps)  # fmt: skip
+    return _build_laps(laps, setting)
 
 
 def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
@@ -261,25 +271,8 @@ def _build_waypoints(config: WaypointTask, setting: TaskSetting) -> Scenario:
     return Scenario(setting.start(config.start), reference, duration, 0.5 * duration)
 
 
-# Start and target as joint positions, and beside them the ball on the nominal robot in the base frame.
-EXP1 = PointTask(
-    start=(0.169, -1.669, -2.250, 0.893, 1.156, 0.0),  # (0.50, -0.10, 0.35) m
-    target=(1.484, -1.897, -2.052, 0.793, 1.624, 0.0),  # (0.15, 0.58, 0.30) m; the shoulder is 0.63 rad outside
-)
-EXP2 = PointTask(
-    start=(0.097, -1.434, -2.282, 0.990, 1.124, 0.0),  # (0.40, -0.15, 0.45) m
-    target=(0.441, -2.006, -2.124, 0.760, 1.255, 0.0),  # (0.60, 0.10, 0.20) m
-)
-EXP3 = PointTask(
-    start=(0.583, -2.093, -1.976, 0.720, 1.301, 0.0),  # (0.62, 0.22, 0.20) m
-    target=(-0.114, -1.648, -2.157, 0.894, 1.067, 0.0),  # (0.45, -0.25, 0.40) m
-)
-EXP4 = PointTask(
-    start=(-0.938, -1.724, -1.814, 0.812, 0.855, 0.0),  # (0.12, -0.55, 0.50) m; the shoulder is 0.69 rad outside
-    target=(0.403, -1.847, -2.248, 0.826, 1.231, 0.0),  # (0.55, 0.05, 0.25) m
-)
-# The arm stretched level over the table, the ball at (1.03, 0, 0.09) m: its Jacobian has lost the way out and back.
-SINGULAR = PointTask(start=(0.132772, -3.141593, 0.0, -0.483504, 1.421076, -0.000417))
+EXP1, EXP2, EXP3, EXP4 = (PointTask(start=start, target=target) for start, target in MOVES.values())
+SINGULAR = PointTask(start=STRETCHED)
 UNREACHABLE = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)  # 1.5 m straight on from where the ball starts
 
 _ENTRIES = (

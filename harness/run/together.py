@@ -36,7 +36,7 @@ def side_by_side_key(run: ResolvedRun) -> Hashable | None:
     if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
         return None
     moved = request.mismatch.size("camera_move") > 0.0
-    names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved
+    names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved, request.robot
     return (*names, id(run.run), id(run.controller), id(run.task))
 
 

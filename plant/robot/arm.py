@@ -183,6 +183,33 @@ def arm_from_dh(
     return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), tool_vector)
 
 
+def arm_from_modified_dh(
+    a: npt.ArrayLike, d: npt.ArrayLike, alpha: npt.ArrayLike, joint_names: tuple[str, ...]
+) -> SerialArm:
+    """Return the arm of a DH table by the modified convention, T_i = Rx(α_i) Tx(a_i) Rz(θ_i) Tz(d_i), without a ball.
+
+    Args:
+        a: (n,) or (n+1,), m; the last one of n+1 leads to the flange.
+        d: the same, m.
+        alpha: the same, rad.
+        joint_names: n names.
+
+    Returns:
+        The arm with gear ratios of 1, no joint offsets and its ball in the flange's origin.
+
+    Raises:
+        ValueError: a column of the wrong length.
+    """
+    n = len(joint_names)
+    size = n + 1 if np.shape(a) == (n + 1,) else n
+    columns = [as_vector(name, value, size) for name, value in (("a", a), ("d", d), ("alpha", alpha))]
+    a_, d_, alpha_ = (np.pad(column, (0, n + 1 - size)) for column in columns)
+    translation = np.stack([a_, -d_ * np.sin(alpha_), d_ * np.cos(alpha_)], axis=-1)
+    rpy = np.zeros((n + 1, 3))
+    rpy[:, 0] = alpha_
+    return SerialArm(joint_names, translation, rpy, np.zeros(n), np.ones(n), np.zeros(3))
+
+
 def arm_from_calibration(path: Path, tool: npt.ArrayLike, joint_names: tuple[str, ...]) -> SerialArm:
     """Return the arm that a Universal Robots factory-calibration file describes.
 

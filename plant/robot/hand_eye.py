@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.limits import JointLimits, narrowed
 from servobench.plant.signals import Channel, PlantSpec
 
 FEATURE_NAMES = ("x", "y", "z")
@@ -93,7 +94,9 @@ class TrueJacobian:
         return self.model.jacobian(joint_position)
 
 
-def hand_eye_spec(model: HandEyeModel, period: float, max_joint_speed: float, joint_range: float) -> PlantSpec:
+def hand_eye_spec(
+    model: HandEyeModel, period: float, max_joint_speed: float, joint_range: float, limits: JointLimits | None = None
+) -> PlantSpec:
     """Return the spec of a plant built on `model`.
 
     Args:
@@ -101,9 +104,10 @@ def hand_eye_spec(model: HandEyeModel, period: float, max_joint_speed: float, jo
         period: control period, s.
         max_joint_speed: rad/s, the same for all joints.
         joint_range: rad, each way, the same for all joints.
+        limits: of its maker, which hold as well; None for none.
 
     Raises:
         ValueError: a period, speed or range that is not positive.
     """
-    speed, reach = np.full(model.arm.n, max_joint_speed), np.full(model.arm.n, joint_range)
-    return PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, speed, -reach, reach, period)
+    both = narrowed(limits, model.arm.n, max_joint_speed, joint_range)
+    return PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, both.speed, both.lower, both.upper, period)

@@ -62,6 +62,37 @@ def closest_distance(
     return np.asarray(distance.min(axis=0))
 
 
+def reach_for(
+    arm: SerialArm, point: FloatArray, starts: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return where the search ends that begins at each of many joint positions.
+
+    Args:
+        arm: one arm.
+        point: (3,), in the base frame [m].
+        starts: (k, n) [rad].
+        lower: (n,), joint limits [rad].
+        upper: (n,) [rad].
+
+    Returns:
+        Joint positions (k, n) [rad], and how far the ball is from the point (k,) [m].
+    """
+    q, target = starts, np.broadcast_to(point, (len(starts), 3))
+    error, J = _error(arm, target, q)
+    damping = np.full(len(starts), FIRST_DAMPING)
+    for _ in range(ITERATIONS):
+        open_ = norm(error) > CLOSE_ENOUGH
+        if not open_.any():
+            break
+        tried = _step(q, error, J, damping, lower, upper)
+        new_error, new_J = _error(arm, target, tried)
+        nearer = (norm(new_error) < norm(error)) & open_
+        q = np.where(nearer[:, None], tried, q)
+        error, J = np.where(nearer[:, None], new_error, error), np.where(nearer[:, None, None], new_J, J)
+        damping = np.clip(damping * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
+    return q, np.asarray(norm(error))
+
+
 def _starts(count: int, lead: tuple[int, ...], lower: FloatArray, upper: FloatArray) -> FloatArray:
     """Return where the search begins, (count, ..., n) rad: the same joint positions for every point, within a turn."""
     drawn = np.random.default_rng(0).uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower)))

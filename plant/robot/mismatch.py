@@ -20,7 +20,6 @@ import math
 import re
 from dataclasses import dataclass, fields, replace
 from math import radians
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -28,7 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, ur5_arm_from_calibration
+from servobench.plant.robot.measured import measured_arm
+from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_generator
 
 MAX_TILT = radians(45.0)
@@ -220,11 +220,12 @@ class MismatchSample:
     move_axis: FloatArray
     move_angle: float
 
-    def moved(self, model: HandEyeModel) -> HandEyeModel | None:
-        """Return the true robot `model` after its camera was moved in the middle of the run; None if it is not."""
+    def moved(self, model: HandEyeModel, robot: Robot) -> HandEyeModel | None:
+        """Return the true `robot`, `model`, after its camera was moved in the middle of the run; None if it is not."""
         if self.move_angle == 0.0:
             return None
-        return replace(model, X_BC=_turn_camera(model.X_BC, self.move_angle * self.move_axis))
+        centre = robot.workspace.centre
+        return replace(model, X_BC=_turn_camera(model.X_BC, self.move_angle * self.move_axis, centre))
 
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists and floats, for JSON."""
@@ -232,21 +233,21 @@ class MismatchSample:
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
-def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple[HandEyeModel, MismatchSample]:
+def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEyeModel, MismatchSample]:
     """Draw a true robot.
 
     Args:
-        mismatch: how far it may be from `model`.
-        model: the nominal robot.
+        mismatch: how far it may be from the nominal robot.
+        robot: by its maker's description.
         seed: non-negative.
 
     Returns:
         The true robot and the values that were drawn.
 
     Raises:
-        ValueError: the calibration file is missing or malformed.
+        ValueError: the calibration file is missing, malformed or that of another robot.
     """
-    arm, n, size = model.arm, model.arm.n, mismatch.size
+    nominal, n, size = robot.nominal, robot.n, mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
         return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, shape)
@@ -266,9 +267,9 @@ def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple
         move_axis=_draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
         move_angle=move,
     )
+    arm = nominal.arm if robot.measured is None else robot.measured
     if mismatch.profile == "factory":
-        file = mismatch.calibration
-        arm = ur5_arm_from_calibration(None if file is None else Path(file).expanduser())
+        arm = measured_arm(robot, mismatch.calibration)
     true = replace(
         arm,
         translation=arm.translation * sample.link_scale,
@@ -276,7 +277,8 @@ def sample_mismatch(mismatch: Mismatch, model: HandEyeModel, seed: int) -> tuple
         gear_ratio=arm.gear_ratio * sample.gear_ratio,
         tool=arm.tool + sample.tool_offset,
     )
-    return HandEyeModel(true, _turn_camera(model.X_BC, sample.camera_angle * sample.camera_axis)), sample
+    turned = _turn_camera(nominal.X_BC, sample.camera_angle * sample.camera_axis, robot.workspace.centre)
+    return HandEyeModel(true, turned), sample
 
 
 def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
@@ -292,9 +294,8 @@ def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Genera
     return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
 
 
-def _turn_camera(X_BC: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the pose X_BC (4, 4) turned by a rotation vector, (3,) rad, about the middle of the workspace."""
-    centre = np.asarray(WORKSPACE_CENTRE)
+def _turn_camera(X_BC: FloatArray, rotation: FloatArray, centre: FloatArray) -> FloatArray:
+    """Return the pose X_BC (4, 4) turned by a rotation vector, (3,) rad, about the workspace's `centre` (3,) m."""
     centre_C = X_BC[:3, :3].T @ (centre - X_BC[:3, 3])
     turned = np.eye(4)
     turned[:3, :3] = X_BC[:3, :3] @ Rotation.from_rotvec(rotation).as_matrix()

@@ -55,6 +55,30 @@ BALL_RADIUS = 0.035  # m
 # The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
 HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
 
+# Start and target of the moves as joint positions [rad]; beside them the ball on the nominal robot, base frame.
+MOVES = {
+    "exp1": (
+        (0.169, -1.669, -2.250, 0.893, 1.156, 0.0),  # (0.50, -0.10, 0.35) m
+        (1.484, -1.897, -2.052, 0.793, 1.624, 0.0),  # (0.15, 0.58, 0.30) m; the shoulder is 0.63 rad outside the box
+    ),
+    "exp2": (
+        (0.097, -1.434, -2.282, 0.990, 1.124, 0.0),  # (0.40, -0.15, 0.45) m
+        (0.441, -2.006, -2.124, 0.760, 1.255, 0.0),  # (0.60, 0.10, 0.20) m
+    ),
+    "exp3": (
+        (0.583, -2.093, -1.976, 0.720, 1.301, 0.0),  # (0.62, 0.22, 0.20) m
+        (-0.114, -1.648, -2.157, 0.894, 1.067, 0.0),  # (0.45, -0.25, 0.40) m
+    ),
+    "exp4": (
+        (-0.938, -1.724, -1.814, 0.812, 0.855, 0.0),  # (0.12, -0.55, 0.50) m; the shoulder is 0.69 rad outside the box
+        (0.403, -1.847, -2.248, 0.826, 1.231, 0.0),  # (0.55, 0.05, 0.25) m
+    ),
+}
+# The arm stretched level over the table, the ball at (1.03, 0, 0.09) m: its Jacobian has lost the way out and back.
+STRETCHED = (0.132772, -3.141593, 0.0, -0.483504, 1.421076, -0.000417)  # rad
+
+SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
+
 # The box of joint positions in which networks are trained on the nominal model, rad.
 TRAINING_LOWER = (-0.25, -2.29, -3.04, 0.39, 0.92, -0.3)
 TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
@@ -76,8 +100,12 @@ def ur5_arm_from_calibration(path: Path | None = None) -> SerialArm:
     Raises:
         ValueError: the file is missing or malformed.
     """
-    shipped = Path(str(files("servobench.plant") / "data" / "ur5_factory_calibration.yaml"))
-    return arm_from_calibration(shipped if path is None else path, TOOL, JOINT_NAMES)
+    return arm_from_calibration(shipped_calibration() if path is None else path, TOOL, JOINT_NAMES)
+
+
+def shipped_calibration() -> Path:
+    """Return the calibration file of one real UR5 which the package brings."""
+    return Path(str(files("servobench.plant") / "data" / "ur5_factory_calibration.yaml"))
 
 
 def camera_pose(R_BC: FloatArray) -> FloatArray:

@@ -21,9 +21,10 @@ from servobench.harness.run.request import RunRequest
 from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.fmu.model_exchange import FmuModel
 from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.symbolic import symbolic_feature
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 from servobench.plant.signals import Command
 
 TRUE_ARM, NOMINAL_ARM = (0.6, 0.3), (0.55, 0.4)
@@ -44,7 +45,7 @@ TARGET = {"target": [0.2, 0.7], "duration": 3.0}
 
 
 def mismatched(text: str):
-    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), 3)[0]
+    return sample_mismatch(Mismatch.parse(text), find_robot("ur5"), 3)[0]
 
 
 def mapped(tmp_path: Path, text: str = MAPPING, description: str | None = None) -> Path:

@@ -8,8 +8,9 @@ import pytest
 
 from servobench.harness.config.registry import plant_names
 from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 from servobench.plant.sensing import SensingConfig
 
 NEEDS_BULLET = pytest.mark.skipif(
@@ -21,7 +22,7 @@ ALL_PLANTS = [pytest.param(name, marks=NEEDS_BULLET) if name == "bullet" else na
 
 def mismatched(text, seed=3):
     """Return the true robot of a mismatch."""
-    return sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[0]
+    return sample_mismatch(Mismatch.parse(text), find_robot("ur5"), seed)[0]
 
 
 def setup(text="none", period=0.05):

@@ -5,9 +5,10 @@ from scipy.optimize import least_squares
 
 from servobench.plant.lanes import stack
 from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, closest_distance
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 
 BAND = 0.005  # m
 TURN = np.full(6, 2 * np.pi)
@@ -25,7 +26,7 @@ def oracle(arm: SerialArm, point: np.ndarray, lower: np.ndarray, upper: np.ndarr
 
 
 def arms(count: int) -> list[SerialArm]:
-    return [sample_mismatch(Mismatch.parse("severe"), nominal_ur5(), seed)[0].arm for seed in range(count)]
+    return [sample_mismatch(Mismatch.parse("severe"), find_robot("ur5"), seed)[0].arm for seed in range(count)]
 
 
 def test_the_distance_is_that_of_scipy_in_and_out_of_reach():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
 
@@ -16,13 +17,13 @@ POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
 
 
 def test_no_mismatch_leaves_the_model_as_it_is():
-    model, _ = sample_mismatch(Mismatch.parse("none"), nominal_ur5(), 3)
+    model, _ = sample_mismatch(Mismatch.parse("none"), find_robot("ur5"), 3)
     np.testing.assert_allclose(model.feature(POSES), nominal_ur5().feature(POSES), rtol=0, atol=1e-12)
 
 
 def test_the_same_seed_draws_the_same_robot_and_another_seed_another():
     mismatch = Mismatch.parse("severe")
-    records = [sample_mismatch(mismatch, nominal_ur5(), seed)[1].as_record() for seed in (5, 5, 6)]
+    records = [sample_mismatch(mismatch, find_robot("ur5"), seed)[1].as_record() for seed in (5, 5, 6)]
     assert records[0] == records[1]
     assert records[0] != records[2]
     assert json.loads(json.dumps(records[0])) == records[0]
@@ -32,7 +33,7 @@ def test_the_same_seed_draws_the_same_robot_and_another_seed_another():
     ("text", "links", "offset", "angle", "tool"), [("moderate", 0.05, 3, 15, 0.02), ("severe", 0.1, 6, 45, 0.04)]
 )
 def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset, angle, tool):
-    samples = [sample_mismatch(Mismatch.parse(text), nominal_ur5(), seed)[1] for seed in range(200)]
+    samples = [sample_mismatch(Mismatch.parse(text), find_robot("ur5"), seed)[1] for seed in range(200)]
     for values, bound in (
         ([sample.link_scale - 1 for sample in samples], links),
         ([sample.joint_offset for sample in samples], math.radians(offset)),
@@ -48,7 +49,7 @@ def test_profiles_stay_within_their_magnitudes_and_use_them(text, links, offset,
 def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(angle):
     nominal = nominal_ur5()
     for seed in range(100):
-        true, _ = sample_mismatch(Mismatch.parse(f"camera_rotation={angle}deg"), nominal, seed)
+        true, _ = sample_mismatch(Mismatch.parse(f"camera_rotation={angle}deg"), find_robot("ur5"), seed)
         R = nominal.X_BC[:3, :3].T @ true.X_BC[:3, :3]
         assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(math.radians(angle), abs=1e-6)
         assert math.acos(min(R[2, 2], 1.0)) <= MAX_TILT + 1e-9
@@ -56,7 +57,7 @@ def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(a
 
 
 def test_a_larger_magnitude_goes_further_in_the_same_direction():
-    small, large = (sample_mismatch(Mismatch.parse(f"links={size}%"), nominal_ur5(), 4)[1] for size in (5, 10))
+    small, large = (sample_mismatch(Mismatch.parse(f"links={size}%"), find_robot("ur5"), 4)[1] for size in (5, 10))
     np.testing.assert_allclose(2 * (small.link_scale - 1), large.link_scale - 1, atol=1e-12)
 
 
@@ -99,12 +100,12 @@ def test_an_axis_is_put_on_top_of_a_mismatch():
 
 
 def test_factory_takes_the_arm_of_the_calibration_file():
-    true, _ = sample_mismatch(Mismatch.parse("factory"), nominal_ur5(), 0)
+    true, _ = sample_mismatch(Mismatch.parse("factory"), find_robot("ur5"), 0)
     np.testing.assert_allclose(true.arm.ball_position(POSES), ur5_arm_from_calibration().ball_position(POSES))
 
 
 def test_a_gear_ratio_scales_the_motion_but_not_the_reported_position():
-    true, sample = sample_mismatch(Mismatch.parse("gear_ratio=5%"), nominal_ur5(), 0)
+    true, sample = sample_mismatch(Mismatch.parse("gear_ratio=5%"), find_robot("ur5"), 0)
     expected = nominal_ur5().jacobian(sample.gear_ratio * POSES) * sample.gear_ratio
     np.testing.assert_allclose(true.jacobian(POSES), expected, atol=1e-12)
 
@@ -130,7 +131,7 @@ def test_a_malformed_mismatch_is_refused(text, message):
 
 def test_a_missing_calibration_file_is_named():
     with pytest.raises(ValueError, match="nowhere.yaml cannot be read"):
-        sample_mismatch(Mismatch.parse("factory=nowhere.yaml"), nominal_ur5(), 0)
+        sample_mismatch(Mismatch.parse("factory=nowhere.yaml"), find_robot("ur5"), 0)
 
 
 def test_a_negative_magnitude_is_refused():
@@ -170,8 +171,8 @@ def test_a_bad_range_of_magnitudes_is_refused(axis, text, message):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
-    model, sample = sample_mismatch(Mismatch.parse("camera_move=120deg"), nominal_ur5(), seed)
-    moved = sample.moved(model)
+    model, sample = sample_mismatch(Mismatch.parse("camera_move=120deg"), find_robot("ur5"), seed)
+    moved = sample.moved(model, find_robot("ur5"))
     turn = Rotation.from_matrix(model.X_BC[:3, :3].T @ moved.X_BC[:3, :3])
     assert turn.magnitude() == pytest.approx(np.radians(120.0))
     tilt = np.arccos(model.X_BC[:3, 2] @ moved.X_BC[:3, 2])
@@ -180,5 +181,5 @@ def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
 
 
 def test_without_a_move_there_is_no_moved_robot():
-    model, sample = sample_mismatch(Mismatch.parse("severe"), nominal_ur5(), 0)
-    assert sample.moved(model) is None
+    model, sample = sample_mismatch(Mismatch.parse("severe"), find_robot("ur5"), 0)
+    assert sample.moved(model, find_robot("ur5")) is None

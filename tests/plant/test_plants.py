@@ -8,6 +8,7 @@ import pytest
 from kit.plants import ALL_PLANTS
 from servobench.harness.config.registry import find_plant
 from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 from servobench.plant.sensing import vary_sensing
@@ -24,7 +25,7 @@ def entry(request) -> PlantEntry:
 
 @pytest.fixture
 def plant(entry):
-    model, _ = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%"), nominal_ur5(), 1)
+    model, _ = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%"), find_robot("ur5"), 1)
     made = entry.build(entry.config(), PlantSetup(model, np.array(HOME), PERIOD))
     yield made
     made.close()
@@ -108,7 +109,7 @@ def test_it_can_be_closed_twice_and_closes_no_other(entry, plant):
 
 
 def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_camera(plant):
-    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
+    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
 
     def continued() -> list[bytes]:
         seen = [plant.step(Command(u)) for u in COMMANDS]
@@ -119,7 +120,7 @@ def test_a_restored_state_continues_with_the_same_bits_also_after_a_move_of_the_
     plant.reset(5)
     before = plant.save()
     first = continued()
-    plant.move_camera(sample.moved(model).X_BC)
+    plant.move_camera(sample.moved(model, find_robot("ur5")).X_BC)
     between = plant.save()
     second = continued()
     for state, expected in ((before, first), (between, second), (before, first)):
@@ -142,8 +143,8 @@ def test_a_picture_disturbs_neither_the_run_nor_its_random_streams(plant):
 
 
 def test_a_moved_camera_shows_the_ball_elsewhere_until_the_reset(plant):
-    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), nominal_ur5(), 1)
-    moved = sample.moved(model)
+    model, sample = sample_mismatch(Mismatch.parse("moderate+gear_ratio=5%+camera_move=20deg"), find_robot("ur5"), 1)
+    moved = sample.moved(model, find_robot("ur5"))
     plant.reset(0)
     before = plant.truth()
     plant.move_camera(moved.X_BC)
@@ -179,10 +180,10 @@ START = np.add(HOME, [0.6, 0.0, 0.0, 0.0, 0.0, 0.0])  # the ball far from the po
 
 
 def test_latency_shows_a_moved_camera_late(entry):
-    model, sample = sample_mismatch(Mismatch.parse("camera_move=20deg"), nominal_ur5(), 1)
+    model, sample = sample_mismatch(Mismatch.parse("camera_move=20deg"), find_robot("ur5"), 1)
     plant = entry.build(vary_sensing(entry.config(), 0.0, 3 * PERIOD), PlantSetup(model, START, PERIOD))
     first = plant.reset(0).feature
-    plant.move_camera(sample.moved(model).X_BC)
+    plant.move_camera(sample.moved(model, find_robot("ur5")).X_BC)
     seen = [np.linalg.norm(plant.step(Command(np.zeros(6))).feature - first) for _ in range(6)]
     plant.close()
     assert max(seen[:3]) < 0.002

@@ -1,0 +1,59 @@
+"""Robots by name or by file: `--robot ur10e`, `panda`, `my_ur10e.yaml`, `my_arm.toml`, `my_arm.urdf`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache, partial
+from pathlib import Path
+from typing import Final
+
+from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
+from servobench.plant.robot.robot import Robot
+from servobench.plant.settings import suggest
+
+UR5: Final = "ur5"
+ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
+    title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
+} | {"panda": panda}
+
+
+def find_robot(text: str) -> Robot:
+    """Return the robot that a name or the path of a file stands for; the same object for the same unchanged file.
+
+    Args:
+        text: a key of `ROBOTS`, or the path of a file that ends in .yaml (a factory calibration of Universal Robots),
+            .toml (a DH table) or .urdf.
+
+    Raises:
+        ValueError: an unknown name, or a file that cannot be used.
+    """
+    if text in ROBOTS:
+        return _known(text)
+    path = Path(text.partition("#")[0]).expanduser()
+    if path.suffix.lower() not in {".yaml", ".yml", ".toml", ".urdf"}:
+        raise ValueError(
+            f"unknown robot {text!r}: {suggest(text, ROBOTS)}; or a file: a factory calibration (.yaml), a DH table "
+            "(.toml) or a .urdf"
+        )
+    try:
+        changed = path.stat().st_mtime_ns
+    except OSError as error:
+        raise ValueError(f"robot file {path} cannot be read: {error.strerror}") from error
+    return _read(text, changed)
+
+
+def nominal_ur5() -> Robot:
+    """Return the robot of every run that names none."""
+    return _known(UR5)
+
+
+@cache
+def _known(name: str) -> Robot:
+    return ROBOTS[name]()
+
+
+@cache
+def _read(text: str, changed: int) -> Robot:
+    from servobench.plant.robot.files import read_robot  # noqa: PLC0415 - only files need their readers
+
+    return read_robot(text)

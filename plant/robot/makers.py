@@ -1,0 +1,183 @@
+"""The arms that are known by name, from their makers' tables.
+
+Sources. Universal Robots: "DH parameters for calculations of kinematics and dynamics" (lengths, masses, centres of
+mass), "Max. joint torques", and the user manuals (speeds, ranges, loads). Franka: "Robot and interface specifications"
+of the Franka Control Interface (lengths by the modified convention, limits); masses and inertia of the Panda, which
+its maker does not publish: C. Gaz, M. Cognetti, A. Oliva, P. Robuffo Giordano, A. De Luca, "Dynamic identification of
+the Franka Emika Panda robot with retrieval of feasible parameters using penalty-based optimization", IEEE Robotics and
+Automation Letters 4 (2019). Radii of tubes are appearance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+from typing import Final
+
+import numpy as np
+
+from servobench.plant.checks import FloatArray
+from servobench.plant.robot import ur5
+from servobench.plant.robot.arm import SerialArm, arm_from_dh, arm_from_modified_dh
+from servobench.plant.robot.bodies import at_far_end, cylinder_inertia
+from servobench.plant.robot.limits import JointLimits
+from servobench.plant.robot.robot import Links, Robot
+from servobench.plant.robot.teaching import find_workspace, length_scale, with_ball
+from servobench.plant.robot.workspace import Workspace
+
+Triple = tuple[float, float, float]
+NO_BALL: Final = (0.0, 0.0, 0.0)
+UR_SOURCE: Final = "Universal Robots, DH parameters for calculations of kinematics and dynamics"
+PANDA_SOURCE: Final = "Franka, Robot and interface specifications; masses by Gaz et al. 2019"
+
+
+@dataclass(frozen=True)
+class UniversalRobot:
+    """A row of Universal Robots' tables.
+
+    Attributes:
+        d1, a2, a3, d4, d5, d6: standard DH lengths [m].
+        mass: of the links [kg].
+        centre: of mass, in DH frames [m].
+        torque: of shoulder pan and lift, elbow, and each wrist joint [Nm].
+        speed: of shoulder pan and lift, elbow, and each wrist joint [deg/s].
+        payload: rated load [kg].
+    """
+
+    d1: float
+    a2: float
+    a3: float
+    d4: float
+    d5: float
+    d6: float
+    mass: tuple[float, ...]
+    centre: tuple[Triple, ...]
+    torque: Triple
+    speed: Triple
+    payload: float
+
+    def arm(self) -> SerialArm:
+        """Return the nominal arm without a ball."""
+        a = (0.0, self.a2, self.a3, 0.0, 0.0, 0.0)
+        return arm_from_dh(a, (self.d1, 0.0, 0.0, self.d4, self.d5, self.d6), ur5.DH_ALPHA, NO_BALL, ur5.JOINT_NAMES)
+
+
+_CENTRES_3 = (
+    (0.0, -0.02, 0.0), (0.13, 0.0, 0.1157), (0.05, 0.0, 0.0238), (0.0, 0.0, 0.01), (0.0, 0.0, 0.01), (0.0, 0.0, -0.02),
+)  # fmt: skip
+_CENTRES_10 = (
+    (0.021, 0.0, 0.027), (0.38, 0.0, 0.158), (0.24, 0.0, 0.068), (0.0, 0.007, 0.018), (0.0, 0.007, 0.018),
+    (0.0, 0.0, -0.026),
+)  # fmt: skip
+UNIVERSAL_ROBOTS: Final = {
+    "UR3": UniversalRobot(
+        0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, (2.0, 3.42, 1.26, 0.8, 0.8, 0.35), _CENTRES_3,
+        (56.0, 28.0, 12.0), (180.0, 180.0, 360.0), 3.0,
+    ),
+    "UR5": UniversalRobot(
+        0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, ur5.MASS, ur5.CENTRE_OF_MASS,
+        (150.0, 150.0, 28.0), (180.0, 180.0, 180.0), 5.0,
+    ),
+    "UR10": UniversalRobot(
+        0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, (7.1, 12.7, 4.27, 2.0, 2.0, 0.365), _CENTRES_10,
+        (330.0, 150.0, 56.0), (120.0, 180.0, 180.0), 10.0,
+    ),
+    "UR3e": UniversalRobot(
+        0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261), _CENTRES_3,
+        (56.0, 28.0, 12.0), (180.0, 180.0, 360.0), 3.0,
+    ),
+    "UR5e": UniversalRobot(
+        0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, (3.761, 8.058, 2.846, 1.37, 1.3, 0.365), ur5.CENTRE_OF_MASS,
+        (150.0, 150.0, 28.0), (180.0, 180.0, 180.0), 5.0,
+    ),
+    "UR10e": UniversalRobot(
+        0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, (7.369, 13.051, 3.989, 2.1, 1.98, 0.615), _CENTRES_10,
+        (330.0, 150.0, 56.0), (120.0, 180.0, 180.0), 12.5,
+    ),
+}  # fmt: skip
+
+
+def universal_robot(title: str) -> Robot:
+    """Return an arm of Universal Robots by its title, such as "UR10e"."""
+    if title == "UR5":
+        return _ur5()
+    row = UNIVERSAL_ROBOTS[title]
+    arm, limits = with_ball(row.arm()), _ur_limits(row)
+    scale = length_scale(arm)
+    radius, aside = scale * np.array(ur5.TUBE_RADIUS), scale * np.array(ur5.SIDE_STEP)
+    mass = np.array(row.mass)
+    links = Links(
+        mass, np.array(row.centre), cylinder_inertia(mass, radius, arm), _by_joint(row.torque), radius, aside,
+        row.payload,
+    )  # fmt: skip
+    workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
+    return Robot(title.lower(), title, UR_SOURCE, arm, limits, links, workspace)
+
+
+def _ur5() -> Robot:
+    """Return the UR5, whose bench was laid out by hand."""
+    links = Links(
+        np.array(ur5.MASS), np.array(ur5.CENTRE_OF_MASS), np.array(ur5.INERTIA), np.array(ur5.MAX_TORQUE),
+        np.array(ur5.TUBE_RADIUS), np.array(ur5.SIDE_STEP), UNIVERSAL_ROBOTS["UR5"].payload,
+    )  # fmt: skip
+    workspace = Workspace(
+        scale=1.0,
+        centre=np.array(ur5.WORKSPACE_CENTRE),
+        shoulder=np.array(ur5.SHOULDER),
+        home=np.array(ur5.HOME),
+        lower=np.array(ur5.TRAINING_LOWER),
+        upper=np.array(ur5.TRAINING_UPPER),
+        moves={name: (np.array(start), np.array(target)) for name, (start, target) in ur5.MOVES.items()},
+        stretched=np.array(ur5.STRETCHED),
+    )
+    limits = _ur_limits(UNIVERSAL_ROBOTS["UR5"])
+    return Robot("ur5", "UR5", UR_SOURCE, ur5.ur5_arm(), limits, links, workspace)
+
+
+def _by_joint(values: Triple) -> FloatArray:
+    shoulder, elbow, wrist = values
+    return np.array([shoulder, shoulder, elbow, wrist, wrist, wrist])
+
+
+def _ur_limits(row: UniversalRobot) -> JointLimits:
+    return JointLimits(np.full(6, -2 * pi), np.full(6, 2 * pi), np.radians(_by_joint(row.speed)))
+
+
+# Modified DH: the translation and rotation that lead to joint i, and then from joint 7 to the flange.
+_PANDA_A = (0.0, 0.0, 0.0, 0.0825, -0.0825, 0.0, 0.088, 0.0)
+_PANDA_D = (0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0, 0.107)
+_PANDA_ALPHA = (0.0, -pi / 2, pi / 2, pi / 2, -pi / 2, pi / 2, pi / 2, 0.0)
+_PANDA_MASS = (4.970684, 0.646926, 3.228604, 3.587895, 1.225946, 1.666555, 0.735522)
+_PANDA_CENTRE = (
+    (3.875e-3, 2.081e-3, -0.04762), (-3.141e-3, -2.872e-2, 3.495e-3), (2.7518e-2, 3.9252e-2, -6.6502e-2),
+    (-5.317e-2, 1.04419e-1, 2.7454e-2), (-1.1953e-2, 4.1065e-2, -3.8437e-2), (6.0149e-2, -1.4117e-2, -1.0517e-2),
+    (1.0517e-2, -4.252e-3, 6.1597e-2),
+)  # fmt: skip
+# ixx, ixy, ixz, iyy, iyz, izz about the centre of mass [kg m²].
+_PANDA_INERTIA = (
+    (7.0337e-1, -1.39e-4, 6.772e-3, 7.0661e-1, 1.9169e-2, 9.117e-3),
+    (7.962e-3, -3.925e-3, 1.0254e-2, 2.811e-2, 7.04e-4, 2.5995e-2),
+    (3.7242e-2, -4.761e-3, -1.1396e-2, 3.6155e-2, -1.2805e-2, 1.083e-2),
+    (2.5853e-2, 7.796e-3, -1.332e-3, 1.9552e-2, 8.641e-3, 2.8323e-2),
+    (3.5549e-2, -2.117e-3, -4.037e-3, 2.9474e-2, 2.29e-4, 8.627e-3),
+    (1.964e-3, 1.09e-4, -1.158e-3, 4.354e-3, 3.41e-4, 5.433e-3),
+    (1.2516e-2, -4.28e-4, -1.196e-3, 1.0027e-2, -7.41e-4, 4.815e-3),
+)
+_PANDA_RADIUS = (0.06, 0.06, 0.06, 0.06, 0.055, 0.05, 0.045)  # [m]
+
+
+def panda() -> Robot:
+    """Return Franka's Panda, the arm with seven joints."""
+    joints = tuple(f"joint_{i}" for i in range(1, 8))
+    arm = with_ball(arm_from_modified_dh(_PANDA_A, _PANDA_D, _PANDA_ALPHA, joints))
+    limits = JointLimits(
+        np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]),
+        np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973]),
+        np.array([2.175] * 4 + [2.61] * 3),
+    )
+    inertia = np.array([[(xx, xy, xz), (xy, yy, yz), (xz, yz, zz)] for xx, xy, xz, yy, yz, zz in _PANDA_INERTIA])
+    radius, aside = np.array(_PANDA_RADIUS), np.zeros(7)
+    bodies = at_far_end(arm, np.array(_PANDA_CENTRE), inertia)
+    links = Links(np.array(_PANDA_MASS), *bodies, np.array([87.0] * 4 + [12.0] * 3), radius, aside, 3.0)
+    workspace = find_workspace(arm, (limits.lower, limits.upper), (radius, aside))
+    return Robot("panda", "Panda", PANDA_SOURCE, arm, limits, links, workspace)
