@@ -10,16 +10,17 @@ import typer
 import typer.main
 from rich.markup import escape
 
-from servobench.harness.cli import runs, show, studies
+from servobench.harness.cli import lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.options import INTERRUPTED, grouped
+from servobench.harness.cli.record import record
 from servobench.harness.cli.sweep import sweep
 
 INPUT_ERROR = 2  # exit code
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
-    "First steps": (runs.run, runs.compare, show.statistics, show.report, show.record),
-    "What there is": (show.plants, show.controllers, show.tasks),
+    "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
+    "What there is": (lists.plants, lists.controllers, lists.tasks),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
     "Tools": (runs.train, runs.collect),
 }

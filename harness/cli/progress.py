@@ -1,10 +1,11 @@
-"""What the commands that run batches show on their way."""
+"""What long commands show on their way: bars in a terminal, elsewhere a line now and then on standard error."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -23,6 +24,52 @@ from rich.text import Text
 
 from servobench.harness.batch.campaign import Observer, Row
 from servobench.harness.cli.options import INTERRUPTED
+
+FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
+
+
+class Lines:
+    """Tells on standard error how far a command is, in few lines: for pipes and files, in which a bar is no use."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._began = clock, clock()
+        self._due = self._began + FIRST_LINE
+
+    def tell(self, share: float, text: str) -> None:
+        """Write a line with the time left, unless one was written a moment ago.
+
+        Args:
+            share: how much is done, from 0 to 1.
+            text: what is told.
+        """
+        now = self._clock()
+        if now < self._due:
+            return
+        so_far = now - self._began
+        left = f", about {so_far * (1.0 - share) / share:.0f} s left" if 0.0 < share < 1.0 else ""
+        sys.stderr.write(f"{text}{left}\n")
+        sys.stderr.flush()
+        self._due = now + max(FIRST_LINE, LINE_SHARE * so_far)
+
+
+@contextlib.contextmanager
+def telling(console: Console, begin: str) -> Iterator[Callable[[float, str], None]]:
+    """Yield what shows the share that is done of something, and its name.
+
+    Args:
+        console: where it is shown, if that is a terminal.
+        begin: what is shown first.
+    """
+    lines = Lines()
+    with console.status(begin) as status:
+
+        def tell(share: float, what: str) -> None:
+            text = f"{what}: {100 * share:.0f} %"
+            status.update(text)
+            if not console.is_terminal:
+                lines.tell(share, text)
+
+        yield tell
 
 
 class RateColumn(ProgressColumn):
@@ -60,11 +107,16 @@ class ConsoleObserver(Observer):
         self._status: Status | None = console.status("checking the configuration")
         self._status.start()
         self._bar: Progress | None = None
+        self._lines, self._training = Lines(), Lines()
+        self._done = self._begun = self._total = 0
 
     def training(self, share: float, what: str) -> None:
         """Show how much of a training of networks is done."""
+        text = f"training networks once: {100 * share:3.0f} %, {what}"
         if self._status is not None:
-            self._status.update(f"training networks once: {100 * share:3.0f} %, {what}")
+            self._status.update(text)
+        if not self._console.is_terminal:
+            self._training.tell(share, text)
 
     def begin(self, total: int, done: int) -> None:
         """Show the bar."""
@@ -74,11 +126,16 @@ class ConsoleObserver(Observer):
         self._bar = run_progress(self._console, RateColumn())
         self._bar.add_task("running", total=total, completed=done)
         self._bar.start()
+        self._done, self._begun, self._total, self._lines = done, done, total, Lines()
 
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""
         if self._bar is not None:
             self._bar.advance(self._bar.task_ids[0], len(rows))
+        self._done += len(rows)
+        if not self._console.is_terminal:
+            share = (self._done - self._begun) / (self._total - self._begun)
+            self._lines.tell(share, f"{self._done} of {self._total} runs")
 
     def note(self, text: str) -> None:
         """Print a line."""

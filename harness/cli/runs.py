@@ -102,7 +102,7 @@ def train(
     """
     from rich.table import Table
 
-    from servobench.harness.cli.progress import run_progress
+    from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import cache_folder
@@ -110,12 +110,8 @@ def train(
 
     settings, controller = overrides.settings(), choose_controller(controller)
     settings.check_sections([*known_sections(), controller])
-    with run_progress(console) as progress:
-        bar = progress.add_task("training", total=1.0)
-        trained = train_networks(
-            controller, settings, lambda share, what: progress.update(bar, completed=share, description=what), robot
-        )
-        progress.update(bar, completed=1.0, description="done")
+    with telling(console, "training") as tell:
+        trained = train_networks(controller, settings, tell, robot)
     table = Table("network", "held-out error")
     table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
     table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")

@@ -2,19 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+import contextlib
+import signal
+import sys
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
 
 if TYPE_CHECKING:
     import pandas as pd
 
+TERMINATED = 128 + signal.SIGTERM  # exit code
+
 LEFT = ("controller", "mismatch", "noise", "latency", "period", "pair", "failures", "outcome")  # columns of words
 WHOLE = ("controller", "pair")  # columns whose words are not broken over lines
 UNBROKEN = ("outcome",)  # columns of which no word is broken
 
 console = Console()
+
+
+@contextlib.contextmanager
+def cleaning_up_when_terminated() -> Iterator[None]:
+    """Let SIGTERM end the command as Ctrl-C does, such that nothing half written and no other program is left."""
+
+    def stop(_number: int, _frame: object) -> NoReturn:
+        sys.stderr.write("servobench: terminated\n")
+        raise SystemExit(TERMINATED)
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -> None:

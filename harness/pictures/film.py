@@ -1,14 +1,12 @@
 """A moving picture of a run: the arm with the trails of ball and reference, the camera's view, the error below.
 
 Everything comes from the log through `harness.pictures.replay`. Frames are composed once and go to MP4 and GIF side by
-side; both are written by the ffmpeg that the optional extra `animation` brings.
+side (`harness.pictures.encoder`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from contextlib import ExitStack, closing, contextmanager
-from importlib import import_module
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,26 +17,29 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.draw import save_figure
+from servobench.harness.pictures.encoder import GIF, MP4, encoding, find_ffmpeg
 from servobench.harness.pictures.panels import mark_settling_band, plain_logarithms
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles
 from servobench.plant.bullet.detection import ByteArray
 from servobench.plant.checks import FloatArray
+from servobench.plant.robot.ur5 import BALL_RADIUS
 from servobench.plant.settings import suggest
 
-MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
+SNAPSHOTS = "snapshots"
+KINDS = (MP4, GIF, SNAPSHOTS)
 WIDTH, HEIGHT = 960, 736  # px of a frame; ffmpeg wants multiples of 16
 HEAD, VIEW_WIDTH, VIEW_HEIGHT = 32, 640, 480  # px: line of text on top, overview below it at the left
 SIDE = WIDTH - VIEW_WIDTH
 CAMERA_HEIGHT = 240  # px
 MAX_RATE = 25.0  # frames a second
-GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
 FINENESS = 1.25  # pixels rendered for one pixel of the overview, along each side
 REFERENCE_COLOUR, REFERENCE_HEX = (40, 40, 40), "#282828"
 SNAPSHOT_COUNT = 8
+MIN_ADVANCE = 0.01  # of the extent of the ball's path: shorter ways are the jitter of an arm at rest
+CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: it is seen around the ball
 CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
 
 
@@ -66,8 +67,8 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
         ConfigurationError: the extra `animation` is missing, or ffmpeg cannot write.
     """
     paths = []
-    films = [kind for kind in kinds if kind != SNAPSHOTS]
-    ffmpeg = _ffmpeg() if films else None
+    films = [stem.with_name(f"{stem.name}.{kind}") for kind in kinds if kind != SNAPSHOTS]
+    ffmpeg = find_ffmpeg(f"--kinds {SNAPSHOTS} works without it") if films else None
     if SNAPSHOTS in kinds:
         progress(0.0, "snapshots")
         with figure_style():
@@ -78,34 +79,30 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
     stem.parent.mkdir(parents=True, exist_ok=True)
     step, rate = _frame_rate(run.track.time)
     board, count = _Board(run), len(run.track.table)
-    try:
-        with ExitStack() as stack:
-            replay, writers = stack.enter_context(Replay(run, fineness=FINENESS)), []
-            for kind in films:
-                paths.append(stem.with_name(f"{stem.name}.{kind}"))
-                writers.append(stack.enter_context(_writer(ffmpeg, kind, paths[-1], rate)))
-            for k in range(0, count, step):
-                progress(k / count, "frames")
-                frame = board.compose(replay, k)
-                for writer in writers:
-                    writer.send(frame)
-    except OSError as error:
-        raise ConfigurationError(f"ffmpeg cannot write {paths[-1]}: {' '.join(str(error).split())}") from error
-    return paths
+    with ExitStack() as stack:
+        writers = [stack.enter_context(encoding(ffmpeg, film, (WIDTH, HEIGHT), rate)) for film in films]
+        replay = stack.enter_context(Replay(run, fineness=FINENESS))
+        for k in range(0, count, step):
+            progress(k / count, "frames")
+            frame = board.compose(replay, k)
+            for write in writers:
+                write(frame)
+        progress(1.0, "encoding")
+    return paths + films
 
 
 def draw_snapshots(run: LoggedRun) -> Figure:
-    """Draw the arm at eight places of its first lap, or of the whole run (the paper's figure 8), even in time."""
+    """Draw the arm in eight instants of its first lap, or of the whole run, at equal progress (paper, fig. 8)."""
     figure = Figure(figsize=(11.0, 4.7), layout="constrained")
-    chosen = np.linspace(0, _lap(run), SNAPSHOT_COUNT).round().astype(int)
     panels = figure.subplots(2, SNAPSHOT_COUNT // 2).ravel()
+    for axes in panels:
+        axes.set_axis_off()
     with Replay(run, fineness=2.0) as replay:
-        for axes, k in zip(panels, chosen.tolist(), strict=True):
+        for axes, k in zip(panels, snapshot_instants(run.ball[: _lap(run) + 1], SNAPSHOT_COUNT), strict=False):
             replay.place(k)
             axes.imshow(replay.overview(_trails(run, k)), interpolation="antialiased")
             axes.set_title(f"{run.track.time[k]:.2f} s")
-            axes.set_axis_off()
-    figure.suptitle(f"{_title(run)}: trail of the ball in colour, desired path in black")
+    figure.suptitle(f"{_title(run)}: trail of the ball in colour, {_desired(run)} in black")
     return figure
 
 
@@ -133,7 +130,7 @@ class _Board:
             self._numbers = figure.text(left, top - 0.06, "", fontsize=13, va="top", family="monospace", animated=True)
             lines = [
                 mpl.lines.Line2D([], [], color=self._style.colour, linewidth=3, label="ball, so far"),
-                mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label="desired path"),
+                mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label=_desired(run)),
             ]
             figure.legend(handles=lines, loc="upper left", bbox_to_anchor=(left - 0.012, top - 0.17), frameon=False)
             self._canvas.draw()
@@ -166,7 +163,7 @@ class _Board:
         if len(positive):
             plain_logarithms(axes)
             axes.set_ylim(np.fmin(0.8 * positive.min(), 0.6 * band), 1.3 * np.fmax(positive.max(), band))
-        axes.set_xlim(0.0, max(float(track.time[-1]), 1e-3))
+        axes.set_xlim(track.time[0], max(float(track.time[-1]), track.time[0] + 1e-3))
         mark_settling_band(axes, track)
         for line in axes.get_lines():
             axes.annotate(str(line.get_label()), (0.995, band), xycoords=("axes fraction", "data"), fontsize=8,
@@ -185,9 +182,39 @@ def _trails(run: LoggedRun, k: int) -> list[Trail]:
     """Return the desired path, or a cross at a fixed target, and the ball's path up to period `k`."""
     red, green, blue = (round(255 * part) for part in mpl.colors.to_rgb(_style(run).colour))
     desired = run.reference[run.moved_from :] if k >= run.moved_from else run.reference[: run.moved_from]
-    cross = [desired[0] + np.stack([-arm, arm]) for arm in 0.03 * np.eye(3)]
+    cross = [desired[0] + np.stack([-arm, arm]) for arm in CROSS * np.eye(3)]
     lines = cross if run.track.point_to_point else [desired]
     return [*(Trail(line, REFERENCE_COLOUR, 2) for line in lines), Trail(run.ball[: k + 1], (red, green, blue), 3)]
+
+
+def _desired(run: LoggedRun) -> str:
+    return "target" if run.track.point_to_point else "desired path"
+
+
+def snapshot_instants(ball: FloatArray, count: int) -> list[int]:
+    """Return up to `count` different periods, in order, between which the ball goes equally far.
+
+    The first is that of the start, the last that in which the ball arrives: what it does in a place counts as no way.
+
+    Args:
+        ball: its path (k, 3) [m].
+        count: how many periods are wanted, two or more; there are fewer if the run has fewer.
+    """
+    least = MIN_ADVANCE * float(np.linalg.norm(np.ptp(ball, axis=0)))
+    way, place, count = np.zeros(len(ball)), ball[0], min(count, len(ball))
+    for k, point in enumerate(ball):
+        advance = float(np.linalg.norm(point - place))
+        counts = advance > least
+        way[k] = way[k - 1] + advance * counts if k else 0.0
+        place = point if counts else place
+    if way[-1] == 0.0:  # the arm rests throughout
+        return [round(k) for k in np.linspace(0, len(ball) - 1, count)]
+    chosen = [int(k) for k in np.searchsorted(way, np.linspace(0.0, 1.0, count) * way[-1] * (1.0 - 1e-12))]
+    for i in range(1, count):  # apart, where one period takes the ball far
+        chosen[i] = max(chosen[i], chosen[i - 1] + 1)
+    for i in reversed(range(count)):
+        chosen[i] = min(chosen[i], len(ball) - count + i)
+    return chosen
 
 
 def _lap(run: LoggedRun) -> int:
@@ -209,33 +236,3 @@ def _frame_rate(time: FloatArray) -> tuple[int, float]:
     period = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     step = max(1, round(1.0 / (MAX_RATE * period)))
     return step, 1.0 / (step * period)
-
-
-def _ffmpeg() -> Any:  # noqa: ANN401 - the optional package has no types
-    try:
-        ffmpeg = import_module("imageio_ffmpeg")
-        ffmpeg.get_ffmpeg_exe()
-    except ImportError as error:
-        raise ConfigurationError(f"{missing_extra(error, 'a film')}; --kinds {SNAPSHOTS} works without it") from error
-    except RuntimeError as error:
-        raise ConfigurationError(f"no ffmpeg for mp4 and gif, --kinds {SNAPSHOTS} works without it: {error}") from error
-    return ffmpeg
-
-
-@contextmanager
-def _writer(ffmpeg: Any, kind: str, path: Path, rate: float) -> Iterator[Generator[None, ByteArray, None]]:  # noqa: ANN401
-    """Yield a generator that sends each frame to ffmpeg, which writes the file."""
-    if kind == MP4:
-        quality = ["-crf", "22", "-preset", "medium", "-movflags", "+faststart"]
-        options = {"codec": "libx264", "quality": None, "output_params": quality, "macro_block_size": 16}
-    else:
-        # One palette for the whole film, no dithering, and only the rectangle that changed: a still background is free.
-        chain = (
-            f"fps={min(float(GIF_RATE), rate):g},scale={GIF_WIDTH}:-1:flags=area,split[a][b];"
-            "[a]palettegen=max_colors=128:stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
-        )
-        options = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "macro_block_size": 1,
-                   "output_params": ["-filter_complex", chain]}  # fmt: skip
-    with closing(ffmpeg.write_frames(str(path), (WIDTH, HEIGHT), fps=rate, **options)) as writer:
-        writer.send(None)
-        yield writer

@@ -7,6 +7,7 @@ simulated: each frame has the logged joint positions, and the ball is detected i
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, fields, replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame: from the front right, down to the workspace
 OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
+ROUNDING = 1e-6  # [s] by which an instant may lie outside a stretch
 HIDDEN_OPACITY = 0.3  # of the parts of a trail that are hidden
 
 
@@ -107,6 +109,29 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         return np.concatenate([model.to_base(points[:moved_from]), later])
 
     return LoggedRun(track, model, moved, moved_from, config, q, in_base(ball), in_base(track.vectors("reference_")))
+
+
+def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:
+    """Return the part of a run that begins at `begin` and is `length` long [s], or goes to its end.
+
+    Raises:
+        ConfigurationError: nothing of the run lies there.
+    """
+    time = run.track.time
+    end = math.inf if length is None else begin + length
+    inside = np.flatnonzero((time >= begin - ROUNDING) & (time <= end + ROUNDING))
+    if not len(inside):
+        raise ConfigurationError(f"run {run.track.row['run_id']} has no instant from {begin:g} to {end:g} s: it goes "
+                                 f"from {time[0]:g} to {time[-1]:g} s")  # fmt: skip
+    part = slice(inside[0], inside[-1] + 1)
+    return replace(
+        run,
+        track=Track(run.track.row, run.track.table.iloc[part].reset_index(drop=True)),
+        moved_from=max(0, run.moved_from - int(inside[0])),
+        joint_position=run.joint_position[part],
+        ball=run.ball[part],
+        reference=run.reference[part],
+    )
 
 
 class Replay:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -10,14 +13,16 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
-from kit.command import servobench
+from kit.command import finish, servobench, start, wait_for
 from kit.plants import NEEDS_BULLET
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.pictures import film
-from servobench.harness.pictures.replay import Replay, Trail, logged_run
+from servobench.harness.pictures import encoder, film
+from servobench.harness.pictures.replay import Replay, Trail, logged_run, stretch
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
@@ -106,11 +111,95 @@ def test_films_last_as_long_as_the_run_and_the_gif_is_small(films):
     assert (frames, seconds) == (40, pytest.approx(2.0, abs=0.05))
     with Image.open(paths[3]) as gif:
         assert gif.n_frames == 20
-        assert gif.size[0] == film.GIF_WIDTH
+        assert gif.size[0] == encoder.GIF_WIDTH
     assert paths[3].stat().st_size < 6e6 * 2.0 / 20.0
     shares = [share for share, what in told if what == "frames"]
     assert shares == sorted(shares)
     assert len(shares) == 40
+
+
+@pytest.fixture(scope="module")
+def move():
+    made = run_experiment(RunRequest("kinematic", "calibrated", "exp2", "moderate", 3), Settings())
+    return logged_run(made.row, made.steps, {})
+
+
+def test_snapshots_of_a_move_show_eight_places_and_not_the_arm_at_rest(move):
+    chosen = film.snapshot_instants(move.ball, 8)
+    time = move.track.time[chosen]
+    assert time[0] == 0.0
+    assert 0.5 < time[-1] < 3.0 < move.track.time[-1]
+    ways = np.linalg.norm(np.diff(move.ball[chosen], axis=0), axis=1)
+    assert ways.min() > 0.02
+
+
+def test_snapshots_are_equally_far_apart_along_the_way():
+    time = np.linspace(0.0, 1.0, 1001)
+    ball = np.stack([time**3, 0.0 * time, 0.0 * time], axis=-1)  # it gets faster and faster
+    chosen = film.snapshot_instants(ball, 5)
+    np.testing.assert_allclose(ball[chosen, 0], [0.0, 0.25, 0.5, 0.75, 1.0], atol=0.012)
+
+
+@given(st.integers(1, 30), st.integers(2, 12), st.integers(0, 2**31))
+def test_snapshots_are_different_instants_in_order_whatever_the_ball_does(periods, count, seed):
+    generator = np.random.default_rng(seed)
+    ball = generator.normal(size=(periods, 3)) * generator.choice([0.0, 1.0, 100.0], size=(periods, 1))
+    chosen = film.snapshot_instants(ball, count)
+    assert len(chosen) == min(count, periods)
+    assert sorted(set(chosen)) == chosen
+    assert 0 == chosen[0] <= chosen[-1] < periods
+
+
+def test_a_stretch_of_a_run_keeps_its_times_and_rows(run):
+    part = stretch(run, 0.5, 1.0)
+    assert part.track.time.tolist() == run.track.time[10:31].tolist()
+    assert part.ball.tolist() == run.ball[10:31].tolist()
+    assert part.moved_from == run.moved_from - 10
+    assert stretch(run, 0.0, None).track.table.equals(run.track.table)
+    with pytest.raises(ConfigurationError, match="has no instant from 3 to 4 s: it goes from 0 to 1.95 s"):
+        stretch(run, 3.0, 1.0)
+
+
+def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch):
+    pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
+    started = []
+    popen = subprocess.Popen
+    monkeypatch.setattr(encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+
+    def interrupt(share, what):
+        if share > 0.2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        film.write_recording(run, tmp_path / "run", ("mp4", "gif"), interrupt)
+    assert list(tmp_path.iterdir()) == []
+    assert len(started) == 2
+    assert all(process.poll() is not None for process in started)
+
+
+def write_frames(path):
+    with encoder.encoding(encoder.find_ffmpeg(""), path, (64, 48), 10.0) as write:
+        for _ in range(100):
+            write(np.zeros((48, 64, 3), np.uint8))
+
+
+def test_a_film_that_ffmpeg_cannot_write_is_one_line_with_its_reason(tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
+    target = tmp_path / "none" / "run.mp4"
+    with pytest.raises(ConfigurationError, match=r"ffmpeg cannot write .*run.mp4: .*No such file or directory"):
+        write_frames(target)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_recording_says_so_and_leaves_nothing(tmp_path, folder, number, code):
+    process = start("record", str(folder), "--kinds", "gif", "--out", str(tmp_path))
+    wait_for(lambda: any(tmp_path.iterdir()))
+    os.kill(process.pid, number)
+    ended, output = finish(process)
+    assert ended == code, output
+    assert output.splitlines()[-1] == f"servobench: {'interrupted' if code == 130 else 'terminated'}"
+    assert "Traceback" not in output
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_snapshots_go_once_around(run):

@@ -1,0 +1,125 @@
+"""The command `servobench record`: films and snapshots of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servobench.harness.cli.options import split_names
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console
+
+if TYPE_CHECKING:
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.pictures.replay import LoggedRun
+
+RECORDED = {
+    "plant": "bullet",
+    "controller": "rbfnn_mfac",
+    "task": "circle",
+    "mismatch": "moderate",
+    "robot": "ur5",
+    "seed": 0,
+}
+RECORDINGS = "recordings"
+
+
+def _new(what: str) -> str:
+    return f"New run: {what}, default {RECORDED[what]}."
+
+
+def record(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
+    ] = None,
+    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+    plant: Annotated[str | None, typer.Option(help=_new("plant"))] = None,
+    controller: Annotated[str | None, typer.Option(help=_new("controller"))] = None,
+    task: Annotated[str | None, typer.Option(help=_new("task"))] = None,
+    mismatch: Annotated[str | None, typer.Option(help=_new("mismatch"))] = None,
+    robot: Annotated[str | None, typer.Option(help=_new("robot"))] = None,
+    seed: Annotated[int | None, typer.Option(help=_new("seed"))] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None,
+    kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    begin: Annotated[float, typer.Option(min=0.0, help="Where in the run the film begins [s].")] = 0.0,
+    length: Annotated[
+        float | None, typer.Option(min=0.001, help="How long the film is [s]; default: to the run's end.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the films; default recordings below the results folder.")
+    ] = None,
+) -> None:
+    """Show a run as film (MP4, GIF) and snapshots.
+
+    They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
+    """
+    from servobench.harness.cli.progress import telling
+    from servobench.harness.config.extras import check_installed
+    from servobench.harness.config.settings import ConfigurationError, read_settings
+    from servobench.harness.pictures.film import KINDS, find_kind, write_recording
+    from servobench.harness.pictures.replay import stretch
+
+    wanted = split_names("kinds", kinds, KINDS, find_kind)
+    check_installed(("pybullet",), "a film of the rendered arm")
+    new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "robot": robot, "seed": seed}
+    given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
+    with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
+        if folder is not None:
+            if given:
+                raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+            shown = _run_of(folder, run)
+        else:
+            if run is not None:
+                raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+            chosen = {name: value for name, value in new.items() if value is not None}
+            shown = _new_run(RECORDED | chosen, read_settings(config, set_ or []))
+        paths = write_recording(
+            stretch(shown, begin, length),
+            (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"]),
+            wanted,
+            tell,
+        )
+    for path in paths:
+        console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False)
+
+
+def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
+    """Return a run of a results folder; without a name the only one."""
+    from servobench.harness.batch import results
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.pictures.replay import logged_run
+    from servobench.plant.settings import suggest
+
+    runs = results.load_runs(folder)
+    names = runs["run_id"].tolist()
+    if run_id is None and len(names) > 1:
+        raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")
+    chosen = run_id or names[0]
+    if chosen not in names:
+        raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
+    row = {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
+    configuration = results.read_manifest(folder).get("configuration", {})
+    return logged_run(row, results.load_steps(folder, [chosen]), configuration.get("bullet", {}))
+
+
+def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
+    """Carry out a run to be shown."""
+    from servobench.harness.config.registry import choose_controller
+    from servobench.harness.config.settings import ConfigurationError, flatten
+    from servobench.harness.pictures.replay import logged_run
+    from servobench.harness.run.episode import run_experiment
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolved import known_sections
+    from servobench.plant.bullet.bullet_plant import BulletConfig
+
+    chosen = {"mismatch": read_mismatch(asked["mismatch"]), "controller": choose_controller(asked["controller"])}
+    request = RunRequest(**asked | chosen)
+    if request.seed < 0:
+        raise ConfigurationError(f"seed must not be negative, got {request.seed}")
+    settings.check_sections([*known_sections(), request.plant, request.controller])
+    result = run_experiment(request, settings)
+    return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", BulletConfig())))

@@ -1,0 +1,61 @@
+"""Lines about long commands, for pipes and files."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from servobench.harness.cli import progress
+from servobench.harness.cli.progress import FIRST_LINE, ConsoleObserver, Lines, telling
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(progress, "Lines", lambda: Lines(clock))
+    return clock
+
+
+def piped():
+    return Console(file=io.StringIO(), force_terminal=False)
+
+
+def test_short_work_is_silent_and_long_work_tells_the_time_left(capsys, clock):
+    with telling(piped(), "reading") as tell:
+        for percent in range(101):
+            tell(percent / 100, "frames")
+            clock.now += 0.01 * FIRST_LINE
+        assert capsys.readouterr().err == ""
+        clock.now = 100.0 + 2 * FIRST_LINE
+        tell(0.25, "frames")
+    assert capsys.readouterr().err == f"frames: 25 %, about {6 * FIRST_LINE:.0f} s left\n"
+
+
+def test_a_long_night_is_few_lines(capsys):
+    clock = Clock()
+    lines = Lines(clock)
+    for k in range(8 * 3600):
+        clock.now += 1.0
+        lines.tell(k / (8 * 3600), "runs")
+    assert 50 < capsys.readouterr().err.count("\n") < 100
+
+
+def test_a_batch_tells_its_runs_in_a_pipe_and_draws_a_bar_in_a_terminal(capsys, clock):
+    for terminal, wanted in ((False, "60 of 100 runs, about 40 s left\n"), (True, "")):
+        console = Console(file=io.StringIO(), force_terminal=terminal)
+        observer = ConsoleObserver(console)
+        observer.begin(100, 50)
+        clock.now += 10.0
+        observer.finished([{}] * 10)
+        observer.close()
+        assert capsys.readouterr().err == wanted
