@@ -10,10 +10,9 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from page_studies.audit_lines import ABLATION, ENDS, HARD, LONG, OLD_HARD, RATES, THEN, TUNING, WORLDS, Line
+from page_studies.audit_lines import ABLATION, ENDS, HARD, LONG, OLD_HARD, RATES, SUCCESSOR, THEN, TUNING, WORLDS, Line
 from page_studies.held_out import LOST
 from page_studies.methods import (
-    BETTER,
     MOVE,
     count_and_median,
     difference,
@@ -175,7 +174,7 @@ def other_table(folder: Path) -> pd.DataFrame:
            ("ukf_mpc:published", "ukf_mfac:published"), "settling_time_s", MOVE, 1.0)
           for task, old in (("exp2", "−0.00 [−0.03, 0.05]"), ("exp3", "−0.28 [−0.40, −0.20]"))),
         *((f"torque limits halved on `bullet`, `{name}`, s", "0", motors, (f"{name} weak_motors", f"{name} bullet"),
-           "settling_time_s", MOVE, 1.0) for name in (BETTER, "rbf_pid:published")),
+           "settling_time_s", MOVE, 1.0) for name in (SUCCESSOR, "rbf_pid:published")),
     )  # fmt: skip
     rows = []
     for words, old, runs, pair, metric, never, factor in cases:
@@ -197,7 +196,7 @@ ENDLESS: Final = (
     "--tasks", "endurance", "--seeds", "9300:9301", "--no-report",
 )  # fmt: skip
 WEAK: Final = ("--set", "bullet.drives.torque_limit=[75.0, 75.0, 75.0, 14.0, 14.0, 14.0]")
-RENDERED: Final = ("bullet", (BETTER, "rbf_pid:published"), "random", "9100:9112", "--set", "bullet.scenery=false")
+RENDERED: Final = ("bullet", (SUCCESSOR, "rbf_pid:published"), "random", "9100:9112", "--set", "bullet.scenery=false")
 AUDIT: Final = Study(
     "audit",
     "the tables of the audit of 0.1.0, then and now",
