@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 UNIT := tests/plant tests/controllers tests/fmus tests/harness
 RUNS ?= results/pages
 
-.PHONY: run check test results nightly lint format docs benchmark lock clean
+.PHONY: run check test results nightly lint format tables docs release benchmark lock clean
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
@@ -40,8 +40,16 @@ format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 
 # Write the generated tables of the pages anew from the code and from docs/tables.
-docs: $(VENV)/ready
+tables: $(VENV)/ready
 	$(BIN)/python docs/generated_tables.py
+
+# The same, and the pages as a site: build/site/index.html. A broken link or any other warning is an error.
+docs: tables
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs build/site
+
+# Build wheel and source distribution into dist, check them, install each alone in a fresh environment and make a run.
+release: $(VENV)/ready
+	$(BIN)/python .ci/release.py
 
 # Write docs/performance.md and its pictures: a quarter of an hour on two quiet processors. AGAINST="0.1.0=/path" adds a checkout.
 benchmark: $(VENV)/ready

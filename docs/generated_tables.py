@@ -1,6 +1,6 @@
 """Writes the generated parts of the pages: settings, methods, variables of the exported FMU, and measured tables.
 
-    make docs
+    make tables
 
 A generated part of a page is everything between two comments, of which the first says what belongs there:
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+import subprocess
 import sys
 import tomllib
 
 import pytest
 from typer.testing import CliRunner
 
+from kit import console
 from kit.documents import DOCS, PAGES, PLACE, ROOT, anchors, blocks, find, names, read, section, tables
 from kit.foreign_fmu import build_crane
 from servobench.controllers.parts import ESTIMATORS, LAWS
@@ -21,6 +23,7 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.tasks import TASKS
 
+DEEPER = sorted((ROOT / "docs" / "claims").glob("*.md"))
 PLACES = sorted({match.groups() for page in DOCS for match in PLACE.finditer(page.read_text(encoding="utf-8"))})
 
 
@@ -41,8 +44,27 @@ def test_every_relative_link_leads_somewhere(page):
 
 
 def test_the_pages_do_link():
-    assert {"docs/methods.md", "docs/plants.md", "docs/results.md"} <= set(links(PAGES[0].read_text(encoding="utf-8")))
+    assert {"docs/five_minutes.md", "docs/limitations.md", "docs/results.md"} <= set(
+        links(PAGES[0].read_text(encoding="utf-8"))
+    )
     assert sum(len(links(page.read_text(encoding="utf-8"))) for page in DOCS) > 30
+
+
+SESSIONS = [page for page in PAGES if "```console\n" in page.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("page", SESSIONS, ids=[page.stem for page in SESSIONS])
+def test_what_a_page_says_that_commands_print_is_what_they_print(page, monkeypatch, capsys, tmp_path):
+    console.carry_out(page.read_text(encoding="utf-8"), monkeypatch, capsys, tmp_path)
+
+
+def test_another_output_than_that_of_the_page_is_found():
+    told, printed = console.plain("a 1\n...\n c 3 99\n"), console.plain("a 1\nb\n c 3 7\n")
+    console.compare("it", told, printed)
+    with pytest.raises(AssertionError, match="does not print 'c 4'"):
+        console.compare("it", console.plain("a 1\n...\n c 4 99\n"), printed)
+    with pytest.raises(AssertionError, match="also prints"):
+        console.compare("it", told[:1], printed)
 
 
 @pytest.mark.parametrize(("path", "name"), PLACES, ids=[f"{path}:{name}" for path, name in PLACES])
@@ -129,6 +151,19 @@ def test_the_mapping_of_the_example_closes_a_loop_on_an_fmu(tmp_path):
     assert result.row["settling_time_s"] < 8.0
     assert (result.steps["feature_x_m"] == result.steps["true_feature_x_m"]).all()
     assert "joint_position_luff_rad" in result.steps
+
+
+def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
+    pytest.importorskip("sphinx", reason="the extra docs is not installed")
+    command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", "-b", "html"]
+    done = subprocess.run([*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    index = (tmp_path / "index.html").read_text(encoding="utf-8")
+    places = [page.relative_to(ROOT / "docs").with_suffix(".html").as_posix() for page in (*DOCS, *DEEPER)]
+    assert [place for place in places if f'href="{place}"' not in index] == ["index.html"]
+    assert index.index(">Limitations<") < index.index(">Five minutes<")
+    api = (tmp_path / "api.html").read_text(encoding="utf-8")
+    assert all(f'id="servobench.{name}"' in api for name in ("run", "compare", "load", "Controller", "Command"))
 
 
 def test_the_lines_that_load_results_run(tmp_path, monkeypatch, capsys):

@@ -51,7 +51,7 @@ def test_all_settings_have_a_table_and_nothing_else_has():
 
 @pytest.mark.parametrize("page", generated_tables.PAGES, ids=lambda page: page.name)
 def test_the_generated_parts_of_a_page_are_up_to_date(page):
-    assert generated_tables.renewed(page) == page.read_text(encoding="utf-8"), "run make docs"
+    assert generated_tables.renewed(page) == page.read_text(encoding="utf-8"), "run make tables"
 
 
 def test_the_presets_differ_from_their_parts_only_where_it_is_told():

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / ".ci"))
+import release  # noqa: E402 - a script beside the package
+
 FOLDERS = ("plant", "controllers", "fmus", "harness")
 CODE = (".py", ".toml", ".c", ".h", ".j2", ".urdf", ".yaml")
 
@@ -55,6 +58,54 @@ def test_the_source_distribution_makes_the_same_wheel(wheel_names, tmp_path):
     (source,) = (tmp_path / "source").iterdir()
     with zipfile.ZipFile(build(source, "wheel", tmp_path / "again")) as wheel:
         assert set(wheel.namelist()) == wheel_names
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return release.build(tmp_path_factory.mktemp("dist"))
+
+
+def test_the_files_of_a_release_have_no_faults(files):
+    wheel, source = files
+    assert release.faults_of_wheel(wheel) == release.faults_of_source(source) == []
+    assert release.faults_of_versions(wheel, ROOT) == []
+
+
+def test_a_wheel_that_lacks_a_file_or_holds_others_is_refused(files, tmp_path):
+    broken = tmp_path / files[0].name
+    with zipfile.ZipFile(files[0]) as wheel, zipfile.ZipFile(broken, "w") as made:
+        for name in wheel.namelist():
+            if name != "servobench/py.typed":
+                made.writestr(name, wheel.read(name).replace(b"text/markdown", b"text/plain"))
+        made.writestr("plant/signals.py", "")
+        made.writestr("servobench/tests/test_it.py", "")
+    assert release.faults_of_wheel(broken) == [
+        f"{broken.name} lacks servobench/py.typed",
+        f"{broken.name} holds servobench/tests/test_it.py",
+        f"{broken.name} installs plant, servobench, wanted servobench alone",
+        f"{broken.name} does not say that its description is Markdown",
+    ]
+
+
+def test_a_source_distribution_without_tests_is_refused(files, tmp_path):
+    broken = tmp_path / "bare.tar.gz"
+    with tarfile.open(files[1]) as source, tarfile.open(broken, "w:gz") as made:
+        for member in source.getmembers():
+            if "/tests" not in member.name:
+                made.addfile(member, source.extractfile(member) if member.isfile() else None)
+    assert release.faults_of_source(broken) == ["bare.tar.gz lacks tests/conftest.py"]
+
+
+def test_another_version_in_the_citation_is_told(files, tmp_path):
+    for name in ("pyproject.toml", "CITATION.cff"):
+        (tmp_path / name).write_text((ROOT / name).read_text(encoding="utf-8").replace("\nversion: ", "\nversion: 9."))
+    (fault,) = release.faults_of_versions(files[0], tmp_path)
+    assert fault.startswith("CITATION.cff says version 9.")
+
+
+def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
+    with pytest.raises(SystemExit, match="exit code 3"):
+        release.quiet(Path(sys.executable), "-c", "raise SystemExit(3)", folder=tmp_path)
 
 
 def test_the_package_is_a_command():

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
+
 from servobench.plant.bullet.engine import BANNER, without_banner
 
 

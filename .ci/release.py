@@ -1,0 +1,146 @@
+"""Rehearses a release: builds both files, checks them, installs each alone in a fresh environment and makes a run.
+
+    python .ci/release.py [--dist dist] [--python python3.13]
+
+What it leaves in the folder of `--dist` is what would be uploaded. Nothing is uploaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tarfile
+import tempfile
+import time
+import tomllib
+import zipfile
+from email.message import Message
+from email.parser import HeaderParser
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "servobench"
+NEEDED = ("py.typed", "__main__.py", "plant/signals.py", "harness/cli/main.py", "harness/notebooks/analysis.ipynb")
+UNWANTED = (".pyc", ".fmu", "/.venv/", "/results/", "/tests/")  # in a wheel
+IN_SOURCE = (
+    "pyproject.toml",
+    "Makefile",
+    "README.md",
+    "LICENSE",
+    "CHANGELOG.md",
+    "requirements.lock",
+    "tests/conftest.py",
+)
+RUN = ("run", "--plant", "kinematic", "--set", "exp2.duration=1", "--out")
+
+
+def main() -> None:
+    """Carry the rehearsal out; the first thing that is wrong ends it with exit code 1."""
+    parser = argparse.ArgumentParser(description="Rehearse a release.")
+    parser.add_argument("--dist", type=Path, default=ROOT / "dist", help="folder for the files")
+    parser.add_argument("--python", default=sys.executable, help="interpreter of the fresh environment")
+    asked = parser.parse_args()
+    wheel, source = build(asked.dist)
+    faults = [*faults_of_wheel(wheel), *faults_of_source(source), *faults_of_versions(wheel, ROOT)]
+    if faults:
+        sys.exit("\n".join(f"release: {fault}" for fault in faults))
+    with tempfile.TemporaryDirectory(prefix=f"{PACKAGE}-release-") as folder:
+        python = fresh_environment(asked.python, Path(folder))
+        for file, options in ((wheel, ["--only-binary", ":all:"]), (source, ["--no-deps", "--force-reinstall"])):
+            began = time.monotonic()
+            quiet(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *options, str(file))
+            print(f"{file.name}: installed in {time.monotonic() - began:.0f} s, {describe(python)}")  # noqa: T201
+            rehearse(python, Path(folder) / f"run of {file.name}")
+    print(f"release: {wheel.name} and {source.name} install and run from the files alone")  # noqa: T201
+
+
+def build(dist: Path) -> tuple[Path, Path]:
+    """Build wheel and source distribution into a folder and return their paths."""
+    for old in dist.glob(f"{PACKAGE}-*"):
+        old.unlink()
+    quiet(Path(sys.executable), "-m", "hatchling", "build", "-d", str(dist.resolve()))
+    (wheel,), (source,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
+    return wheel, source
+
+
+def faults_of_wheel(path: Path) -> list[str]:
+    """Return what is wrong with the names of files and the metadata of a wheel."""
+    with zipfile.ZipFile(path) as wheel:
+        names = set(wheel.namelist())
+    faults = [f"{path.name} lacks {PACKAGE}/{name}" for name in NEEDED if f"{PACKAGE}/{name}" not in names]
+    faults += [f"{path.name} holds {name}" for name in sorted(names) if any(word in f"/{name}" for word in UNWANTED)]
+    top = {name.partition("/")[0] for name in names if ".dist-info/" not in name}
+    if top != {PACKAGE}:
+        faults.append(f"{path.name} installs {', '.join(sorted(top))}, wanted {PACKAGE} alone")
+    told = metadata(path)
+    faults += [f"{path.name} has no {key}" for key in ("Requires-Python", "License-Expression") if not told[key]]
+    if told["Description-Content-Type"] != "text/markdown":
+        faults.append(f"{path.name} does not say that its description is Markdown")
+    return faults
+
+
+def faults_of_source(path: Path) -> list[str]:
+    """Return what a source distribution lacks."""
+    with tarfile.open(path) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    return [f"{path.name} lacks {name}" for name in IN_SOURCE if name not in names]
+
+
+def faults_of_versions(wheel: Path, root: Path) -> list[str]:
+    """Return where another version is told than in the wheel."""
+    version = metadata(wheel)["Version"]
+    told = {
+        "pyproject.toml": tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"],
+        "CITATION.cff": next(
+            line.partition(":")[2].strip()
+            for line in (root / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+            if line.startswith("version:")
+        ),
+    }
+    return [f"{file} says version {found}, the wheel {version}" for file, found in told.items() if found != version]
+
+
+def metadata(wheel: Path) -> Message:
+    """Return the metadata of a wheel."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return HeaderParser().parsestr(archive.read(name).decode())
+
+
+def fresh_environment(python: str, folder: Path) -> Path:
+    """Make an empty environment below a folder and return its interpreter."""
+    subprocess.run([python, "-m", "venv", str(folder / "environment")], check=True)
+    return folder / "environment" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def describe(python: Path) -> str:
+    """Return how much an environment holds."""
+    listed = quiet(python, "-m", "pip", "list", "--disable-pip-version-check", "--format", "freeze").splitlines()
+    size = sum(path.stat().st_size for path in python.parents[1].rglob("*") if path.is_file() and not path.is_symlink())
+    return f"{len(listed)} packages, {size / 1e6:.0f} MB"
+
+
+def rehearse(python: Path, folder: Path) -> None:
+    """Make a run in an empty folder with what is installed."""
+    folder.mkdir()
+    quiet(python, "-m", PACKAGE, "--version", folder=folder)
+    quiet(python, "-m", PACKAGE, *RUN, "out", folder=folder)
+    if not (folder / "out" / "runs.parquet").is_file():
+        sys.exit(f"release: the run left no table in {folder / 'out'}")
+
+
+def quiet(python: Path, *words: str, folder: Path = ROOT) -> str:
+    """Run Python without the checkout on its path and return its output; a failure ends the rehearsal with it."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(python), *words], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        sys.exit(f"release: {' '.join(words)}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Carries out the console sessions that pages show, and compares what they print with what the page says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+from kit.command import servobench
+from kit.documents import FENCED
+
+SAVED = re.compile(r"`([\w/]+\.\w+)`:\s*$")  # the line before a block that is a file
+PROMPT = "$ "
+PROGRESS = re.compile(r"^(running|training)\b.*[━╸]|^report: ")  # times and sizes differ
+CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")  # the last column of a table of runs: microseconds of wall clock
+
+
+def steps(text):
+    """Yield what a page asks for in order: ("file", name, content) or ("command", words, lines that it prints)."""
+    end = 0
+    for match in FENCED.finditer(text):
+        before, end = text[end : match.start()].rstrip(), match.end()
+        if match[1] == "console":
+            for session in re.split(r"^\$ ", match[2], flags=re.MULTILINE)[1:]:
+                command, _, printed = session.partition("\n")
+                while command.endswith("\\"):
+                    further, _, printed = printed.partition("\n")
+                    command = command[:-1] + further.strip()
+                yield "command", shlex.split(command), printed
+        elif saved := SAVED.search(before):
+            yield "file", saved[1], match[2]
+
+
+def plain(printed):
+    """Return the lines of an output without what differs from run to run."""
+    found = []
+    for line in printed.splitlines():
+        if not PROGRESS.search(line):
+            words = (CLOCK.sub("", line) if line.startswith(" ") else line).split()
+            found += [" ".join(words)] if words else []
+    return found
+
+
+def carry_out(text, monkeypatch, capsys, folder):
+    """Do what a page says in a folder; every output is that of the page, with `...` for lines that are left out."""
+    monkeypatch.chdir(folder)
+    for kind, what, content in steps(text):
+        if kind == "file":
+            Path(what).parent.mkdir(parents=True, exist_ok=True)
+            Path(what).write_text(content, encoding="utf-8")
+            continue
+        assert what[0] == "servobench", what
+        capsys.readouterr()
+        code = servobench(monkeypatch, *what[1:])
+        captured = capsys.readouterr()
+        assert code == 0, f"{what}: exit code {code}: {captured.out}{captured.err}"
+        compare(" ".join(what), plain(content), plain(captured.out + captured.err))
+
+
+def compare(command, told, printed):
+    """Check the lines of a page against those that a command printed."""
+    where = 0
+    for line in told:
+        if line == "...":
+            where = None
+            continue
+        if where is None:
+            assert line in printed, f"{command} does not print {line!r}, but:\n" + "\n".join(printed)
+            where = printed.index(line)
+        assert where < len(printed), f"{command} ends before {line!r}"
+        assert printed[where] == line, f"{command} prints {printed[where]!r}, the page says {line!r}"
+        where += 1
+    if told and told[-1] != "...":
+        assert where == len(printed), f"{command} also prints {printed[where:]}"
