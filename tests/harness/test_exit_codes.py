@@ -10,7 +10,7 @@ import pytest
 from kit.command import servobench
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
-from servobench.harness.batch.api import NoSettings
+from servobench.harness.config.entries import NoSettings
 from servobench.harness.config.registry import offering
 from servobench.plant.signals import Command
 
