@@ -1,4 +1,4 @@
-"""Exports the UR5 with mismatched kinematics as an FMU: sources, libraries, description, documentation, reference run.
+"""Exports an arm with mismatched kinematics as an FMU: sources, libraries, description, documentation, reference run.
 
 Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import html
 import os
+import re
 import string
 import tempfile
 import zipfile
@@ -25,11 +26,11 @@ from servobench.fmus.generate import kinematics_source, layout_header
 from servobench.fmus.model_description import Description, write_build_description, write_fmi2, write_fmi3
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
 from servobench.fmus.variables import Actuation, Layout, arm_groups, parameters_of
-from servobench.plant.checks import as_vector
+from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.robot import Robot
 
-IDENTIFIER = "ur5_mismatched"  # name of the libraries and of the folder of the model
+MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
 MACHINERY = "fmi"  # folder of the FMI functions, which know no model
 HEADERS = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
@@ -37,13 +38,15 @@ HEADERS = {
 }
 FMI_SOURCES = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_absent.c")}
 SHARED_SOURCES = ("model.c", "instance.c", "kinematics.c")
-COMMITTED = {MACHINERY: ("instance.h", "instance.c"), IDENTIFIER: ("kinematics.h", "model.h", "model.c")}
+COMMITTED = {MACHINERY: ("instance.h", "instance.c"), MODEL: ("kinematics.h", "model.h", "model.c")}
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 
 
-def default_actuation() -> Actuation:
-    """Return the default lag and limits of the kinematic plant, and a home above the workspace."""
-    return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=as_vector("home", HOME, len(HOME)))
+def default_actuation(robot: Robot | None = None) -> Actuation:
+    """Return the default lag and limits of the kinematic plant and the home of a robot; without one of the UR5."""
+    described = robot or find_robot(UR5)
+    home = described.workspace.home
+    return Actuation(lag=0.05, max_speed=1.0, joint_range=2 * np.pi, home=home, limits=described.limits)
 
 
 @dataclass(frozen=True)
@@ -56,13 +59,15 @@ class ExportOptions:
         actuation: lag, limits and home that become start values.
         platforms: platforms to compile for.
         mismatch: text for the documentation that says how the model differs from the nominal one.
+        robot: by its maker's description.
     """
 
     fmi_version: int = 2
-    model: HandEyeModel = field(default_factory=nominal_ur5)
+    model: HandEyeModel = field(default_factory=lambda: find_robot(UR5).nominal)
     actuation: Actuation = field(default_factory=default_actuation)
     platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))
     mismatch: str = "none"
+    robot: Robot = field(default_factory=lambda: find_robot(UR5))
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
@@ -70,6 +75,31 @@ class ExportOptions:
             raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
+
+    @property
+    def identifier(self) -> str:
+        """Name of the libraries: that of the robot as a word of C."""
+        word = re.sub(r"[^A-Za-z0-9_]", "_", self.robot.name)
+        return f"{word if word[:1].isalpha() else f'arm_{word}'}_mismatched"
+
+    @property
+    def title(self) -> str:
+        """Name of the model."""
+        return f"{self.robot.title} with mismatched kinematics"
+
+    @property
+    def summary(self) -> str:
+        """What the model is."""
+        title = self.robot.title
+        return (
+            f"{'An' if title[:1] in set('AEIO') else 'A'} {title} with a ball on its flange under a fixed camera; "
+            "every length, angle and offset is a tunable parameter."
+        )
+
+
+def nominal_options(fmi_version: int, robot: Robot) -> ExportOptions:
+    """Return the options of an export of a robot without mismatch."""
+    return ExportOptions(fmi_version, robot.nominal, default_actuation(robot), robot=robot)
 
 
 def export_fmu(path: Path, options: ExportOptions) -> Path:
@@ -117,7 +147,7 @@ def source_files(options: ExportOptions) -> dict[str, str]:
     texts |= {name: _committed(MACHINERY, name) for name in FMI_SOURCES[options.fmi_version]}
     texts |= {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
     texts["kinematics.c"] = _kinematics(layout)
-    texts["layout.h"] = layout_header(layout, start, IDENTIFIER, _PLACEHOLDER)
+    texts["layout.h"] = layout_header(layout, start, options.identifier, _PLACEHOLDER)
     return {f"sources/{name}": text for name, text in texts.items()}
 
 
@@ -129,7 +159,7 @@ def _companion_files(options: ExportOptions) -> dict[str, str]:
         INPUT_FILE: input_csv(run, layout),
         OUTPUT_FILE: output_csv(run, layout),
         "documentation/index.html": _documentation(layout, options),
-        "documentation/licenses/license.txt": _committed(IDENTIFIER, "license.txt"),
+        "documentation/licenses/license.txt": _committed(MODEL, "license.txt"),
     }
 
 
@@ -168,19 +198,14 @@ def _descriptions(options: ExportOptions, token: str) -> dict[str, bytes]:
 
 def _description(options: ExportOptions) -> Description:
     return Description(
-        model_name="UR5 with mismatched kinematics",
-        model_identifier=IDENTIFIER,
-        summary=_SUMMARY,
+        model_name=options.title,
+        model_identifier=options.identifier,
+        summary=options.summary,
         layout=arm_layout(options.model.arm.n),
         start=parameters_of(options.model, options.actuation),
         sources=(*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES),
         tool=f"servobench {version('servobench')}",
     )
-
-
-_SUMMARY = (
-    "A UR5 with a ball on its flange under a fixed camera; every length, angle and offset is a tunable parameter."
-)
 
 
 def _token(contents: Mapping[str, bytes]) -> str:
@@ -193,15 +218,15 @@ def _token(contents: Mapping[str, bytes]) -> str:
 
 
 def _documentation(layout: Layout, options: ExportOptions) -> str:
-    template = _committed(IDENTIFIER, "documentation.html")
+    template = _committed(MODEL, "documentation.html")
     rows = [
         f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
         f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
         for group in layout.groups
     ]
     return string.Template(template).substitute(
-        title="UR5 with mismatched kinematics",
-        summary=_SUMMARY,
+        title=html.escape(options.title),
+        summary=html.escape(options.summary),
         joints=options.model.arm.n,
         mismatch="the nominal model"
         if options.mismatch == "none"
@@ -217,7 +242,7 @@ def _compile(folder: Path, contents: dict[str, bytes], options: ExportOptions) -
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
     for target in options.platforms:
-        library = folder / "library" / target.name / f"{IDENTIFIER}{target.suffix}"
+        library = folder / "library" / target.name / f"{options.identifier}{target.suffix}"
         compile_library(folder / "sources", (*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES), target, library)
         contents[f"binaries/{target.folder(options.fmi_version)}/{library.name}"] = library.read_bytes()
 

@@ -41,7 +41,8 @@ class ReferenceRun:
 def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
     """Return the reference run of `model`; some of its commands exceed the speed limit."""
     n = model.arm.n
-    limit, reach = actuation.max_speed, actuation.joint_range
+    stops = actuation.stops(n)
+    limit = stops.speed
     wanted = named_generator(0, "fmu_reference").uniform(-1.2 * limit, 1.2 * limit, (STEPS + 1, n))
     lags = np.broadcast_to(actuation.lag, n).tolist()
     A, B = (np.stack(parts, axis=-1) for parts in zip(*(discretise_lag(lag, STEP) for lag in lags), strict=True))
@@ -51,7 +52,7 @@ def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
         positions[k], velocities[k] = q, v
         u = np.clip(wanted[k], -limit, limit)
         free = q + A[0, 1] * v + B[0] * u
-        q = np.clip(free, -reach, reach)
+        q = np.clip(free, stops.lower, stops.upper)
         v = np.where(q == free, A[1, 1] * v + B[1] * u, 0.0)
     resolution = np.broadcast_to(actuation.encoder_resolution, n)
     steps = np.where(resolution > 0.0, resolution, 1.0)

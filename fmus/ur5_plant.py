@@ -1,4 +1,4 @@
-"""The plant `fmu`: the exported UR5, built on first use and kept in the user's cache folder."""
+"""The plant `fmu`: the exported arm, built on first use and kept in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ import numpy as np
 import platformdirs
 
 from servobench.fmus.compile import CompilationFailed, CompilerMissing
-from servobench.fmus.export import ExportOptions, export_fmu, fingerprint
+from servobench.fmus.export import export_fmu, fingerprint, nominal_options
 from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.bench import Bench
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.hand_eye import FEATURE_NAMES
+from servobench.plant.robot.robot import Robot
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import NonNegative, Positive, nested, settings
 from servobench.plant.timing import RENAMED_DELAY
@@ -26,18 +28,18 @@ from servobench.plant.timing import RENAMED_DELAY
 
 @settings
 class Ur5FmuConfig:
-    """Settings of the exported UR5; the same as those of the kinematic plant."""
+    """Settings of the exported arm; the same as those of the kinematic plant."""
 
     fmi_version: Literal[2, 3] = 2
     """Version of FMI."""
     max_joint_speed: Positive = 1.0
-    """[rad/s] limit of every joint; a cautious share of the vendor's limit of π."""
+    """[rad/s] limit of every joint, beside its maker's; a cautious share of a UR5's π."""
     joint_range: Positive = 2 * math.pi
-    """[rad] largest joint position each way; the vendor's range."""
+    """[rad] largest joint position each way, beside its maker's limits; a UR5's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     joint_lags: tuple[NonNegative, ...] = ()
-    """[s] τ of each of the six joints in place of `lag`; an empty list for none."""
+    """[s] τ of each of the joints in place of `lag`; an empty list for none."""
     encoder_resolution: NonNegative = 0.0
     """[rad] step of reported positions; 0 means exact ones, as those of `kinematic`."""
     command_delay: NonNegative = 0.05
@@ -49,16 +51,18 @@ class Ur5FmuConfig:
 
 
 @cache
-def cached_fmu(fmi_version: int) -> Path:
-    """Return the nominal UR5 as FMU, from the user's cache folder; it is built there if anything in it has changed.
+def cached_fmu(fmi_version: int, robot: Robot | None = None) -> Path:
+    """Return a nominal robot, by default the UR5, as FMU, from the user's cache folder.
+
+    It is built there if anything in it has changed.
 
     Raises:
         CompilerMissing: it has to be built and there is no compiler.
         CompilationFailed: it has to be built and the compiler refused it.
     """
-    options = ExportOptions(fmi_version)
+    options = nominal_options(fmi_version, robot or find_robot(UR5))
     folder = Path(platformdirs.user_cache_dir("servobench")) / "fmus"
-    path = folder / f"ur5_mismatched-fmi{fmi_version}-{fingerprint(options).strip('{}')}.fmu"
+    path = folder / f"{options.identifier}-fmi{fmi_version}-{fingerprint(options).strip('{}')}.fmu"
     if not path.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         export_fmu(path, options)
@@ -66,13 +70,14 @@ def cached_fmu(fmi_version: int) -> Path:
 
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
-    """Return the mapping of the exported UR5, with the true model of `setup` as its parameters, (..., size)."""
+    """Return the mapping of the exported arm, with the true model of `setup` as its parameters, (..., size)."""
     model, start = setup.robot()
     lag, n = config.joint_lags or (config.lag,), model.arm.n
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
     resolution = config.encoder_resolution
-    actuation = Actuation(np.array(lag), config.max_joint_speed, config.joint_range, start, resolution)
+    actuation = Actuation(np.array(lag), config.max_joint_speed, config.joint_range, start, resolution, setup.limits)
+    stops = actuation.stops(n)
     parameters = parameters_of(model, actuation)
     del parameters["home"]
     return FmuMapping(
@@ -84,20 +89,20 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         home="home",
         camera=("camera_position", "camera_rpy"),
         parameters=parameters,
-        limits=JointLimits(config.max_joint_speed, -config.joint_range, config.joint_range),
+        limits=JointLimits(stops.speed, stops.lower, stops.upper),
         names=LogNames(model.arm.joint_names, FEATURE_NAMES),
     )
 
 
 def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
-    """Return the exported UR5 as a plant.
+    """Return the exported arm as a plant.
 
     Raises:
         ValueError: a setting out of its bounds, a start of the wrong size, or an FMU that has to be built and cannot:
             no compiler, or no place in the cache folder.
     """
     try:
-        path = cached_fmu(config.fmi_version)
+        path = cached_fmu(config.fmi_version, setup.nominal)
     except (CompilerMissing, CompilationFailed, OSError) as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
     lag = float(np.mean(config.joint_lags or config.lag))
@@ -106,7 +111,7 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
 
 ENTRY = PlantEntry(
     name="fmu",
-    summary="the exported UR5 as a co-simulation FMU, built and cached on first use",
+    summary="the exported arm as a co-simulation FMU, built and cached on first use",
     config=Ur5FmuConfig,
     build=build_ur5,
     side_by_side=True,

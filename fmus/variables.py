@@ -19,6 +19,7 @@ import numpy as np
 from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.limits import JointLimits, narrowed
 
 PARAMETER, INPUT, STATE, DERIVATIVE, OUTPUT = "parameter", "input", "state", "derivative", "output"
 
@@ -131,6 +132,7 @@ class Actuation:
         joint_range: distance of the stops from zero [rad].
         home: (..., n) reported joint positions at the start [rad].
         encoder_resolution: step of the encoders [rad], one for all joints or (n,); 0 for exact ones.
+        limits: of the arm's maker, which hold as well; None for none.
     """
 
     lag: float | FloatArray
@@ -138,11 +140,17 @@ class Actuation:
     joint_range: float
     home: FloatArray
     encoder_resolution: float | FloatArray = 0.0
+    limits: JointLimits | None = None
+
+    def stops(self, n: int) -> JointLimits:
+        """Return speeds and stops of `n` joints."""
+        return narrowed(self.limits, n, self.max_speed, self.joint_range)
 
 
 def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:
     """Return the FMU's parameters for `model` and `actuation` by group, (..., size)."""
     arm, n = model.arm, model.arm.n
+    stops = actuation.stops(n)
     columns = {"a": 0, "y": 1, "d": 2}
     angles = {"alpha": 0, "pitch": 1, "yaw": 2}
     return {
@@ -156,9 +164,9 @@ def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatA
         "camera_position": model.X_BC[..., :3, 3],
         "camera_rpy": rpy_from_rotation(model.X_BC[..., :3, :3]),
         "lag": np.array(np.broadcast_to(actuation.lag, n)),
-        "max_speed": np.full(n, actuation.max_speed),
-        "joint_lower": np.full(n, -actuation.joint_range),
-        "joint_upper": np.full(n, actuation.joint_range),
+        "max_speed": stops.speed,
+        "joint_lower": stops.lower,
+        "joint_upper": stops.upper,
         "encoder_resolution": np.array(np.broadcast_to(actuation.encoder_resolution, n)),
         "home": as_array("home", actuation.home, (*model.lead, n)),
     }

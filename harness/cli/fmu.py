@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from servobench.harness.cli.options import RobotOption, known_robot
 from servobench.harness.cli.terminal import console
 
-fmu_app = typer.Typer(help="Export the UR5 as an FMU; check and show FMUs.", no_args_is_help=True)
+fmu_app = typer.Typer(help="Export an arm as an FMU; check and show FMUs.", no_args_is_help=True)
 
 FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 
@@ -19,24 +20,26 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The .fmu file to write.")],
     fmi: Annotated[int, typer.Option(help="2 (co-simulation and model exchange) or 3 (co-simulation).")] = 2,
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
+    robot: RobotOption = "ur5",
     seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
     platforms: Annotated[
         str | None,
         typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
     ] = None,
 ) -> None:
-    """Export the UR5 with a mismatch as start values."""
+    """Export an arm with a mismatch as start values."""
     from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
-    from servobench.fmus.export import ExportOptions, export_fmu
+    from servobench.fmus.export import ExportOptions, default_actuation, export_fmu
+    from servobench.harness.config.robots import find_robot
     from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.robot.catalogue import find_robot
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
     from servobench.plant.seeds import named_seed
 
+    described = find_robot(known_robot(robot))
     try:
-        model, _ = sample_mismatch(Mismatch.parse(mismatch), find_robot("ur5"), named_seed(seed, "mismatch"))
+        model, _ = sample_mismatch(Mismatch.parse(mismatch), described, named_seed(seed, "mismatch"))
         words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
-        options = ExportOptions(fmi, model, platforms=parse_platforms(platforms), mismatch=words)
+        options = ExportOptions(fmi, model, default_actuation(described), parse_platforms(platforms), words, described)
         export_fmu(output, options)
     except (ValueError, OSError, CompilerMissing, CompilationFailed) as error:
         raise ConfigurationError(str(error)) from error

@@ -23,16 +23,16 @@ from servobench.harness.pictures.tracks import Track
 from servobench.plant.bullet.bullet_plant import BulletConfig
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.checks import FloatArray
-from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_seed
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import Scene
 
-EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame: from the front right, down to the workspace
+EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame of a UR5: from the front right, down to it
 OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
 ROUNDING = 1e-6  # [s] by which an instant may lie outside a stretch
@@ -53,6 +53,7 @@ class LoggedRun:
 
     Attributes:
         track: its row in the table of runs, and its steps.
+        robot: by its maker's description.
         model: the true arm and camera.
         moved: the same after the camera was moved in the middle of the run; None if it was not.
         moved_from: first period that the moved camera sees; the number of periods if none.
@@ -63,6 +64,7 @@ class LoggedRun:
     """
 
     track: Track
+    robot: Robot
     model: HandEyeModel
     moved: HandEyeModel | None
     moved_from: int
@@ -81,21 +83,22 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         settings: the rendered plant's settings by name, as a manifest has them; empty for the defaults.
 
     Raises:
-        ConfigurationError: a plant that is no UR5, a run without steps, or one whose robot cannot be drawn again.
+        ConfigurationError: a plant that brings its robot, a run without steps, or one whose robot is not found again.
     """
     run_id = row["run_id"]
     if find_plant(row["plant"]).own_robot:
-        raise ConfigurationError(
-            f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own, no UR5"
-        )
+        raise ConfigurationError(f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own")
     if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
     track = Track(row, steps.reset_index(drop=True))
-    names = [f"joint_position_{name}_rad" for name in ur5.JOINT_NAMES]
+    robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
+    names = [f"joint_position_{name}_rad" for name in robot.arm.joint_names]
     missing = [name for name in names if name not in steps]
     if missing:
-        raise ConfigurationError(f"run {run_id} has no column {missing[0]}; wanted the joint positions of a UR5")
-    model, moved = _true_model(row)
+        raise ConfigurationError(
+            f"run {run_id} has no column {missing[0]}; wanted the joint positions of a {robot.title}"
+        )
+    model, moved = _true_model(row, robot)
     known = {item.name for item in fields(BulletConfig)}
     try:
         config = BulletConfig(**{name: value for name, value in settings.items() if name in known})
@@ -108,7 +111,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         later = points[:0] if moved is None else moved.to_base(points[moved_from:])
         return np.concatenate([model.to_base(points[:moved_from]), later])
 
-    return LoggedRun(track, model, moved, moved_from, config, q, in_base(ball), in_base(track.vectors("reference_")))
+    return LoggedRun(
+        track, robot, model, moved, moved_from, config, q, in_base(ball), in_base(track.vectors("reference_"))
+    )
 
 
 def stretch(run: LoggedRun, begin: float, length: float | None) -> LoggedRun:
@@ -146,12 +151,12 @@ class Replay:
         """
         from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet loads slowly
 
-        self._run, self._fineness = run, fineness
-        self._scene: Scene = Scene(run.model.arm, scenery=True, window=False)
+        self._run, self._fineness, scale = run, fineness, run.robot.workspace.scale
+        self._scene: Scene = Scene(run.model.arm, scenery=True, window=False, robot=run.robot)
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]
-        self._overview_pose = _look_at(np.array(EYE), np.array(TARGET))
+        self._overview_pose = _look_at(scale * np.array(EYE), scale * np.array(TARGET))
         width, height = round(fineness * OVERVIEW.width), round(fineness * OVERVIEW.height)
         self._overview = replace(OVERVIEW, width=width, height=height)
 
@@ -171,8 +176,8 @@ class Replay:
     def camera_view(self) -> ByteArray:
         """Return the image of the run's camera with the detected ball marked, (h, w, 3)."""
         rgba, buffer = self._scene.render(self._camera, self._pose)
-        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
-        return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
+        found = find_ball(rgba, buffer, self._camera, self._run.robot.workspace.ball_radius)
+        return draw_detection(rgba[..., :3], found, self._camera, self._run.robot.workspace.ball_radius)
 
     def overview(self, trails: list[Trail]) -> ByteArray:
         """Return the arm from outside with trails, pale where they are hidden: (480, 640, 3) times the fineness."""
@@ -205,7 +210,7 @@ class Replay:
                 cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
 
 
-def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]:
+def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:
     """Return the run's true robot, and the one after its camera was moved; None if it was not.
 
     Raises:
@@ -213,7 +218,6 @@ def _true_model(row: dict[str, Any]) -> tuple[HandEyeModel, HandEyeModel | None]
     """
     try:
         mismatch = Mismatch.parse(row["mismatch"])
-        robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
         model, sample = sample_mismatch(mismatch, robot, named_seed(int(row["seed"]), "mismatch"))
     except ValueError as error:
         raise ConfigurationError(f"run {row['run_id']}: {error}") from error

@@ -1,4 +1,4 @@
-"""The rendered plant: a UR5 with dynamics in PyBullet, seen by an RGB-D camera in whose image the ball is found.
+"""The rendered plant: an arm with dynamics in PyBullet, seen by an RGB-D camera in whose image the ball is found.
 
 The drives of `servobench.plant.bullet.drives` turn joints that have inertia, load and friction, at 1 kHz. Controllers
 see and command reported positions q, which are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link
@@ -22,14 +22,15 @@ from annotated_types import Len
 
 from servobench.plant.bench import Bench, build_bench
 from servobench.plant.bullet.detection import ByteArray, Patch, add_colour_noise, draw_detection, find_ball
-from servobench.plant.bullet.drives import PHYSICS_STEP, DriveConfig, Drives, DriveState
+from servobench.plant.bullet.drives import PHYSICS_STEP, DriveConfig, Drives, DriveState, drives_for
 from servobench.plant.bullet.urdf import Box
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.faults import Collision, PlantDiverged
 from servobench.plant.plant import PlantEntry, PlantSetup
-from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
+from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_generator
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import Count, NonNegative, Number, Positive, nested, settings
@@ -47,12 +48,12 @@ BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
 
 @settings
 class BulletConfig:
-    """Settings of the rendered plant; defaults are those of a UR5 under a stereo depth camera."""
+    """Settings of the rendered plant; those of masses, loads and drives are a UR5's, and change with the robot."""
 
     max_joint_speed: Positive = 1.0
-    """[rad/s] limit of every joint; a cautious share of the vendor's limit of π."""
+    """[rad/s] limit of every joint, beside its maker's; a cautious share of a UR5's π."""
     joint_range: Positive = 2 * math.pi
-    """[rad] largest joint position each way; the vendor's range."""
+    """[rad] largest joint position each way, beside its maker's limits; a UR5's range."""
     lag: NonNegative = 0.05
     """[s] τ, by which the drives smooth the commanded velocity; 0 means none."""
     drives: DriveConfig = nested(DriveConfig)
@@ -137,14 +138,14 @@ class BulletState:
 
 
 class BulletWorld(World):
-    """A UR5 with drives under a fixed RGB-D camera; y = centre of the ball it sees."""
+    """An arm with drives under a fixed RGB-D camera; y = centre of the ball it sees."""
 
     def __init__(self, config: BulletConfig, setup: PlantSetup) -> None:
         """Open worlds of its own and load the arm.
 
         Raises:
-            ValueError: a start of the wrong size, a period that physics steps do not divide, an arm that is not like a
-                UR5, a gear ratio of 0, or a window without a display.
+            ValueError: a start of the wrong size, a period that physics steps do not divide, a list that does not
+                fit the joints, a gear ratio of 0, or a window without a display.
         """
         # PyBullet loads slowly.
         from servobench.plant.bullet.mechanics import Mechanics  # noqa: PLC0415
@@ -153,7 +154,7 @@ class BulletWorld(World):
         model, start = setup.robot()
         self._config, self._model, arm = config, model, model.arm
         self.lag = config.lag
-        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range)
+        self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
         self._start = as_vector("start", start, self.spec.n)
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
         if not arm.gear_ratio.all():
@@ -161,10 +162,12 @@ class BulletWorld(World):
         self._camera, self._depth_noise = config.camera(), config.noise()
         self._X_BC = model.X_BC
         boxes, load = config.boxes(), config.drives
-        self._scene: Scene = Scene(arm, scenery=config.scenery, window=config.view, boxes=boxes)
+        robot = setup.nominal or find_robot(UR5)
+        self._ball_radius = robot.workspace.ball_radius
+        self._scene: Scene = Scene(arm, scenery=config.scenery, window=config.view, boxes=boxes, robot=robot)
         try:
             self._mechanics: Mechanics = Mechanics(
-                arm, payload=load.payload, assumed_payload=load.assumed_payload, boxes=boxes
+                arm, payload=load.payload, assumed_payload=load.assumed_payload, boxes=boxes, robot=robot
             )
         except BaseException:
             self._scene.close()
@@ -231,7 +234,7 @@ class BulletWorld(World):
         deviation = self._config.colour_noise * self._config.sensing.noise_factor
         if deviation > 0.0:
             rgba = add_colour_noise(rgba, deviation, self._colour_noise)
-        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS, self._sense)
+        found = find_ball(rgba, buffer, self._camera, self._ball_radius, self._sense)
         if found is None:
             return None
         found.centre.setflags(write=False)
@@ -272,8 +275,8 @@ class BulletWorld(World):
     def picture(self) -> ByteArray:
         """Return what the camera sees now with the detected ball marked, (h, w, 3)."""
         rgba, buffer = self._render()
-        found = find_ball(rgba, buffer, self._camera, ur5.BALL_RADIUS)
-        return draw_detection(rgba[..., :3], found, self._camera, ur5.BALL_RADIUS)
+        found = find_ball(rgba, buffer, self._camera, self._ball_radius)
+        return draw_detection(rgba[..., :3], found, self._camera, self._ball_radius)
 
     def close(self) -> None:
         """Leave PyBullet's worlds."""
@@ -306,6 +309,11 @@ class BulletWorld(World):
         time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
 
 
+def bullet_config(robot: Robot) -> BulletConfig:
+    """Return the default settings for a robot: drives and load in proportion to its own."""
+    return BulletConfig() if robot.name == UR5 else BulletConfig(drives=drives_for(robot))
+
+
 def build_bullet(config: BulletConfig, setup: PlantSetup) -> Bench:
     """Return the rendered plant.
 
@@ -329,4 +337,5 @@ ENTRY = PlantEntry(
     build=build_bullet,
     needs=("pybullet",),
     engine=rendering_engine,
+    config_for=bullet_config,
 )

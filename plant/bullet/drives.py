@@ -25,6 +25,7 @@ from scipy.linalg.lapack import dposv
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot import ur5
+from servobench.plant.robot.robot import Robot
 from servobench.plant.settings import NonNegative, Positive, Share, settings
 
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
@@ -33,6 +34,7 @@ POSITION_SHARE, INTEGRAL_SHARE = (
     0.1,
 )  # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
+RATED_PAYLOAD = 5.0  # [kg] of a UR5
 MAX_FOLLOWING_ERROR = 0.1  # [rad] the reference waits for a joint that falls behind further
 
 
@@ -45,7 +47,7 @@ class DriveConfig:
     velocity_bandwidth: tuple[Positive, ...] = (15.0, 15.0, 15.0, 20.0, 20.0, 20.0)
     """[Hz] of each velocity loop; in no data sheet: chosen so that joints rise in about 50 ms, as on `kinematic`."""
     torque_limit: tuple[Positive, ...] = ur5.MAX_TORQUE
-    """[Nm] of each joint; Universal Robots, "Max. joint torques"."""
+    """[Nm] of each joint, by its maker; these of Universal Robots, "Max. joint torques"."""
     rotor_inertia: tuple[NonNegative, ...] = (0.1,)
     """[kg m²] of the rotor, times the gear's ratio squared; that of the UR5e in MuJoCo Menagerie, in no data sheet."""
     coulomb_friction: tuple[NonNegative, ...] = (7.5, 7.5, 7.5, 1.4, 1.4, 1.4)
@@ -59,12 +61,36 @@ class DriveConfig:
     assumed_payload: NonNegative = 0.9
     """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
 
-    def __post_init__(self) -> None:
-        """Check the lengths of the lists."""
-        n = len(ur5.JOINT_NAMES)
+    def check(self, n: int) -> None:
+        """Refuse lists that do not fit `n` joints.
+
+        Raises:
+            ValueError: a list of another length.
+        """
         for name in ("velocity_bandwidth", "torque_limit", "rotor_inertia", "coulomb_friction", "viscous_friction"):
             if len(getattr(self, name)) not in {1, n}:
                 raise ValueError(f"{name} must have 1 or {n} numbers, got {len(getattr(self, name))}")
+
+
+def drives_for(robot: Robot) -> DriveConfig:
+    """Return the settings of the drives of an arm: those of the UR5, in proportion to its joints' torques and its load.
+
+    Joints of at least half the torque of the strongest one have the bandwidth of a shoulder, the others of a wrist.
+    """
+    own, default = robot.links.torque, DriveConfig()
+    share = own / ur5.MAX_TORQUE[0]
+    friction = default.coulomb_friction[0] * share
+    slow, fast = default.velocity_bandwidth[0], default.velocity_bandwidth[-1]
+    load = robot.links.payload / RATED_PAYLOAD
+    return DriveConfig(
+        velocity_bandwidth=tuple(np.where(own >= own.max() / 2.0, slow, fast).tolist()),
+        torque_limit=tuple(own.tolist()),
+        rotor_inertia=(default.rotor_inertia[0] * float(share.max()),),
+        coulomb_friction=tuple(friction.tolist()),
+        viscous_friction=tuple(friction.tolist()),
+        payload=default.payload * load,
+        assumed_payload=default.assumed_payload * load,
+    )
 
 
 class DriveState(NamedTuple):
@@ -114,6 +140,7 @@ class Drives:
             stops: (n,) and (n,) [rad], lower and upper stop of the true angles.
         """
         n, h = len(assumed_inertia), PHYSICS_STEP
+        config.check(n)
         self._lower, self._upper = stops
         self._blend = -math.expm1(-h / lag) if lag > 0.0 else 1.0
         rotor = np.broadcast_to(config.rotor_inertia, n)

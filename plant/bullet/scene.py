@@ -18,11 +18,13 @@ from servobench.plant.bullet.engine import pybullet
 from servobench.plant.bullet.meshes import sphere_obj
 from servobench.plant.bullet.urdf import Box, arm_urdf, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
+from servobench.plant.robot.catalogue import UR5, find_robot
 
 if TYPE_CHECKING:
     from servobench.plant.bullet.detection import ByteArray
     from servobench.plant.checks import FloatArray
     from servobench.plant.robot.arm import SerialArm
+    from servobench.plant.robot.robot import Robot
 
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 BALL_MESH = "ball.obj"
@@ -37,17 +39,26 @@ def describe_renderer() -> str:
 class Scene:
     """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
 
-    def __init__(self, arm: SerialArm, *, scenery: bool, window: bool, boxes: tuple[Box, ...] = ()) -> None:
+    def __init__(
+        self,
+        arm: SerialArm,
+        *,
+        scenery: bool,
+        window: bool,
+        boxes: tuple[Box, ...] = (),
+        robot: Robot | None = None,
+    ) -> None:
         """Open a world and load the arm.
 
         Args:
-            arm: the true kinematics of an arm like the UR5.
+            arm: the true kinematics.
             scenery: whether to load the table and the floor.
             window: whether to open PyBullet's window.
             boxes: what else is in the room.
+            robot: by its maker's description, for the looks; None for the UR5.
 
         Raises:
-            ValueError: another number of joints, or a window is wanted where there is no display.
+            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
             ConnectionError: PyBullet opens no world, as too many are open.
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
@@ -56,7 +67,7 @@ class Scene:
         if self._client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
-            self._load(arm, boxes, scenery=scenery)
+            self._load(arm, boxes, robot or find_robot(UR5), scenery=scenery)
             if window:
                 self._aim_window()
         except BaseException:
@@ -66,13 +77,13 @@ class Scene:
         self._joints = list(range(n))
         self._ball_link = n + 1
 
-    def _load(self, arm: SerialArm, boxes: tuple[Box, ...], *, scenery: bool) -> None:
+    def _load(self, arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, *, scenery: bool) -> None:
         client = self._client
         # With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
-        files = {"arm.urdf": arm_urdf(arm, BALL_MESH), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
+        files = {"arm.urdf": arm_urdf(arm, BALL_MESH, robot), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
         if scenery:
-            files |= bench_files()
+            files |= bench_files(robot.workspace.scale)
         if boxes:
             files["boxes.urdf"] = boxes_urdf(boxes)
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:

@@ -1,4 +1,4 @@
-"""URDF of an arm like the UR5 with a ball on its flange, and of the table and floor on which it stands.
+"""URDF of an arm with a ball on its flange, and of the table and floor on which it stands.
 
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from servobench.plant.bullet.meshes import rectangles_obj
 from servobench.plant.checks import FloatArray
-from servobench.plant.robot import ur5
-from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
+from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.robot import Robot
 
 Colour = tuple[float, float, float, float]
 
@@ -51,35 +52,38 @@ class Box(NamedTuple):
     size: tuple[float, float, float]
 
 
-def arm_urdf(arm: SerialArm, ball_mesh: str) -> str:
-    """Return the URDF of an arm with masses and looks of the UR5; its joint angles are the true ones, θ.
+def arm_urdf(arm: SerialArm, ball_mesh: str, robot: Robot | None = None) -> str:
+    """Return the URDF of an arm with masses and looks of a robot; its joint angles are the true ones, θ.
 
     Args:
         arm: the kinematics, mismatch included.
         ball_mesh: name of a file beside the URDF that holds a mesh of the unit sphere.
+        robot: by its maker's description; None for the UR5.
 
     Returns:
         The URDF as text: the base, a link a joint in the arm's order, the flange and the ball.
 
     Raises:
-        ValueError: the arm has another number of joints than the UR5.
+        ValueError: the arm has another number of joints than the robot.
     """
-    return _text(_arm(arm, ball_mesh))
+    return _text(_arm(arm, ball_mesh, robot or find_robot(UR5)))
 
 
-def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool) -> str:
+def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot | None = None) -> str:
     """Return the URDF of an arm without looks, with a point load at the ball.
 
     Args:
         arm: the kinematics, mismatch included.
         payload: kg.
         shapes: whether the parts that `arm_urdf` draws are collision shapes.
+        robot: by its maker's description; None for the UR5.
 
     Raises:
-        ValueError: the arm has another number of joints than the UR5.
+        ValueError: the arm has another number of joints than the robot.
     """
-    robot = _arm(arm, "")
-    for link in robot.iter("link"):
+    described = robot or find_robot(UR5)
+    tree = _arm(arm, "", described)
+    for link in tree.iter("link"):
         for visual in link.findall("visual"):
             if not shapes:
                 link.remove(visual)
@@ -88,16 +92,22 @@ def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool) -> str:
             for material in visual.findall("material"):
                 visual.remove(material)
             for mesh in visual.findall("geometry/mesh"):
-                mesh.tag, mesh.attrib = "sphere", {"radius": repr(ur5.BALL_RADIUS)}
+                mesh.tag, mesh.attrib = "sphere", {"radius": repr(described.workspace.ball_radius)}
         mass = link.find("inertial/mass")
         if link.get("name") == BALL_LINK and mass is not None:
             mass.set("value", repr(LIGHT_PART[0] + payload))
-    return _text(robot)
+    return _text(tree)
 
 
-def room_boxes() -> tuple[Box, Box]:
-    """Return the table's top and the floor as obstacles."""
+def _table(scale: float) -> tuple[float, float, float, float]:
+    """Return x and y of two opposite corners of the table [m], which is as large as the workspace needs."""
     x0, y0, x1, y1 = TABLE
+    return scale * x0, scale * y0, scale * x1, scale * y1
+
+
+def room_boxes(scale: float = 1.0) -> tuple[Box, Box]:
+    """Return the table's top, `scale` times that of a UR5, and the floor as obstacles."""
+    x0, y0, x1, y1 = _table(scale)
     table = (x0 + x1) / 2, (y0 + y1) / 2, -TABLE_THICKNESS / 2
     return (
         Box("table", table, (x1 - x0, y1 - y0, TABLE_THICKNESS)),
@@ -118,37 +128,43 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     return _text(robot)
 
 
-def _arm(arm: SerialArm, ball_mesh: str) -> ET.Element:
+def _arm(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
     """Return the tree of `arm_urdf`."""
-    if arm.n != len(ur5.MASS):
-        raise ValueError(f"arm must have {len(ur5.MASS)} joints like the UR5, got {arm.n}")
+    own, ball_radius = described.links, described.workspace.ball_radius
+    if arm.n != described.n:
+        raise ValueError(f"arm must have {described.n} joints like the {described.title}, got {arm.n}")
+    mass, radius, aside = own.mass.tolist(), own.radius.tolist(), own.aside.tolist()
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    _draw_base(_add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], ur5.TUBE_RADIUS[0])
+    _draw_base(_add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], radius[0])
     for i, name in enumerate(arm.joint_names):
         step = arm.translation[i + 1]
-        centre = rotation_from_rpy(arm.rpy[i + 1]) @ ur5.CENTRE_OF_MASS[i] + step
+        R = rotation_from_rpy(arm.rpy[i + 1])
+        centre = R @ own.centre[i] + step
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
-        link = _add_link(robot, links[i + 1], ur5.MASS[i], ur5.INERTIA[i], centre=centre, along=along)
-        _draw_link(link, step, ur5.TUBE_RADIUS[i], ur5.SIDE_STEP[i])
+        inertia = own.inertia[i] if own.inertia.ndim == 2 else R @ own.inertia[i] @ R.T
+        link = _add_link(robot, links[i + 1], mass[i], inertia, centre=centre, along=along)
+        _draw_link(link, step, radius[i], aside[i])
         _add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
     _add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool)
+    _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, radius[-1], ball_radius)
     _add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
-    _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ur5.BALL_RADIUS)
+    _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ball_radius)
     return robot
 
 
-def bench_files() -> dict[str, str]:
+def bench_files(scale: float = 1.0) -> dict[str, str]:
     """Return the files, text by name, of the table, whose top is at z = 0 around the arm's base, and the floor below.
+
+    The table is `scale` times as large as that of a UR5.
 
     `bench.urdf` is the one to load; it names the others.
     """
     robot = ET.Element("robot", name="bench")
     bench = _add_link(robot, "bench", *BASE_PART)
-    x0, y0, x1, y1 = TABLE
+    x0, y0, x1, y1 = _table(scale)
     for x in (x0 + 0.04, x1 - 0.04):
         for y in (y0 + 0.04, y1 - 0.04):
             _draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
@@ -200,10 +216,10 @@ def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -
         _draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
 
 
-def _draw_tool(link: ET.Element, tool: FloatArray) -> None:
+def _draw_tool(link: ET.Element, tool: FloatArray, radius: float, ball_radius: float) -> None:
     """Draw the flange's plate and the stick that carries the ball."""
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * ur5.TUBE_RADIUS[-1])
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * ur5.BALL_RADIUS)
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius)
+    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * ball_radius)
 
 
 def _numbers(values: npt.ArrayLike) -> str:
@@ -232,17 +248,27 @@ def _add_link(
         robot: the URDF.
         name: of the link.
         mass: kg.
-        inertia: (2,), kg m², about the centre of mass: across `along` and about it.
+        inertia: kg m², about the centre of mass: (2,) across `along` and about it, or (3, 3) in the body frame.
         centre: (3,), m, centre of mass in the body frame.
         along: (3,), the direction about which the link is symmetric, in the body frame.
     """
     link = ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_numbers(centre), rpy=_numbers(rpy_along(along)))
+    rpy, (xx, yy, zz) = _principal(np.asarray(inertia, dtype=np.float64), along)
+    ET.SubElement(inertial, "origin", xyz=_numbers(centre), rpy=_numbers(rpy))
     ET.SubElement(inertial, "mass", value=repr(float(mass)))
-    across, about = (repr(value) for value in np.asarray(inertia, dtype=np.float64).tolist())
-    ET.SubElement(inertial, "inertia", ixx=across, iyy=across, izz=about, ixy="0", ixz="0", iyz="0")
+    ET.SubElement(inertial, "inertia", ixx=repr(xx), iyy=repr(yy), izz=repr(zz), ixy="0", ixz="0", iyz="0")
     return link
+
+
+def _principal(inertia: FloatArray, along: npt.ArrayLike) -> tuple[FloatArray, list[float]]:
+    """Return roll, pitch, yaw [rad] of the principal axes of an inertia, and the moments about them [kg m²]."""
+    if inertia.ndim == 1:
+        across, about = inertia.tolist()
+        return rpy_along(along), [across, across, about]
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return rpy_from_rotation(axes), moments.tolist()
 
 
 def _add_joint(robot: ET.Element, name: str, ends: tuple[str, str], origin: FloatArray, *, turns: bool) -> None:

@@ -13,15 +13,16 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from annotated_types import MinLen
 
+from servobench.plant.checks import FloatArray
 from servobench.plant.fmu.description import FmuDescription, total_size
-from servobench.plant.settings import File, Names, Number, Numbers, Positive, nested, override, settings
+from servobench.plant.settings import File, Names, Numbers, Positive, nested, override, settings
 from servobench.plant.signals import PlantSpec
 
 
@@ -39,14 +40,30 @@ class TruthMapping:
 
 @settings
 class JointLimits:
-    """Limits of all joints."""
+    """Limits of the joints: one number for all of them, or one for each."""
 
-    max_joint_speed: Positive = 1.0
+    max_joint_speed: Numbers = field(default_factory=lambda: np.array(1.0))
     """[rad/s] commands are clipped to it."""
-    joint_lower: Number = -2 * np.pi
+    joint_lower: Numbers = field(default_factory=lambda: np.array(-2 * np.pi))
     """[rad]"""
-    joint_upper: Number = 2 * np.pi
+    joint_upper: Numbers = field(default_factory=lambda: np.array(2 * np.pi))
     """[rad]"""
+
+    def __post_init__(self) -> None:
+        """Check the sign of the speeds."""
+        if not (self.max_joint_speed > 0.0).all():
+            raise ValueError(f"max_joint_speed must be above 0, got {self.max_joint_speed.tolist()}")
+
+    def of(self, name: str, n: int) -> FloatArray:
+        """Return a limit of each of `n` joints, (n,).
+
+        Raises:
+            ValueError: a list of another length.
+        """
+        value: FloatArray = getattr(self, name)
+        if value.shape not in {(), (n,)}:
+            raise ValueError(f"limits.{name} must have one number or {n}, got {value.tolist()}")
+        return np.full(n, value)
 
 
 @settings
@@ -141,9 +158,9 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     return PlantSpec.of_joints(
         _labels("joint", mapping.names.joints, n),
         _labels("feature", mapping.names.features, m),
-        np.full(n, mapping.limits.max_joint_speed),
-        np.full(n, mapping.limits.joint_lower),
-        np.full(n, mapping.limits.joint_upper),
+        mapping.limits.of("max_joint_speed", n),
+        mapping.limits.of("joint_lower", n),
+        mapping.limits.of("joint_upper", n),
         period,
         mapping.names.feature_unit,
     )

@@ -114,6 +114,6 @@ def test_joints_stop_at_their_stops_and_come_back():
 
 def test_a_list_of_another_length_is_refused():
     with pytest.raises(ValueError, match="torque_limit must have 1 or 6 numbers, got 2"):
-        DriveConfig(torque_limit=(1.0, 2.0))
+        DriveConfig(torque_limit=(1.0, 2.0)).check(6)
     with pytest.raises(ValueError, match="must be at least 0"):
         DriveConfig(coulomb_friction=(-1.0,))
