@@ -146,17 +146,13 @@ SWITCHES: Final[Mapping[str, tuple[str, ...]]] = {
     "without dynamics": ("drives.dynamics=false",),
     "torque limits halved": ("drives.torque_limit=[75.0, 75.0, 75.0, 14.0, 14.0, 14.0]",),
     "payload doubled": ("drives.payload=5.0",),
-    "payload known to the drives": ("drives.assumed_payload=2.5",),
     "without friction": (
         "drives.coulomb_friction=[0.0]", "drives.viscous_friction=[0.0]", "drives.friction_compensation=0.0",
     ),
     "friction not compensated": ("drives.friction_compensation=0.0",),
     "bandwidth halved": ("drives.velocity_bandwidth=[7.5, 7.5, 7.5, 10.0, 10.0, 10.0]",),
-    "exact encoders": ("encoder_resolution=0.0",),
-    "without contact with the room": ("room_contact=false",),
     "contact with itself": ("self_contact=true",),
     "without depth noise": ('depth_noise="none"',),
-    "depth noise of pixels independent": ("depth_patch=1",),
 }  # fmt: skip
 
 RATES_STUDY = Study(
