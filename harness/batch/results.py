@@ -11,7 +11,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -177,14 +177,19 @@ def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]
             yield file.read_row_group(group, known, use_threads=False).to_pandas()
 
 
-def load_steps(folder: Path, run_ids: list[str] | None = None) -> pd.DataFrame:
+def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collection[str] | None = None) -> pd.DataFrame:
     """Return the table of steps, of all runs or of those named.
+
+    Args:
+        folder: a results folder.
+        run_ids: of these runs only.
+        columns: these only, as far as there are such; None for all.
 
     Raises:
         ConfigurationError: not a results folder, or one of another schema.
     """
     check_folder(folder)
-    steps = _load(folder, STEPS, None if run_ids is None else ds.field("run_id").isin(run_ids))
+    steps = _load(folder, STEPS, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
     return steps
@@ -245,12 +250,15 @@ def _part_files(folder: Path, kind: str) -> list[Path]:
     return [path for path in files if path.is_file()]
 
 
-def _load(folder: Path, kind: str, only: ds.Expression | None = None) -> pd.DataFrame:
+def _load(
+    folder: Path, kind: str, only: ds.Expression | None = None, columns: Collection[str] | None = None
+) -> pd.DataFrame:
     paths = [folder / kind] if (folder / kind).is_file() else _part_files(folder, kind)
     if not paths:
         return pd.DataFrame()
     data = ds.dataset([str(path) for path in paths], _common_schema(paths))
-    table: pd.DataFrame = data.to_table(filter=only).to_pandas()
+    wanted = None if columns is None else [name for name in data.schema.names if name in columns]
+    table: pd.DataFrame = data.to_table(filter=only, columns=wanted).to_pandas()
     return table
 
 

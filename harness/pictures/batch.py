@@ -1,6 +1,10 @@
-"""Figures over all runs of a folder or over a group of them: effort and saturation, joint speeds, time a step takes."""
+"""Figures of numbers, a row a controller: what each run came to, and how long steps take."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -8,106 +12,168 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.panels import Styles, add_legend
-from servobench.harness.pictures.tracks import Track, Tracks, each
+from servobench.harness.analysis.comparison import settling_times
+from servobench.harness.analysis.measures import MEASURES
+from servobench.harness.pictures.ensembles import Ensembles
+from servobench.harness.pictures.panels import Styles
+from servobench.harness.pictures.style import TEXT, WIDTH
 from servobench.harness.run.ending import COMPLETED
+from servobench.plant.checks import FloatArray
 
-EFFORT = (("control_effort_rad", 1.0, "control effort [rad]"), ("saturation_fraction", 100.0, "saturated periods [%]"))
-COMMAND = "joint_velocity_command_"
+SETTLING, NEVER = "settling_time_s", 1.12  # and where a run without a value stands, over the largest value
+ACCURACY: Final = (SETTLING, "rms_error_evaluated")
+EFFORT: Final = ("control_effort_rad", "saturation_fraction")
+SMOOTHNESS: Final = ("joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3", "command_switches")
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
+LINE: Final = 0.165  # [in] a controller
+WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
 
 
-def draw_effort(runs: pd.DataFrame, styles: Styles) -> Figure | None:
-    """Draw control effort and saturation of each run, a column a task, a line a controller; None without values."""
-    rows = [row for row in EFFORT if row[0] in runs and runs[row[0]].notna().any()]
+class _Dots(NamedTuple):
+    """A measure of the table of runs as it is drawn."""
+
+    column: str
+    label: str
+    factor: float
+
+
+def draw_measures(runs: pd.DataFrame, columns: Sequence[str], styles: Styles) -> Figure | None:
+    """Draw measures of every run, a column a task, a row a measure, a line a controller; None without values.
+
+    A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
+
+    Args:
+        runs: of one plant and mismatch.
+        columns: of the table of runs; those without any value are left out.
+        styles: controller -> style.
+    """
+    rows = [_dots(name, runs) for name in columns if name in runs and runs[name].notna().any()]
     if not rows:
         return None
-    tasks = runs["task"].unique().tolist()
-    names = runs["controller"].unique().tolist()
-    figure = Figure(
-        figsize=(max(6.0, 2.2 + 1.9 * len(tasks)), 1.2 + len(rows) * (0.6 + 0.2 * len(names))), layout="constrained"
-    )
-    panels = figure.subplots(len(rows), len(tasks), sharey=True, squeeze=False)
-    for line, (column, factor, label) in zip(panels, rows, strict=True):
-        for axes, task in zip(line, tasks, strict=True):
-            _draw_values(axes, runs[runs["task"] == task], names, styles, column, factor)
-            axes.set_xlabel(label)
-    for axes, task in zip(panels[0], tasks, strict=True):
-        axes.set_title(task)
-    panels[0, 0].invert_yaxis()
-    if (runs["status"] != COMPLETED).any():
-        figure.supxlabel("hollow: the run ended early", fontsize=8)
+    tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
+    height = 0.55 + LINE * max(4, len(names))
+    figure = Figure(figsize=(WIDTH, 0.65 + len(rows) * height), layout="constrained")
+    parts = np.atleast_1d(np.array(figure.subfigures(len(rows), 1), dtype=object))
+    for part, row in zip(parts, rows, strict=True):
+        panels = part.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
+        for axes, task in zip(panels, tasks, strict=True):
+            _draw_dots(axes, runs[runs["task"] == task], names, styles, row)
+            axes.set_title(task)
+        panels[0].set_ylim(len(names) - 0.4, -0.6)
+        part.supxlabel(row.label, fontsize=TEXT)
+    notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
+    notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
+    if rows[0].column == SETTLING and _unsettled(runs).any():
+        notes.append("at the right edge and counted: never settled")
+    if notes:
+        figure.supxlabel("; ".join(notes), fontsize=TEXT - 0.5)
     return figure
 
 
-def draw_step_times(tasks: dict[str, Tracks], styles: Styles) -> Figure | None:
-    """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values."""
-    times: dict[str, list[np.ndarray]] = {}
-    period = 0.0
-    for tracks in tasks.values():
-        for name, track in tracks.items():
-            times.setdefault(name, []).append(track.column("controller_time_us"))
-            period = max(period, float(np.median(np.diff(track.time))) if len(track.time) > 1 else 0.0)
-    known = {name: np.concatenate(parts) for name, parts in times.items()}
-    known = {name: values[values > 0.0] for name, values in known.items() if (values > 0.0).any()}
+def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | None:
+    """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values.
+
+    Steps that take longer than the control period are marked and counted.
+    """
+    names = list(dict.fromkeys(name for ensembles in tasks.values() for name in ensembles))
+    times = {name: np.concatenate([e[name].step_time for e in tasks.values() if name in e]) for name in names}
+    known = {name: values for name, values in times.items() if len(values)}
     if not known:
         return None
-    figure = Figure(figsize=(7.5, 1.3 + 0.32 * len(known)), layout="constrained")
+    periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
+    limit = 1e6 * max([period for period in periods if math.isfinite(period)], default=math.nan)
+    figure = Figure(figsize=(WIDTH, 1.15 + 0.24 * max(3, len(known))), layout="constrained")
     axes = figure.add_subplot()
+    top = 1.4 * max(np.max(values) for values in known.values())
     for i, (name, values) in enumerate(known.items()):
-        low, first, middle, third, high = np.percentile(values, PERCENTILES)
-        style = styles[name]
-        axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=8)
-        axes.plot([first, third], [i, i], color=style.colour, linewidth=7.0, solid_capstyle="butt", alpha=0.45)
-        axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.5, markeredgecolor="black")
-        axes.annotate(f"{middle:.0f}, {high:.0f}", (1.01, i), xycoords=("axes fraction", "data"), va="center",
-                      fontsize=8)  # fmt: skip
-    if period > 0.0:
-        axes.axvline(1e6 * period, color="0.4", linestyle=(0, (2, 2)), linewidth=0.9)
-        axes.annotate("control period", (1e6 * period, 1.0), xycoords=("data", "axes fraction"), ha="right",
-                      va="bottom", fontsize=8, color="0.4", xytext=(0, 2), textcoords="offset points")  # fmt: skip
+        _draw_times(axes, i, values, limit, styles, name)
+    axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom", fontsize=TEXT - 0.5,
+                  xytext=(0, 2), textcoords="offset points")  # fmt: skip
+    if math.isfinite(limit):
+        top = max(top, 1.6 * limit)
+        axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
+        axes.axvspan(limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0)
+        axes.annotate(f"control period, {limit / 1000:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
+                      ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
+                      textcoords="offset points")  # fmt: skip
     axes.set(xscale="log", yticks=range(len(known)), yticklabels=list(known), xlabel="time of a controller's step [µs]")
+    axes.set_xlim(right=top)
     axes.set_ylim(len(known) - 0.4, -0.6)
     axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.annotate("median, 99 %", (1.01, 1.0), xycoords="axes fraction", va="bottom", fontsize=8, xytext=(0, 2),
-                  textcoords="offset points")  # fmt: skip
     return figure
 
 
-def draw_joint_speeds(tracks: Tracks, styles: Styles) -> Figure | None:
-    """Draw the commanded speed of each joint over time, of a long run at its end; None without values."""
-    tracks = each(Track.closing, tracks)
-    known = [[name for name in track.table.columns if name.startswith(COMMAND)] for track in tracks.values()]
-    columns = max(known, key=len)
-    if not columns:
-        return None
-    rows = -(-len(columns) // 2)
-    figure = Figure(figsize=(8.0, 1.0 + 1.7 * rows), layout="constrained")
-    panels = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False).ravel()
-    for axes, column in zip(panels, columns, strict=False):
-        for name, track in tracks.items():
-            style = styles[name].line_arguments(len(track.table)) | {"linewidth": 1.0, "markersize": 3.5}
-            axes.plot(track.time, track.column(column), label=name, **style)
-        axes.set_title(column.removeprefix(COMMAND).removesuffix("_rad_s"))
-    for axes in panels[len(columns) :]:
-        axes.set_visible(False)
-    for axes in panels[max(0, len(columns) - 2) : len(columns)]:
-        axes.tick_params(labelbottom=True)
-        axes.set_xlabel("time [s]")
-    figure.supylabel("commanded joint speed [rad/s]", fontsize=9)
-    add_legend(figure, panels[: len(columns)])
-    return figure
+def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, styles: Styles, name: str) -> None:
+    low, first, middle, third, high = np.percentile(values, PERCENTILES)
+    style, largest, late = styles[name], float(values.max()), int(np.count_nonzero(values > limit))
+    axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=7)
+    axes.plot([first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45)
+    axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
+              markerfacecolor=style.face)  # fmt: skip
+    words = f"{_short(middle)}, {_short(high)}, {_short(largest)}"
+    if late:
+        axes.plot(largest, i, color="black", marker="X", markersize=6.5, linestyle="")
+        words += f"\n{late} of {len(values)} steps too slow"
+    axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
+                  fontweight="bold" if late else None, linespacing=1.0)  # fmt: skip
 
 
-def _draw_values(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, column: str, factor: float) -> None:
+def _short(microseconds: float) -> str:
+    """Return a time with its unit and at most three digits."""
+    return f"{microseconds:.0f} µs" if microseconds < 999.5 else f"{microseconds / 1000.0:.3g} ms"
+
+
+def _dots(column: str, runs: pd.DataFrame) -> _Dots:
+    unit, factor = MEASURES[column].scale(runs)
+    name = MEASURES[column].name
+    if column == "rms_error_evaluated":
+        name = "RMS error of the judged part: end of a move, last lap of a curve"
+    if column == "command_switches":
+        name, unit = "sign switches of large commands", "count"
+    return _Dots(column, f"{name} [{unit}]", factor)
+
+
+def _unsettled(runs: pd.DataFrame) -> pd.Series[bool]:
+    """Return which moves never settled."""
+    moves = runs.reindex(columns=["task_kind"])["task_kind"] != "curve"
+    return moves & settling_times(runs).isna()
+
+
+def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, row: _Dots) -> None:
+    """Draw a measure of the runs of one task."""
+    values = row.factor * runs[row.column].astype(float)
+    never = _unsettled(runs) if row.column == SETTLING else pd.Series(False, runs.index)
+    values = values.where(~never)
+    if row.column == SETTLING:
+        values = values.where(runs.reindex(columns=["task_kind"])["task_kind"] != "curve")
+    largest, least = float(values.max()), float(values.min())
+    wide = least > 0.0 and largest / least > WIDE_RANGE
+    edge = (largest * NEVER if largest > 0.0 else 1.0) if not wide else largest * (largest / least) ** 0.08
+    if values.isna().all() and not never.any():
+        axes.text(0.5, 0.5, "does not apply", transform=axes.transAxes, ha="center", va="center", color="0.4",
+                  fontsize=TEXT - 1.0)  # fmt: skip
     for i, name in enumerate(names):
-        chosen = runs[runs["controller"] == name]
-        style = styles[name]
-        for completed, group in chosen.groupby(chosen["status"] == COMPLETED):
-            values = factor * group[column].to_numpy(dtype=np.float64)
+        own, style = runs["controller"] == name, styles[name]
+        for completed in (True, False):
+            chosen = own & ((runs["status"] == COMPLETED) == completed)
+            points = values.where(~never, edge)[chosen].dropna().to_numpy()
+            if len(points) == 0:  # an empty line that is not clipped would count as a mark at the origin
+                continue
             face = style.colour if completed else "none"
-            axes.plot(values, np.full(len(values), i), color=style.colour, marker=style.marker or "o", linestyle="",
-                      markersize=5.5, markerfacecolor=face, alpha=0.8)  # fmt: skip
+            axes.plot(points, np.full(len(points), i), color=style.colour, marker=style.marker or "o", linestyle="",
+                      markersize=4.5, markerfacecolor=face, markeredgewidth=0.7, alpha=0.55, clip_on=False)  # fmt: skip
+        middle = values[own].fillna(math.inf).median() if row.column == SETTLING else values[own].median()
+        if own.sum() > 1 and math.isfinite(middle):
+            axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
+        if never[own].any():
+            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="right", va="bottom", xytext=(4, 2),
+                          textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
     axes.set_yticks(range(len(names)), names)
-    largest = float((factor * runs[column]).max())
-    axes.set_xlim(0.0, 1.08 * largest if largest > 0.0 else 1.0)
+    if wide:
+        axes.set_xscale("log")
+        axes.set_xlim(least / (edge / largest), edge)
+        axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    else:
+        axes.set_xlim(0.0, edge)
+        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.analysis.statistics import NO_ESTIMATE
-from servobench.harness.pictures.panels import Styles, add_legend, draw_places, label_rows, panel_grid
+from servobench.harness.pictures.panels import Styles, add_legend, label_rows, panel_grid
+from servobench.harness.pictures.places import draw_curves
 
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
@@ -25,8 +26,8 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
         shares = {key: settled_share(own) for key, own in part.groupby(["controller", "size"])}
         names, sizes = part["controller"].unique(), sorted(part["size"].unique())
         values = {name: [shares.get((name, size), NO_ESTIMATE) for size in sizes] for name in names}
-        draw_places(axes, sizes, values, styles, joined=True)
-        axes.set(xlabel=label, ylim=(-4, 104))
+        draw_curves(axes, sizes, values, styles, top=104.0)
+        axes.set_xlabel(label)
     label_rows(panels, "settled runs [%]")
     add_legend(figure, panels)
     return figure

@@ -5,44 +5,51 @@ from __future__ import annotations
 import io
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image
 
 from servobench.harness.batch import results
-from servobench.harness.pictures.batch import draw_effort, draw_joint_speeds, draw_step_times
+from servobench.harness.pictures.batch import ACCURACY, EFFORT, SMOOTHNESS, draw_measures, draw_step_times
+from servobench.harness.pictures.ensembles import Ensembles, load_ensembles, shown_until
+from servobench.harness.pictures.motion import draw_joint_motion
 from servobench.harness.pictures.panels import Styles
-from servobench.harness.pictures.paper import (
-    draw_jacobians,
-    draw_move_paths,
-    draw_moves,
-    draw_tracking,
-    draw_tracking_path,
-)
-from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.harness.pictures.paper import draw_features, draw_jacobians, draw_moves, draw_tracking
+from servobench.harness.pictures.paths import draw_paths
+from servobench.harness.pictures.style import TEXT, WIDTH, divisions, figure_style, method_styles
 from servobench.harness.pictures.tracks import Group, load_groups
 
 FOLDER = "figures"
 FORMATS = ("png", "pdf")
-RESOLUTION = 150  # dpi of PNG
-SCREEN = 80  # dpi at which a figure is shown in a page
+RESOLUTION = 200  # dpi of PNG
+SCREEN = 1000.0 / WIDTH  # dpi at which a figure is shown in a page
+DENSITY = 1.5  # pixels of a picture in a page for each that it is shown with
 PALETTE = 64  # colours
-LETTERS = 12  # of a title in an inch
+LETTERS = 15.0  # of a title in an inch
 MOVES_A_FIGURE = 4
+TASKS_A_FIGURE = 4
+BLOCKS_A_FIGURE = 4
 HEADINGS = {
-    "errors": "Errors and measured features",
-    "paths": "True paths as the camera sees them",
-    "tracking": "Desired and measured features, and error",
-    "tracking_path": "Desired and true path as the camera sees them",
-    "jacobian": "Relative error of the estimated Jacobian",
-    "effort": "Control effort and saturation of every run",
+    "errors": "Error of moves over time",
+    "features": "Measured features of moves",
+    "paths": "True paths of moves, to scale",
+    "tracking": "Error along the curve, and measured features",
+    "tracking_path": "Desired and true path, to scale",
+    "jacobian": "Error of the estimated Jacobian",
+    "settling": "When each run settled, and with what error it ended",
+    "effort": "Control effort and saturation of each run",
+    "smoothness": "How smoothly each run drives the joints",
     "step_times": "Time of a controller's step",
-    "joint_speeds": "Commanded joint speeds",
+    "joint_speeds": "What is commanded of the joints",
 }
+OVER_SEEDS = ("errors", "jacobian", "tracking")  # kinds that show a median and a band
+OF_FIRST_SEED = ("features", "paths", "tracking_path", "joint_speeds")
+
+T = TypeVar("T")
 
 
 class NamedFigure(NamedTuple):
@@ -55,7 +62,7 @@ class NamedFigure(NamedTuple):
 
 
 def draw_figures(folder: Path) -> list[Path]:
-    """Draw the first seed of each plant and mismatch into the folder's `figures`; return the files, PNG and PDF.
+    """Draw the runs of each plant and mismatch into the folder's `figures`; return the files, PNG and PDF.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -71,7 +78,7 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     paths = []
     for ending in FORMATS:
         paths.append(stem.with_name(f"{stem.name}.{ending}"))
-        with figure_style():
+        with figure_style(TEXT):
             metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
             figure.savefig(paths[-1], dpi=RESOLUTION, metadata=metadata)
         figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
@@ -79,10 +86,10 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
 
 
 def picture_of(figure: Figure) -> tuple[bytes, int]:
-    """Return a figure as a small PNG of twice the pixels that it is to be shown with, and its width in those, px."""
+    """Return a figure as a small, sharp PNG and the width at which it is to be shown, px."""
     large, small = io.BytesIO(), io.BytesIO()
-    with figure_style():
-        figure.savefig(large, dpi=2 * SCREEN)
+    with figure_style(TEXT):
+        figure.savefig(large, dpi=DENSITY * SCREEN)
     # A line drawing has few colours; a palette makes half the size of it.
     with Image.open(large) as picture:
         picture.convert("RGB").quantize(PALETTE, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
@@ -98,36 +105,66 @@ def folder_figures(folder: Path) -> Iterator[NamedFigure]:
     runs = results.load_runs(folder)
     styles = method_styles(runs["controller"].tolist())
     for group in load_groups(folder):
-        yield from _group_figures(group, runs, styles)
+        chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
+        yield from _group_figures(group, chosen, load_ensembles(folder, chosen), styles)
 
 
-def _group_figures(group: Group, runs: pd.DataFrame, styles: Styles) -> Iterator[NamedFigure]:
-    chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
-    with figure_style():
-        figures = list(_drawings(group, chosen, styles))
+def _group_figures(
+    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles
+) -> Iterator[NamedFigure]:
+    with figure_style(TEXT):
+        figures = list(_drawings(group, runs, ensembles, styles))
     for kind, what, figure in figures:
         if figure is None:
             continue
-        runs_in_it = f"{group.plant}, mismatch {group.mismatch}" + ("" if kind == "effort" else f", seed {group.seed}")
-        title = f"{HEADINGS[kind]}: {', '.join(part for part in (what, runs_in_it) if part)}"
-        figure.suptitle(textwrap.fill(title, round(LETTERS * figure.get_figwidth())), fontsize=10)
+        place = f"{group.plant}, mismatch {group.mismatch}"
+        details = ", ".join(filter(None, (what, place, _sample(kind, group, runs))))
+        title = f"{HEADINGS[kind]}: {details}"
+        wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
+        figure.suptitle(f"{HEADINGS[kind]}\n{wrapped}", fontsize=TEXT + 1.0)
         words = "_".join(part for part in (kind, what, group.plant, group.mismatch) if part)
         yield NamedFigure(kind, re.sub(r"[^A-Za-z0-9.=+_-]", "_", words), title, figure)
 
 
-def _drawings(group: Group, runs: pd.DataFrame, styles: Styles) -> Iterator[tuple[str, str, Figure | None]]:
+def _sample(kind: str, group: Group, runs: pd.DataFrame) -> str:
+    """Return words for the seeds that a figure shows, and how."""
+    seeds = runs["seed"].nunique()
+    if kind in OF_FIRST_SEED or seeds == 1:
+        return f"seed {group.seed}"
+    if kind not in OVER_SEEDS:
+        return f"{seeds} seeds"
+    words = f"median of {seeds} seeds, band: the middle 80 %"
+    return f"{words}; features of seed {group.seed}" if kind == "tracking" else words
+
+
+def _drawings(
+    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles
+) -> Iterator[tuple[str, str, Figure | None]]:
     """Yield kind, what it is of within the group, and the figure."""
-    moves = list(group.select(point_to_point=True).items())
-    for first in range(0, len(moves), MOVES_A_FIGURE):
-        part = dict(moves[first : first + MOVES_A_FIGURE])
-        what = "" if len(moves) <= MOVES_A_FIGURE else "-".join(part)
-        yield "errors", what, draw_moves(part, styles)
-        yield "paths", what, draw_move_paths(part, styles)
-    for task, tracks in group.select(point_to_point=False).items():
-        yield "tracking", task, draw_tracking(tracks, styles)
-        yield "tracking_path", task, draw_tracking_path(tracks, styles)
-    yield "jacobian", "", draw_jacobians(group.tasks, styles)
-    yield "effort", "", draw_effort(runs, styles)
-    yield "step_times", "", draw_step_times(group.tasks, styles)
+    moves, curves = (group.select(point_to_point=fixed) for fixed in (True, False))
+    for what, part in _parts(moves, MOVES_A_FIGURE):
+        yield "errors", what, draw_moves({task: ensembles[task] for task in part}, styles)
+        yield "features", what, draw_features(part, {task: shown_until(ensembles[task]) for task in part}, styles)
+    for what, part in _parts(
+        moves, BLOCKS_A_FIGURE // len(divisions(name for tracks in moves.values() for name in tracks))
+    ):
+        yield "paths", what, draw_paths(part, styles)
+    for task, tracks in curves.items():
+        yield "tracking", task, draw_tracking(ensembles[task], tracks, styles)
+        yield "tracking_path", task, draw_paths({task: tracks}, styles)
+    yield "jacobian", "", draw_jacobians(ensembles, styles)
+    for what, measured in _parts(dict.fromkeys(runs["task"]), TASKS_A_FIGURE):
+        chosen = runs[runs["task"].isin(list(measured))]
+        for kind, columns in (("settling", ACCURACY), ("effort", EFFORT), ("smoothness", SMOOTHNESS)):
+            yield kind, what, draw_measures(chosen, columns, styles)
+    yield "step_times", "", draw_step_times(ensembles, styles)
     for task, tracks in group.tasks.items():
-        yield "joint_speeds", task, draw_joint_speeds(tracks, styles)
+        yield "joint_speeds", task, draw_joint_motion(tracks, shown_until(ensembles[task]))
+
+
+def _parts(tasks: Mapping[str, T], size: int) -> Iterator[tuple[str, dict[str, T]]]:
+    """Yield tasks in parts for a figure each, and words for the part where there are several."""
+    names = list(tasks)
+    for first in range(0, len(names), size):
+        part = names[first : first + size]
+        yield "" if len(names) <= size else "-".join(part), {name: tasks[name] for name in part}

@@ -1,123 +1,147 @@
-"""The figures of the paper, drawn anew from logged steps.
+"""Figures of moves and of tracked curves, among them those of the paper drawn anew from logged steps.
 
 | figure | shows | here |
 |---|---|---|
-| 4 | errors of the point-to-point moves, the measured features below | `draw_moves` |
-| 5 | paths of these moves in space, seen from the camera | `draw_move_paths` |
-| 6 | a tracked curve: desired and measured features, and the error | `draw_tracking` |
-| 7 | the tracked curve in space | `draw_tracking_path` |
+| 4 | errors of the point-to-point moves; the measured features | `draw_moves`, `draw_features` |
+| 5 | paths of these moves in space | `servobench.harness.pictures.paths` |
+| 6 | a tracked curve: error, desired and measured features | `draw_tracking` |
+| 7 | the tracked curve in space | `servobench.harness.pictures.paths` |
 
 Figure 8, the arm at eight places on the circle, is rendered by `servobench.harness.pictures.film`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Final
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from servobench.harness.pictures.panels import (
-    Styles,
-    add_legend,
-    draw_error,
-    draw_feature,
-    draw_jacobian,
-    draw_path,
-    label_rows,
-    panel_grid,
-)
-from servobench.harness.pictures.tracks import Track, Tracks, each
+from servobench.harness.pictures.ensembles import WINDOW, Ensembles, shown_until
+from servobench.harness.pictures.panels import Styles, add_legend, draw_error, draw_feature, draw_jacobian, error_limits
+from servobench.harness.pictures.style import WIDTH, divisions
+from servobench.harness.pictures.tracks import Track, Tracks, each, longest
 
-ROOM_IN_SPACE = (0.0, 0.0, 0.95, 0.95)  # constrained layout ignores 3-D axis labels
+COLUMNS: Final = 2
+LINE: Final = 0.17  # [in] of the legend
+
+DrawPanel = Callable[[Axes, Ensembles, Styles], None]
 
 
-def draw_moves(tasks: dict[str, Tracks], styles: Styles) -> Figure:
-    """Draw a column for each task: the error on top, below it each feature as it was measured (figure 4)."""
+def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure:
+    """Draw the error of each task over time: median and band over seeds, and where runs settled (figure 4).
+
+    With aids and as published are beside each other where there are both. The time ends when methods have settled.
+    """
+    figure, panels = _draw_tasks(tasks, styles, draw_error)
+    low, high = error_limits([ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
+    if high > 0.0:
+        panels[0][0].set_ylim(low if low > 0.0 else None, high)
+    for axes, task in panels:
+        until, end = shown_until(tasks[task]), max(float(own.time[-1]) for own in tasks[task].values())
+        if until < end:
+            axes.set_xlim(-0.02 * until, until)
+            axes.set_xlabel(f"time [s]; the move lasts {end:.2g} s")
+    return figure
+
+
+def draw_jacobians(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | None:
+    """Draw how far the estimated Jacobian is from the true one, over seeds; None if no run knows it."""
+    known = {
+        task: {name: own for name, own in ensembles.items() if np.isfinite(own.jacobian_error).any()}
+        for task, ensembles in tasks.items()
+    }
+    known = {task: ensembles for task, ensembles in known.items() if ensembles}
+    return _draw_tasks(known, styles, draw_jacobian)[0] if known else None
+
+
+def draw_features(tasks: Mapping[str, Tracks], until: Mapping[str, float], styles: Styles) -> Figure:
+    """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
+
+    Args:
+        tasks: task -> controller -> run.
+        until: task -> the time at which its column ends [s].
+        styles: controller -> style.
+    """
     features = _features(tasks)
-    rows, columns = 1 + len(features), len(tasks)
-    figure = Figure(figsize=(1.2 + 2.7 * columns if columns > 1 else 6.0, 2.3 + 1.35 * len(features)),
-                    layout="constrained")  # fmt: skip
-    panels = figure.subplots(
-        rows, columns, sharex="col", sharey="row", squeeze=False, height_ratios=[1.8, *[1.0] * len(features)]
-    )
+    figure = Figure(figsize=(WIDTH, 1.1 + 1.3 * len(features)), layout="constrained")
+    panels = figure.subplots(len(features), len(tasks), sharex="col", sharey="row", squeeze=False)
     for column, (task, whole) in zip(panels.T, tasks.items(), strict=True):
         tracks = each(Track.overview, whole)
-        draw_error(column[0], tracks, styles)
-        for axes, feature in zip(column[1:], features, strict=True):
+        for axes, feature in zip(column, features, strict=True):
             draw_feature(axes, tracks, styles, feature)
         column[0].set_title(task)
         column[-1].set_xlabel("time [s]")
+        if until[task] < longest(tracks).time[-1]:
+            column[-1].set_xlim(-0.02 * until[task], until[task])
     for axes in panels[:, 1:].ravel():
         axes.set_ylabel("")
     figure.align_ylabels(panels[:, 0])
-    add_legend(figure, panels.ravel(), 8 if columns > 2 else 4)
+    add_legend(figure, panels.ravel())
     return figure
 
 
-def draw_move_paths(tasks: dict[str, Tracks], styles: Styles) -> Figure:
-    """Draw the path of each task in space as the camera sees it, with start and target (figure 5)."""
-    columns = min(2, len(tasks))
-    rows = -(-len(tasks) // columns)
-    figure = Figure(figsize=(4.6 * columns if columns > 1 else 6.0, 0.6 + 4.0 * rows),
-                    layout=ConstrainedLayoutEngine(rect=ROOM_IN_SPACE))  # fmt: skip
-    panels = []
-    for i, (task, tracks) in enumerate(tasks.items()):
-        axes = figure.add_subplot(rows, columns, i + 1, projection="3d")
-        draw_path(axes, each(Track.for_path, tracks), styles)
-        axes.text2D(0.02, 1.0, task, transform=axes.transAxes, fontweight="bold")
-        panels.append(axes)
-    add_legend(figure, panels)
-    return figure
-
-
-def draw_tracking(tracks: Tracks, styles: Styles) -> Figure:
-    """Draw desired and measured features over time and the error below (figure 6).
+def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles) -> Figure:
+    """Draw the error along a curve over seeds, and below it the measured features of one run (figure 6).
 
     Of a long run, features are drawn at its end only.
     """
     features, long = _features({"": tracks}), any(track.long for track in tracks.values())
-    figure = Figure(figsize=(7.5, 2.6 + 1.4 * len(features)), layout="constrained")
-    panels = np.atleast_1d(
-        figure.subplots(len(features) + 1, 1, sharex=not long, height_ratios=[*[1.0] * len(features), 1.5])
-    )
-    for axes, feature in zip(panels, features, strict=False):
-        draw_feature(axes, each(Track.closing, tracks), styles, feature)
-    draw_error(panels[-1], each(Track.overview, tracks), styles)
-    if long:
-        panels[-2].set_xlabel("time [s], the end of the run")
-    panels[-1].set_xlabel("time [s], each point the root mean square of those around it" if long else "time [s]")
-    figure.align_ylabels(panels)
-    add_legend(figure, panels)
+    heads = divisions(ensembles)
+    figure = Figure(figsize=(WIDTH, 3.1 + 1.15 * len(features)), layout="constrained")
+    panels = figure.subplots(
+        1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
+        height_ratios=[2.2, *[1.0] * len(features)],
+    )  # fmt: skip
+    closing = each(Track.closing, tracks)
+    for column, (head, names) in zip(panels.T, heads.items(), strict=True):
+        draw_error(column[0], {name: ensembles[name] for name in names}, styles)
+        column[0].set_title(head)
+        column[0].set_ylabel(f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
+        shown = {name: closing[name] for name in names if name in closing}
+        for axes, feature in zip(column[1:], features, strict=True):
+            if shown:
+                draw_feature(axes, shown, styles, feature)
+        column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
+        if long:
+            column[0].set_xlabel("time [s]")
+    for axes in panels[:, 1:].ravel():
+        axes.set_ylabel("")
+    figure.align_ylabels(panels[:, 0])
+    add_legend(figure, panels.ravel())
     return figure
 
 
-def draw_tracking_path(tracks: Tracks, styles: Styles) -> Figure:
-    """Draw desired and true path in space (figure 7)."""
-    figure = Figure(figsize=(7.0, 5.8), layout=ConstrainedLayoutEngine(rect=ROOM_IN_SPACE))
-    axes = figure.add_subplot(projection="3d")
-    draw_path(axes, each(Track.for_path, tracks), styles)
-    add_legend(figure, [axes])
-    return figure
+def _draw_tasks(
+    tasks: Mapping[str, Ensembles], styles: Styles, draw: DrawPanel
+) -> tuple[Figure, list[tuple[Axes, str]]]:
+    """Draw a panel for each task and division of methods; return the figure, and the panels with their tasks."""
+    cells = [
+        (task, head, {name: ensembles[name] for name in names})
+        for task, ensembles in tasks.items()
+        for head, names in divisions(ensembles).items()
+    ]
+    columns = min(COLUMNS, len(cells))
+    rows = -(-len(cells) // columns)
+    names = {name for ensembles in tasks.values() for name in ensembles}
+    height = 0.6 + (2.0 if columns > 1 else 2.8) * rows + LINE * (2 + len(names) / 4)
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    panels = []
+    for axes, (task, head, ensembles) in zip(grid.flat, cells, strict=False):
+        draw(axes, ensembles, styles)
+        axes.set(title=", ".join(filter(None, (task, head))), xlabel="time [s]")
+        panels.append((axes, task))
+    for axes in grid[:, 1:].flat:
+        axes.set_ylabel("")
+    for axes in grid.flat[len(cells) :]:
+        axes.set_visible(False)
+    add_legend(figure, [axes for axes, _ in panels])
+    return figure, panels
 
 
-def draw_jacobians(tasks: dict[str, Tracks], styles: Styles) -> Figure | None:
-    """Draw how far the estimated Jacobian is from the true one, a panel a task; None if no run knows it."""
-    known = {
-        task: {name: track for name, track in tracks.items() if np.isfinite(track.column("jacobian_error")).any()}
-        for task, tracks in tasks.items()
-    }
-    known = {task: tracks for task, tracks in known.items() if tracks}
-    if not known:
-        return None
-    figure, panels = panel_grid(len(known), 2.3)
-    for axes, (task, tracks) in zip(panels, known.items(), strict=True):
-        draw_jacobian(axes, each(Track.overview, tracks), styles)
-        axes.set(title=task, xlabel="time [s]")
-    label_rows(panels, panels[0].get_ylabel())
-    add_legend(figure, panels)
-    return figure
-
-
-def _features(tasks: dict[str, Tracks]) -> list[str]:
+def _features(tasks: Mapping[str, Tracks]) -> list[str]:
     """Return the names of the features in the order of the plant; those of the richest track count."""
     return max((track.features for tracks in tasks.values() for track in tracks.values()), key=len)

@@ -16,8 +16,11 @@ from servobench.plant.checks import FloatArray
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
 BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
-WINE = "#882255"  # of Tol's palette, which goes with it
+WINE, INDIGO = "#882255", "#332288"  # of Tol's palette, which goes with it
 MARKS = 8  # on each line
+WIDTH = 7.2  # [in] of a figure: both columns of a paper, or 1,000 px of a page
+TEXT = 8.0  # [pt] of a figure of that width
+FILM_TEXT = 9.0  # [pt]
 
 
 @dataclass(frozen=True)
@@ -29,12 +32,19 @@ class MethodStyle:
         line: matplotlib's line style.
         marker: matplotlib's marker; empty = none.
         shift: 0 … 1, where between two marks of another method this one's marks lie.
+        hollow: whether its marks are not filled.
     """
 
     colour: str
     line: Any
     marker: str
     shift: float = 0.0
+    hollow: bool = False
+
+    @property
+    def face(self) -> str:
+        """Colour with which marks are filled."""
+        return "white" if self.hollow else self.colour
 
     def line_arguments(self, points: int) -> dict[str, Any]:
         """Return keyword arguments for a matplotlib line of `points` points, with about eight markers on it."""
@@ -49,29 +59,33 @@ class MethodStyle:
 
     def _arguments(self) -> dict[str, Any]:
         look = {"color": self.colour, "linestyle": self.line, "marker": self.marker}
-        return look | {"markersize": 4.5, "linewidth": 1.4}
+        return look | {"markersize": 4.0, "linewidth": 1.2, "markerfacecolor": self.face}
 
 
+DASHED = (0, (3.5, 1.5))  # of every method as published
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
     "map_mfac": MethodStyle(WINE, "-", "*"),
-    "arm_mfac": MethodStyle(WINE, "--", "H"),
-    "ukf_mfac": MethodStyle(BLUE, "--", "s"),
-    "ukf_mpc": MethodStyle(GREEN, "-.", "^"),
-    "rbf_pid": MethodStyle(ORANGE, (0, (5, 1)), "D"),
-    "calibrated": MethodStyle(BLACK, "-", ""),
+    "arm_mfac": MethodStyle(INDIGO, "-", "H"),
+    "ukf_mfac": MethodStyle(BLUE, "-", "s"),
+    "ukf_mpc": MethodStyle(GREEN, "-", "^"),
+    "rbf_pid": MethodStyle(ORANGE, "-", "D"),
+    "calibrated": MethodStyle(BLACK, "-.", ""),
     "nmpc_calibrated": MethodStyle(BLACK, ":", "x"),
     "constant": MethodStyle(GREY, ":", "v"),
-    "broyden": MethodStyle(PURPLE, "--", "P"),
-    "rls": MethodStyle(SKY, "-.", "X"),
-    "cfdl_mfac": MethodStyle(YELLOW, (0, (3, 1, 1, 1)), "*"),
+    "broyden": MethodStyle(PURPLE, "-", "P"),
+    "rls": MethodStyle(SKY, "-", "X"),
+    "cfdl_mfac": MethodStyle(YELLOW, "-", "p"),
 }
 _STYLES |= {
-    name + PUBLISHED: replace(_STYLES[name], line=(0, (1, 1))) for name in _STYLES if name + PUBLISHED in METHODS
+    name + PUBLISHED: replace(_STYLES[name], line=DASHED, hollow=True)
+    for name in _STYLES
+    if name + PUBLISHED in METHODS
 }
+UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
 _OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
-_OTHER_LINES = ((0, (1, 1)), (0, (4, 2)), (0, (6, 1, 1, 1)), "-", "--")
-_OTHER_MARKERS = ("<", ">", "h", "p", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
+_OTHER_LINES = ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-.")
+_OTHER_MARKERS = ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
 
 
 def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
@@ -85,12 +99,30 @@ def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
     return {name: replace(style, shift=i / len(styles)) for i, (name, style) in enumerate(styles.items())}
 
 
-def figure_style() -> AbstractContextManager[None]:
-    """Return the context in which every figure is drawn; text in SVG stays text, fonts in PDF are embedded."""
+def divisions(names: Iterable[str]) -> dict[str, list[str]]:
+    """Return the names with aids and those as published, under a heading each; the upper bounds are in both.
+
+    Without a method as published, or with no other, there is one division without a heading.
+    """
+    wanted = list(dict.fromkeys(names))
+    published = [name for name in wanted if name.endswith(PUBLISHED)]
+    bounds = [name for name in wanted if name in UPPER_BOUNDS]
+    others = [name for name in wanted if name not in published]
+    if not published or len(others) == len(bounds):
+        return {"": wanted}
+    return {"with aids": others, "as published": published + bounds}
+
+
+def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
+    """Return the context in which every figure is drawn; text in SVG stays text, fonts in PDF are embedded.
+
+    Args:
+        size: of the text [pt].
+    """
     return mpl.rc_context(
         {
-            "font.size": 9,
-            "axes.titlesize": 9,
+            "font.size": size,
+            "axes.titlesize": size,
             "axes.grid": True,
             "grid.alpha": 0.3,
             "axes.axisbelow": True,

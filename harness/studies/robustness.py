@@ -6,10 +6,11 @@ take longer, so that there is time to recover.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,8 +31,9 @@ from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.draw import save_figure
-from servobench.harness.pictures.panels import Styles, draw_places
-from servobench.harness.pictures.style import method_styles
+from servobench.harness.pictures.panels import Styles, add_legend
+from servobench.harness.pictures.places import Curves, draw_curves, same_curves
+from servobench.harness.pictures.style import TEXT, WIDTH, figure_style, method_styles
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
@@ -47,6 +49,16 @@ STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it
 MOVED_CAMERA: Final = "moved"  # folder of the runs whose camera is moved
 FIGURES: Final = "figures"
 LIMITS: Final = "predicted_limits.csv"
+COLUMNS: Final = 3  # panels of a picture
+NOTE: Final = 115  # letters of a line below it
+
+
+class Scale(NamedTuple):
+    """What a picture of the map shows."""
+
+    measure: Callable[[pd.DataFrame], Estimate]  # of the runs at a place
+    label: str
+    top: float  # upper edge of the panels
 
 
 @dataclass(frozen=True)
@@ -68,13 +80,13 @@ def _cell(place: Place, request: RunRequest) -> Cell:
 
 
 LINES: Final = (
-    Line("camera_rotation", "camera turned, °", parse_magnitudes("camera_rotation", "0:180:30deg")),
-    Line("links", "link lengths wrong by up to, %", parse_magnitudes("links", "0:30:10%")),
-    Line("joint_offsets", "joint zeros wrong by up to, °", parse_magnitudes("joint_offsets", "0:20:5deg")),
-    Line("tool", "tool wrong by up to, mm", parse_magnitudes("tool", "0:100:25mm")),
-    Line(LATENCY, "camera latency, ms", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
-    Line(NOISE, "sensor noise, times the usual", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
-    Line(MOVE, "camera moved half-way through the run, °", parse_magnitudes(MOVE, "0:180:45deg")),
+    Line("camera_rotation", "camera turned [°]", parse_magnitudes("camera_rotation", "0:180:30deg")),
+    Line("links", "link lengths wrong by up to [%]", parse_magnitudes("links", "0:30:10%")),
+    Line("joint_offsets", "joint zeros wrong by up to [°]", parse_magnitudes("joint_offsets", "0:20:5deg")),
+    Line("tool", "tool wrong by up to [mm]", parse_magnitudes("tool", "0:100:25mm")),
+    Line(LATENCY, "camera latency [ms]", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
+    Line(NOISE, "sensor noise [times the usual]", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
+    Line(MOVE, "camera moved half-way [°]", parse_magnitudes(MOVE, "0:180:45deg")),
 )
 
 
@@ -174,16 +186,12 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | Non
     """
     if "axis" not in runs or not set(runs["axis"]) & {line.axis for line in LINES}:
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
-    arrived = f"Runs that arrived within {settling_band(runs)} and stayed, %"
+    arrived = f"Runs that came within {settling_band(runs)} and stayed"
+    took = "Median settling time, from the move where the camera moves"
     return [
-        *_draw(runs, folder / "robustness", arrived, settled_share, 104.0, limits or {}),
+        *_draw(runs, folder / "robustness", arrived, Scale(settled_share, "settled runs [%]", 104.0), limits or {}),
         *_draw(
-            runs,
-            folder / "robustness_settling",
-            "Median settling time (after the move, where the camera moves), s",
-            settling_median,
-            10.0,
-            limits or {},
+            runs, folder / "robustness_settling", took, Scale(settling_median, "settling time [s]", 10.0), limits or {}
         ),
     ]
 
@@ -197,48 +205,61 @@ def settling_median(runs: pd.DataFrame) -> Estimate:
     return median_with_interval((settling_times(runs) - begin).clip(lower=0.0))
 
 
-def _draw(
-    runs: pd.DataFrame,
-    stem: Path,
-    title: str,
-    measure: Callable[[pd.DataFrame], Estimate],
-    top: float,
-    limits: Mapping[str, float],
-) -> list[Path]:
-    lines = [line for line in LINES if line.axis in set(runs["axis"])]
+def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapping[str, float]) -> list[Path]:
     controllers = list(dict.fromkeys(runs["controller"]))
     styles = method_styles(controllers)
-    columns = min(4, len(lines))
-    rows = -(-len(lines) // columns)
-    figure = Figure(figsize=(3.1 * columns, 2.5 * rows + 0.5), layout="constrained")
-    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    for axes, line in zip(grid.flat, lines, strict=False):
-        cells = dict(iter(runs[runs["axis"] == line.axis].groupby(["controller", "magnitude"])))
-        values = {name: [measure(cells[name, place.number]) for place in line.places] for name in controllers}
-        draw_places(axes, range(len(line.places)), values, styles, joined=True)
-        axes.set_xticks(range(len(line.places)), [f"{place.number:g}" for place in line.places])
-        axes.set_xlabel(line.title)
-        if line.axis == LATENCY and limits:
-            _mark_limits(axes, line, limits, styles)
-        axes.set_ylim(0.0, top)
-        axes.grid(visible=True, alpha=0.3)
-    for axes in grid.flat[len(lines) :]:
-        axes.set_axis_off()
-    handles, labels = grid.flat[0].get_legend_handles_labels()
-    if len(lines) < grid.size:
-        grid.flat[-1].legend(handles, labels, loc="center", frameon=False, fontsize=11)
-    else:
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(controllers), frameon=False)
+    curves: dict[str, Curves] = {}
+    for line in LINES:
+        if line.axis in set(runs["axis"]):
+            cells = dict(iter(runs[runs["axis"] == line.axis].groupby(["controller", "magnitude"])))
+            curves[line.axis] = {
+                name: [scale.measure(cells[name, place.number]) for place in line.places] for name in controllers
+            }
+    flat = [axis for axis in curves if _is_flat(curves[axis])]
+    lines = [line for line in LINES if line.axis in curves and (line.axis not in flat or len(flat) == len(curves))]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
-    figure.suptitle(f"{title}: {robots} robots a point on {plant}, bars are 95 % intervals")
+    with figure_style(TEXT):
+        columns = min(COLUMNS, len(lines))
+        rows = -(-len(lines) // columns)
+        figure = Figure(figsize=(WIDTH, 1.5 + 1.9 * rows), layout="constrained")
+        grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+        for axes, line in zip(grid.flat, lines, strict=False):
+            draw_curves(axes, [place.number for place in line.places], curves[line.axis], styles, scale.top)
+            axes.set_xticks([place.number for place in line.places])
+            axes.set_xlabel(line.title)
+            if line.axis == LATENCY and limits:
+                _mark_limits(axes, line, limits, styles)
+        for axes in grid[:, 0]:
+            axes.set_ylabel(scale.label)
+        for axes in grid.flat[len(lines) :]:
+            axes.set_axis_off()
+        figure.suptitle(f"{title}: {robots} robots a point on {plant}, bands are 95 % intervals", fontsize=TEXT + 1.0)
+        notes = [_name_flat(flat, curves)] if 0 < len(flat) < len(curves) else []
+        if any(np.isinf(e.value) for axis in curves.values() for estimates in axis.values() for e in estimates):
+            notes.append("Triangles at the upper edge: half of the runs or more never settle.")
+        figure.supxlabel("\n".join(textwrap.fill(note, NOTE) for note in notes), fontsize=TEXT - 0.5)
+        add_legend(figure, grid.flat)
     return save_figure(figure, stem)
+
+
+def _is_flat(curves: Curves) -> bool:
+    """Return whether all methods have the same value at all places."""
+    return len(same_curves(curves)) == 1 and len({e.value for estimates in curves.values() for e in estimates}) == 1
+
+
+def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
+    """Return a sentence on the axes along which nothing differs."""
+    found = next(iter(curves[flat[0]].values()))[0]
+    titles = [line for line in LINES if line.axis in flat]
+    words = "; ".join(f"{line.title}, up to {line.places[-1].number:g}" for line in titles)
+    return f"Every method has {found.value:g} at every place, with an interval from {found.low:.0f}, along: {words}."
 
 
 def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: Styles) -> None:
     """Draw a vertical line where each method is predicted to become unstable, if that is on the axis."""
-    numbers = [place.number for place in line.places]
     for name, limit in limits.items():
-        if name in styles and 1000.0 * limit <= numbers[-1]:
-            where = np.interp(1000.0 * limit, numbers, np.arange(len(numbers)))
-            axes.axvline(where, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6)
+        if name in styles and 1000.0 * limit <= line.places[-1].number:
+            axes.axvline(
+                1000.0 * limit, color=styles[name].colour, linestyle=styles[name].line, linewidth=1.6, alpha=0.6
+            )
     axes.set_xlabel(f"{line.title}\n(upright: predicted limit of stability)")

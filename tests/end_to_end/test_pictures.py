@@ -53,24 +53,29 @@ def test_marks_lie_evenly_along_a_path_and_not_in_time():
 
 def test_a_comparison_gives_the_figures_of_the_paper_and_more(tmp_path):
     assert kinds(comparison(tmp_path / "out")) == [
-        "errors", "paths", "tracking", "tracking_path", "jacobian", "effort", "step_times",
-        "joint_speeds", "joint_speeds", "joint_speeds",
+        "errors", "features", "paths", "tracking", "tracking_path", "jacobian", "settling", "effort", "smoothness",
+        "step_times", "joint_speeds", "joint_speeds", "joint_speeds",
     ]  # fmt: skip
 
 
-def test_every_axis_of_every_figure_has_a_unit_and_the_legend_every_controller(tmp_path):
+def test_every_axis_of_every_figure_has_a_unit_and_the_figure_names_every_controller(tmp_path):
     for named in folder_figures(comparison(tmp_path / "out")):
         figure = named.figure
         figure.canvas.draw()
-        outer = [figure.get_supylabel(), figure.get_supxlabel()]
+        assert figure.get_suptitle().startswith(named.title.split(":")[0]), named.stem
+        if figure.subfigs:
+            assert all("[" in part.get_supxlabel() for part in figure.subfigs), named.stem
+        elif named.kind == "joint_speeds":
+            assert all("[" in axes.get_title() for axes in figure.axes[:3])
+            assert [axes.get_xlabel() for axes in figure.axes[-3:]] == ["time [s]"] * 3
+        else:
+            for axes in filter(lambda axes: axes.get_visible(), figure.axes):
+                assert axes.get_xlabel() or not any(label.get_visible() for label in axes.get_xticklabels()), named.stem
+                labels = [axes.get_xlabel(), axes.get_ylabel()]
+                assert all("[" in label for label in labels if label), named.stem
+        words = legend_of(figure)
         for axes in figure.axes:
-            if not axes.get_visible():
-                continue
-            assert axes.get_xlabel() or not any(label.get_visible() for label in axes.get_xticklabels()), named.stem
-            labels = [axes.get_xlabel(), axes.get_ylabel(), *outer]
-            labels += [axes.get_zlabel()] if hasattr(axes, "get_zlabel") else []
-            assert all("[" in label for label in labels if label and not label.startswith("hollow")), named.stem
-        words = legend_of(figure) or [text.get_text() for axes in figure.axes for text in axes.get_yticklabels()]
+            words += [axes.get_ylabel(), *(text.get_text() for text in axes.get_yticklabels())]
         assert set(CONTROLLERS) <= set(words), named.stem
 
 
@@ -85,7 +90,7 @@ def test_figures_are_files_in_two_formats_and_the_same_each_time(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     paths = draw_figures(folder)
     assert {path.suffix for path in paths} == {".png", ".pdf"}
-    assert len(paths) == 12
+    assert len(paths) == 18
     before = {path.name: path.read_bytes() for path in paths}
     assert before == {path.name: path.read_bytes() for path in draw_figures(folder)}
 
@@ -100,7 +105,7 @@ def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
     for named in folder_figures(folder):
         if named.kind in ("errors", "paths", "jacobian"):
             assert ENDED in legend_of(named.figure), named.kind
-    assert any(named.figure.get_supxlabel().startswith("hollow") for named in folder_figures(folder))
+    assert any("hollow: the run ended early" in named.figure.get_supxlabel() for named in folder_figures(folder))
 
 
 def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
@@ -136,10 +141,21 @@ def test_a_plant_with_other_features_and_joints_is_drawn_under_its_own_names(tmp
         assert set(named.stem) <= set("abcdefghijklmnopqrstuvwxyz_0123456789.")
         if named.kind == "errors":
             labels = [axes.get_ylabel() for axes in named.figure.axes]
-            assert labels == ["true error [rad]", "measured\nsway_angle [rad]", "measured\ntrolley [m]"]
+            assert labels == ["true error [rad]"]
             assert "settling band, 0.1 rad" in legend_of(named.figure)
+        if named.kind == "features":
+            labels = [axes.get_ylabel() for axes in named.figure.axes]
+            assert labels == ["measured\nsway_angle [rad]", "measured\ntrolley [m]"]
         if named.kind == "paths":
-            assert "fewer than three features" in [text.get_text() for text in named.figure.axes[0].texts]
+            (axes,) = named.figure.axes
+            assert (axes.get_xlabel(), axes.get_ylabel()) == ("sway_angle [rad]", "trolley [m]")
+            assert axes.get_aspect() == "auto"
+
+
+def test_a_single_feature_has_no_path(tmp_path):
+    folder = write_folder(tmp_path / "out", [made_up_row("a")], [made_up_steps("a", features=("level_m",))])
+    assert {"errors", "features"} < set(kinds(folder))
+    assert "paths" not in kinds(folder)
 
 
 def test_half_an_hour_is_drawn_with_few_points(tmp_path):
@@ -175,7 +191,8 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     figure = draw_conditions(moves, method_styles(CONTROLLERS))
     labels = [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
     assert labels == ["latency [ms]", "camera rotation [deg]"]
-    share = np.asarray(figure.axes[1].containers[0].lines[0].get_ydata(), dtype=float)
+    share = np.asarray(figure.axes[1].get_lines()[0].get_ydata(), dtype=float)
+    assert "all methods" in figure.axes[1].texts[0].get_text().replace("\n", " ")
     np.testing.assert_allclose(share, [100.0, 100 * 4 / 6, 50.0])
     moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "same")))
     assert draw_conditions(moves, method_styles(CONTROLLERS)) is None

@@ -72,4 +72,34 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatc
     draw_map(runs, tmp_path, limits)
     lines = [np.asarray(each.get_xdata()) for each in figures[0].axes[0].get_lines()]
     upright = [x[0] for x in lines if len(x) == 2 and x[0] == x[1]]
-    assert upright == [pytest.approx(limits["pid+true"] / 0.05)]
+    assert upright == [pytest.approx(1000.0 * limits["pid+true"])]
+
+
+def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, monkeypatch):
+    runs = pd.DataFrame(
+        [
+            {"axis": line.axis, "controller": name, "magnitude": place.number, "seed": seed, "plant": "kinematic",
+             "status": "completed", "task_kind": "point_to_point", "settling_band": 0.005, "feature_unit": "m",
+             "settling_time_s": math.nan if (line.axis, name) == ("noise", "rls") and place.number > 2 else 1.0 + seed}
+            for line in LINES if line.axis in ("links", "noise", "tool")
+            for name in ("ukf_mfac", "ukf_mpc", "rls")
+            for place in line.places
+            for seed in range(3)
+        ]
+    )  # fmt: skip
+    figures = []
+    monkeypatch.setattr(robustness, "save_figure", lambda figure, stem: figures.append(figure) or [stem])
+    draw_map(runs, tmp_path)
+    success = figures[0]
+    assert [axes.get_xlabel() for axes in success.axes] == ["sensor noise [times the usual]"]
+    note = success.get_supxlabel().replace("\n", " ")
+    assert "Every method has 100 at every place, with an interval from 44, along: link lengths" in note
+    assert "tool wrong by up to [mm], up to 100" in note
+    (axes,) = success.axes
+    drawn = {line.get_label(): line for line in axes.get_lines() if len(line.get_xdata())}
+    assert np.asarray(drawn["rls"].get_xdata()).tolist() == [0, 1, 2, 4, 8]  # to scale, without any shift
+    assert np.asarray(drawn["rls"].get_ydata()).tolist() == [100, 100, 100, 0, 0]
+    assert "ukf_mpc" not in drawn
+    assert axes.texts[0].get_text().replace("\n", " ") == "one line 100 throughout: ukf_mfac, ukf_mpc"
+    assert [text.get_text() for text in success.legends[0].get_texts()] == ["ukf_mfac", "ukf_mpc", "rls"]
+    assert "half of the runs or more never settle" in figures[1].get_supxlabel()

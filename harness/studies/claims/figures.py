@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.pictures.draw import save_figure
-from servobench.harness.pictures.panels import draw_places
+from servobench.harness.pictures.places import draw_places
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.studies.claims.measurements import Answer, Measurement
 
@@ -50,7 +50,7 @@ def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
     labels = list(dict.fromkeys(m.label for m in measured))
     known = {(m.label, m.place): m.estimate for m in measured}
     values = {label: [known.get((label, place), NO_ESTIMATE) for place in places] for label in labels}
-    draw_places(axes, range(len(places)), values, method_styles(labels), joined=False)
+    draw_places(axes, range(len(places)), values, method_styles(labels))
     axes.set_xticks(range(len(places)), places)
     axes.set_xlim(-0.6, len(places) - 0.4)
     if "−" in measured[0].panel or " over " in measured[0].panel:  # a difference or a ratio: a line at "alike"

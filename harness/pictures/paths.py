@@ -1,0 +1,176 @@
+"""Paths of the feature in space, in two views to scale: what the camera sees, and the same from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servobench.harness.pictures.panels import DESIRED, END_MARK, Styles, add_legend
+from servobench.harness.pictures.style import WIDTH, divisions
+from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
+from servobench.plant.checks import FloatArray
+
+COLUMNS: Final = 2
+PANEL: Final = 2.8  # [in] width of a view
+SLIMMEST, TALLEST = 0.3, 1.0  # height of a view over its width
+ROOM: Final = 1.16  # of a view over the paths in it
+ARROW: Final = 0.06  # of a curve, from where to where an arrow shows its direction
+CAMERA_FRAME: Final = {
+    "x_m": "x, to the right [m]",
+    "y_m": "y, downwards [m]",
+    "z_m": "z, depth [m]",
+}  # of a feature in the frame of the camera
+
+
+class View(NamedTuple):
+    """Which features a view shows."""
+
+    title: str
+    across: int
+    upright: int
+
+
+class Block(NamedTuple):
+    """The views of the runs of a task that stand above each other."""
+
+    title: str
+    tracks: Tracks
+    extent: _Extent
+
+
+def draw_paths(tasks: Mapping[str, Tracks], styles: Styles) -> Figure | None:
+    """Draw the true paths of one run of each controller in two views, to scale; None with fewer than two features.
+
+    Start, target and desired path are in black, an arrow shows in which direction a curve is followed.
+    """
+    views = _views(next(iter(tasks.values())))
+    if not views:
+        return None
+    blocks = _blocks(tasks, views)
+    columns = min(COLUMNS, len(blocks))
+    rows = -(-len(blocks) // columns)
+    lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
+    ratios = [max(block.extent.ratio(i) for block in line) for line in lines for i in range(len(views))]
+    width = PANEL if columns > 1 else 4.2
+    figure = Figure(figsize=(WIDTH, 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views))), layout="constrained")
+    grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
+    for number, block in enumerate(blocks):
+        row, column = divmod(number, columns)
+        for i, view in enumerate(views):
+            axes = grid[row * len(views) + i, column]
+            _draw_view(axes, block.tracks, styles, view)
+            block.extent.apply(axes, i, ratios[row * len(views) + i])
+            axes.set_title(f"{block.title}: {view.title}" if len(views) > 1 else block.title)
+            if i + 1 < len(views):  # the view below has the same abscissa
+                axes.set_xlabel("")
+                axes.tick_params(labelbottom=False)
+    for axes in grid.reshape(rows, len(views), columns).transpose(0, 2, 1).reshape(-1, len(views))[len(blocks) :].flat:
+        axes.set_visible(False)
+    add_legend(figure, [axes for axes in grid.flat if axes.get_visible()])
+    return figure
+
+
+def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[Block]:
+    """Return a block for each task and division of methods; the blocks of a task have the same extent."""
+    blocks = []
+    for task, whole in tasks.items():
+        tracks = each(Track.for_path, whole)
+        extent = _Extent(tracks, views)
+        for head, names in divisions(tracks).items():
+            title = ", ".join(filter(None, (task, head)))
+            blocks.append(Block(title, {name: tracks[name] for name in names}, extent))
+    return blocks
+
+
+def _views(tracks: Tracks) -> list[View]:
+    features = longest(tracks).features
+    if features[:3] == list(CAMERA_FRAME):
+        return [View("as the camera sees it", 0, 1), View("from above", 0, 2)]
+    names = [name.rpartition("_")[0] for name in features]
+    return [View(f"{names[i]} over {names[0]}", 0, i) for i in range(1, min(3, len(names)))]
+
+
+class _Extent:
+    """The range of the paths of a block along each of its features."""
+
+    def __init__(self, tracks: Tracks, views: list[View]) -> None:
+        points = np.concatenate([_points(track, "true_feature_") for track in tracks.values()])
+        points = np.concatenate([points, _points(longest(tracks), "reference_")])
+        names = longest(tracks).features
+        self._views = views
+        self._to_scale = [names[v.across].rpartition("_")[2] == names[v.upright].rpartition("_")[2] for v in views]
+        self._middle = (points.max(axis=0) + points.min(axis=0)) / 2
+        self._size = np.maximum(ROOM * np.ptp(points, axis=0), 1e-6)
+        scaled = [self._size[v.upright] / TALLEST for v, scale in zip(views, self._to_scale, strict=True) if scale]
+        self._across = max([float(self._size[views[0].across]), *scaled])
+
+    def ratio(self, i: int) -> float:
+        """Return height over width that a view needs."""
+        if not self._to_scale[i]:
+            return 0.6
+        return float(np.clip(self._size[self._views[i].upright] / self._across, SLIMMEST, TALLEST))
+
+    def apply(self, axes: Axes, i: int, ratio: float) -> None:
+        """Set the limits of a view whose height over width is given; lengths have the same scale both ways."""
+        view = self._views[i]
+        middle, half = self._middle[view.across], self._across / 2
+        axes.set_xlim(middle - half, middle + half)
+        middle = self._middle[view.upright]
+        half = ratio * self._across / 2 if self._to_scale[i] else self._size[view.upright] / 2
+        axes.set_ylim(middle - half, middle + half)
+        if self._to_scale[i]:
+            axes.set_aspect("equal", adjustable="box")
+        if axes.get_ylabel() == CAMERA_FRAME["y_m"]:
+            axes.invert_yaxis()
+        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
+        axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _draw_view(axes: Axes, tracks: Tracks, styles: Styles, view: View) -> None:
+    whole = longest(tracks)
+    chosen = [view.across, view.upright]
+    reference = _points(whole, "reference_")[:, chosen]
+    if not whole.point_to_point:
+        axes.plot(*reference.T, **DESIRED)
+        _draw_direction(axes, reference)
+    for name, track in tracks.items():
+        points = _points(track, "true_feature_")[:, chosen]
+        if len(points):
+            axes.plot(*points.T, label=name, **styles[name].path_arguments(points))
+            if not track.completed:
+                axes.plot(*points[-1:].T, color=styles[name].colour, **END_MARK)
+    start = _points(whole, "true_feature_")[:1, chosen]
+    axes.plot(*start.T, color="black", marker="s", markersize=6, markerfacecolor="white", markeredgewidth=1.3,
+              linestyle="", label="start", zorder=10)  # fmt: skip
+    if whole.point_to_point:
+        axes.plot(*reference[:1].T, color="black", marker="*", markersize=10, markerfacecolor="white", linestyle="",
+                  label="target", zorder=11)  # fmt: skip
+    labels = [CAMERA_FRAME.get(whole.features[i], label_of(whole.features[i])) for i in chosen]
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+
+
+def _draw_direction(axes: Axes, reference: FloatArray) -> None:
+    """Draw an arrow along a desired curve near its start."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
+    first, second = np.searchsorted(way, [ARROW * way[-1], 1.4 * ARROW * way[-1]])
+    if first < second < len(reference):
+        look = {
+            "arrowstyle": "-|>",
+            "color": "black",
+            "linewidth": 1.2,
+            "mutation_scale": 14,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
+        axes.annotate("", reference[second], reference[first], arrowprops=look, zorder=9)
+
+
+def _points(track: Track, kind: str) -> FloatArray:
+    """Return those rows of the first three features that are known throughout, (k, 3 or fewer)."""
+    points = track.vectors(kind)[:, :3]
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
