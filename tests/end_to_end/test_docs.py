@@ -59,10 +59,10 @@ def test_what_a_page_says_that_commands_print_is_what_they_print(page, monkeypat
 
 
 def test_another_output_than_that_of_the_page_is_found():
-    told, printed = console.plain("a 1\n...\n c 3 99\n"), console.plain("a 1\nb\n c 3 7\n")
+    told, printed = console.plain(" a 1 5\n...\n c 3 99\n"), console.plain(" a 1 7\n b 5\n c 3 7*\n")
     console.compare("it", told, printed)
     with pytest.raises(AssertionError, match="does not print 'c 4'"):
-        console.compare("it", console.plain("a 1\n...\n c 4 99\n"), printed)
+        console.compare("it", console.plain(" a 1 2\n...\n c 4 99\n"), printed)
     with pytest.raises(AssertionError, match="also prints"):
         console.compare("it", told[:1], printed)
 

@@ -60,7 +60,7 @@ def carry_out(text, monkeypatch, capsys, folder):
         code = servobench(monkeypatch, *what[1:])
         captured = capsys.readouterr()
         assert code == 0, f"{what}: exit code {code}: {captured.out}{captured.err}"
-        compare(" ".join(what), plain(content), plain(captured.out + captured.err))
+        compare(" ".join(what), plain(content), plain(captured.out))
 
 
 def compare(command, told, printed):
