@@ -18,31 +18,22 @@ A measured table is that of docs/tables, which `make results` writes; until it i
 
 from __future__ import annotations
 
-import ast
-import dataclasses
 import importlib
-import inspect
-import json
 import os
 import re
 import sys
-import textwrap
-from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
 import methods_table
 import stored_tables
 from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
+from servobench.harness.config.describe import describe_settings, toml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
 PART = re.compile(r"(<!-- (settings|variables|table|studies|methods): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
-UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # what a string below a field begins with
-SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
 def main() -> None:
@@ -108,60 +99,11 @@ def settings_table(kind: type[Any]) -> str:
         ValueError: a field has no string below it.
     """
     rows = []
-    for name, value, wanted, string in settings_rows(kind(), ""):
-        unit, meaning = UNIT.fullmatch(string).groups(default="")  # type: ignore[union-attr]
-        rows.append((f"`{name}`", toml(value), unit, wanted, meaning))
+    for each in describe_settings(kind()):
+        if not each.meaning:
+            raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
+        rows.append((f"`{each.key}`", toml(each.value), each.unit, each.allowed, each.meaning))
     return table(("setting", "default", "unit", "allowed", "meaning"), rows)
-
-
-def settings_rows(config: Any, prefix: str) -> Iterator[tuple[str, Any, str, str]]:  # noqa: ANN401 - any settings
-    """Yield name, default, what is allowed, and the meaning of each setting of `config`."""
-    meanings, hints = field_strings(type(config)), get_type_hints(type(config), include_extras=True)
-    for item in dataclasses.fields(config):
-        value = getattr(config, item.name)
-        if dataclasses.is_dataclass(value):
-            yield from settings_rows(value, f"{prefix}{item.name}.")
-        elif item.name not in meanings:
-            raise ValueError(f"{type(config).__name__}.{item.name} has no string below it that says its meaning")
-        else:
-            yield prefix + item.name, value, allowed(hints[item.name]), meanings[item.name]
-
-
-def field_strings(kind: type[Any]) -> dict[str, str]:
-    """Return the strings below the fields of a class and of those that it inherits from, as one line each, by field."""
-    strings = {}
-    for each in reversed(kind.__mro__[:-1]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0].body  # type: ignore[attr-defined]
-        for field, below in pairwise(body):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(below, ast.Expr)
-                and isinstance(below.value, ast.Constant)
-            ):
-                strings[field.target.id] = " ".join(below.value.value.split())
-    return strings
-
-
-def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
-    """Return what a type allows, in words; nothing for what the default shows already."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is Annotated:
-        bounds = [
-            f"{sign} {getattr(bound, name):g}"
-            for bound in arguments[1:]
-            for name, sign in SIGNS.items()
-            if hasattr(bound, name)
-        ]
-        return ", ".join(part for part in (allowed(arguments[0]), *bounds) if part)
-    if origin is Literal:
-        return ", ".join(map(toml, arguments))
-    if origin in (Union, UnionType):
-        return " or ".join(filter(None, (allowed(each) for each in arguments if each is not NoneType)))
-    if origin is tuple:
-        each = allowed(arguments[0])
-        size = "list" if arguments[-1] is Ellipsis else f"{len(arguments)} numbers"
-        return size + (f", each {each}" if each else "")
-    return "whole" if hint is int else ""
 
 
 def variables_table() -> str:
@@ -171,15 +113,6 @@ def variables_table() -> str:
         for group in arm_layout(6).groups
     ]
     return table(("variable", "size", "role", "unit", "meaning"), rows)
-
-
-def toml(value: Any) -> str:  # noqa: ANN401 - any setting
-    """Return a value as TOML has it; nothing for a value that is absent."""
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(map(toml, value)) + "]"
-    return (
-        "" if value is None else json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
-    )
 
 
 def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:

@@ -7,54 +7,111 @@ from typing import Annotated, Any
 
 import typer
 
-from servobench.harness.cli.terminal import console
+from servobench.harness.cli import completion
+from servobench.harness.cli.terminal import console, print_json
 
-NameArgument = Annotated[str | None, typer.Argument(help="Show the settings of this one.")]
+HELP = "Show the settings of this one."
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 
 
-def plants(name: NameArgument = None) -> None:
+def plants(
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.plants)] = None,
+    as_json: JsonOption = False,
+) -> None:
     """List the plants, or show the settings of one."""
     from servobench.harness.config.registry import find_plant, installed_plant, plant_names
 
-    _show("plants", name, plant_names(), find_plant if name else installed_plant, lambda entry: entry.config())
+    if name:
+        _show_settings(name, find_plant(name).config(), as_json=as_json)
+    else:
+        _show_names(plant_names(), installed_plant, as_json=as_json)
 
 
-def controllers(name: NameArgument = None) -> None:
+def controllers(
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.controllers)] = None,
+    as_json: JsonOption = False,
+) -> None:
     """List the controllers, or show the settings of one."""
     from servobench.controllers.parts import ESTIMATORS, LAWS
     from servobench.harness.config.defaults import default_config
     from servobench.harness.config.registry import choose_controller, controller_names, find_controller
 
-    name = choose_controller(name) if name else None
-    _show("controllers", name, controller_names(), find_controller, default_config)
-    if not name:
-        console.print(f"or any law with any estimator, such as mfac+rls: laws {', '.join(LAWS)};", soft_wrap=True)
-        console.print(f"estimators {', '.join(ESTIMATORS)}", soft_wrap=True)
+    if name:
+        name = choose_controller(name)
+        _show_settings(name, default_config(find_controller(name)), as_json=as_json)
+        return
+    _show_names(controller_names(), find_controller, as_json=as_json)
+    if not as_json:
+        console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
+        console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
 
 
-def tasks(name: NameArgument = None) -> None:
+def tasks(
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.tasks)] = None,
+    as_json: JsonOption = False,
+) -> None:
     """List the tasks, or show the settings of one."""
     from servobench.harness.run.tasks import TASKS, find_task
 
-    _show("tasks", name, list(TASKS), find_task, lambda entry: entry.default)
-
-
-def _show(
-    kind: str, name: str | None, names: Sequence[str], find: Callable[[str], Any], default: Callable[[Any], Any]
-) -> None:
-    """Print names with their summaries, or the settings of one with their defaults."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    from servobench.harness.config.settings import ConfigurationError, flatten
-
-    table = Table("setting", "default") if name else Table(kind, "")
     if name:
-        for key, value in flatten(default(find(name))).items():
-            table.add_row(f"{name}.{key}", str(value))
-    for known in () if name else names:
+        _show_settings(name, find_task(name).default, as_json=as_json)
+    else:
+        _show_names(list(TASKS), find_task, as_json=as_json)
+
+
+def _show_names(names: Sequence[str], find: Callable[[str], Any], *, as_json: bool) -> None:
+    """Print names with their summaries, and what is wrong with those that cannot be used."""
+    from rich.table import Table
+    from rich.text import Text
+
+    from servobench.harness.config.settings import ConfigurationError
+
+    found: list[dict[str, str]] = []
+    for name in names:
         try:
-            table.add_row(known, find(known).summary)
+            found.append({"name": name, "summary": find(name).summary})
         except ConfigurationError as error:  # an extra is missing, or a plug-in is broken; the others are usable
-            table.add_row(known, escape(str(error)))
+            found.append({"name": name, "error": str(error)})
+    if as_json:
+        print_json(found)
+        return
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True, style="bold")
+    table.add_column()
+    summaries = {each["name"]: each.get("summary", "") for each in found}
+    for each in found:
+        base = summaries.get(each["name"].partition(":")[0], "")
+        words = each.get("summary", "")
+        if base and words != base:  # a variant: only what is different
+            words = words.removeprefix(base).lstrip("; ")
+        table.add_row(Text(each["name"]), Text(words) if words else Text(each.get("error", ""), style="red"))
     console.print(table)
+
+
+def _show_settings(section: str, config: object, *, as_json: bool) -> None:
+    """Print each setting with its default, and what it means."""
+    from rich.padding import Padding
+    from rich.text import Text
+
+    from servobench.harness.config.describe import describe_settings, plain, toml
+
+    found = list(describe_settings(config))
+    if as_json:
+        facts = ("unit", "allowed", "meaning")
+        print_json(
+            [
+                {"setting": f"{section}.{each.key}", "default": plain(each.value)}
+                | {fact: getattr(each, fact) for fact in facts}
+                for each in found
+            ]
+        )
+        return
+    if not found:
+        console.print(f"{section} has no settings", markup=False, highlight=False)
+    for each in found:
+        line = Text(f"{section}.{each.key}", style="bold").append(f" = {toml(each.value) or 'unset'}", style="not bold")
+        console.print(line, soft_wrap=True)
+        unit = f"[{each.unit}] " if each.unit else ""
+        words = f"{unit}{each.meaning.rstrip('.')}{f' ({each.allowed})' if each.allowed else ''}"
+        if words:
+            console.print(Padding(Text(words, style="dim"), (0, 0, 0, 4)))

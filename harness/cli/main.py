@@ -13,6 +13,7 @@ from rich.markup import escape
 from servobench.harness.cli import lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
 from servobench.harness.cli.fmu import fmu_app
+from servobench.harness.cli.init import init
 from servobench.harness.cli.options import INTERRUPTED, grouped
 from servobench.harness.cli.record import record
 from servobench.harness.cli.sweep import sweep
@@ -20,7 +21,7 @@ from servobench.harness.cli.sweep import sweep
 INPUT_ERROR = 2  # exit code
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
-    "What there is": (lists.plants, lists.controllers, lists.tasks),
+    "What there is": (lists.plants, lists.controllers, lists.tasks, init),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
     "Tools": (runs.train, runs.collect),
 }
@@ -67,11 +68,8 @@ def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public 
 
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
-    from servobench.harness.config.registry import offering
-
     try:
-        with offering():
-            code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
+        code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
         code = INTERRUPTED
     except typer.TyperException as error:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from servobench.harness.cli import completion
+
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
     from servobench.harness.config.settings import Settings
@@ -29,11 +31,25 @@ SchedulerOption = Annotated[str | None, typer.Option(help="Address of a Dask sch
 TimeoutOption = Annotated[
     float | None, typer.Option(min=0.001, help="Time limit of a run [s]; a run that takes longer becomes a failed row.")
 ]
-NamesOption = Annotated[str, typer.Option(help="Comma-separated names, or 'all'.")]
+NAMES = "Comma-separated names, or 'all'."
+PlantsOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.plants))]
+ControllersOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.controllers))]
+TasksOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.tasks))]
+TaskOption = Annotated[str, typer.Option(help="Name of the task.", autocompletion=completion.tasks)]
+MismatchOption = Annotated[
+    str,
+    typer.Option(
+        help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.", autocompletion=completion.mismatches
+    ),
+]
+MismatchesOption = Annotated[
+    str, typer.Option(help="Comma-separated mismatches.", autocompletion=completion.listed(completion.mismatches))
+]
 RobotOption = Annotated[
     str,
     typer.Option(
-        help="ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf."
+        help="ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf.",
+        autocompletion=completion.robots,
     ),
 ]
 SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
@@ -129,9 +145,12 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
+        from servobench.harness.config.registry import offering
+
         for name, group in groups.items():
             values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
-        command(**values)
+        with offering():  # a user's own controllers have their names for as long as the command takes
+            command(**values)
 
     vars(call).update(
         __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from servobench.harness.cli import completion
 from servobench.harness.cli.options import split_names
 from servobench.harness.cli.terminal import cleaning_up_when_terminated, console
 
@@ -25,8 +27,8 @@ RECORDED = {
 RECORDINGS = "recordings"
 
 
-def _new(what: str) -> str:
-    return f"New run: {what}, default {RECORDED[what]}."
+def _new(what: str, complete: Callable[[str], list[str]] | None = None) -> Any:  # noqa: ANN401 - typer's word for it
+    return typer.Option(help=f"New run: {what}, default {RECORDED[what]}.", autocompletion=complete)
 
 
 def record(
@@ -34,12 +36,12 @@ def record(
         Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
     ] = None,
     run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
-    plant: Annotated[str | None, typer.Option(help=_new("plant"))] = None,
-    controller: Annotated[str | None, typer.Option(help=_new("controller"))] = None,
-    task: Annotated[str | None, typer.Option(help=_new("task"))] = None,
-    mismatch: Annotated[str | None, typer.Option(help=_new("mismatch"))] = None,
-    robot: Annotated[str | None, typer.Option(help=_new("robot"))] = None,
-    seed: Annotated[int | None, typer.Option(help=_new("seed"))] = None,
+    plant: Annotated[str | None, _new("plant", completion.plants)] = None,
+    controller: Annotated[str | None, _new("controller", completion.controllers)] = None,
+    task: Annotated[str | None, _new("task", completion.tasks)] = None,
+    mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None,
+    robot: Annotated[str | None, _new("robot", completion.robots)] = None,
+    seed: Annotated[int | None, _new("seed")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
     ] = None,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import options
+from servobench.harness.cli import completion, options
 from servobench.harness.cli.show import make_report
 from servobench.harness.cli.terminal import console, print_tables
 from servobench.harness.cli.verdict import judge, print_faults
@@ -19,18 +19,39 @@ from servobench.harness.cli.verdict import judge, print_faults
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Campaign, Execution
 
+DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
+
 OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
 ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
 
 
 def run(
-    plant: Annotated[str | None, typer.Option(help=f"Name of the plant; default {options.DEFAULT_PLANT}.")] = None,
-    controller: Annotated[str, typer.Option(help="Name of the controller, or of a law with --estimator.")] = "ukf_mfac",
-    estimator: Annotated[str | None, typer.Option(help="Compose the law --controller with this estimator.")] = None,
-    task: Annotated[str, typer.Option(help="Name of the task.")] = "exp2",
-    mismatch: Annotated[str, typer.Option(help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.")] = (
-        "moderate"
-    ),
+    method: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="CONTROLLER",
+            help="Short for --controller.",
+            show_default=False,
+            autocompletion=completion.controllers,
+        ),
+    ] = None,
+    plant: Annotated[
+        str | None,
+        typer.Option(help=f"Name of the plant; default {options.DEFAULT_PLANT}.", autocompletion=completion.plants),
+    ] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Name or file of the controller, or a law with --estimator; default {DEFAULT_CONTROLLER}.",
+            autocompletion=completion.controllers,
+        ),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(help="Compose the law --controller with this estimator.", autocompletion=completion.estimators),
+    ] = None,
+    task: options.TaskOption = "exp2",
+    mismatch: options.MismatchOption = "moderate",
     robot: options.RobotOption = "ur5",
     seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
     overrides: options.Overrides = options.OVERRIDES,
@@ -48,6 +69,9 @@ def run(
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.config.settings import ConfigurationError
 
+    if method and controller and method != controller:
+        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
+    controller = method or controller or DEFAULT_CONTROLLER
     plant = plant or options.default_plant()
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
@@ -59,10 +83,10 @@ def run(
 
 
 def compare(
-    plants: options.NamesOption = "kinematic",
-    controllers: options.NamesOption = "all",
-    tasks: options.NamesOption = "exp1,exp2,exp3,exp4,circle",
-    mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
+    plants: options.PlantsOption = "kinematic",
+    controllers: options.ControllersOption = "all",
+    tasks: options.TasksOption = "exp1,exp2,exp3,exp4,circle",
+    mismatch: options.MismatchesOption = "moderate",
     robot: options.RobotOption = "ur5",
     seeds: options.SeedsOption = "1",
     running: options.Running = options.RUNNING,

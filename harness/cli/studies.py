@@ -30,7 +30,7 @@ EXIT_DIFFERENT = 1
 def robustness(
     out: options.FolderOption,
     plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
-    controllers: options.NamesOption = DEFAULT_CONTROLLERS,
+    controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
@@ -53,7 +53,7 @@ def robustness(
 
 def claims(
     out: options.FolderOption,
-    plants: options.NamesOption = "kinematic,fmu",
+    plants: options.PlantsOption = "kinematic,fmu",
     seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[str, typer.Option(help="How methods are equipped: equipped, published or both.")] = "both",
     running: options.Running = options.RUNNING,
@@ -91,7 +91,7 @@ def tune(
     trials: Annotated[int, typer.Option(help="Trials of each study, known settings included.")] = 100,
     search: Annotated[int, typer.Option(help="Most points of the coordinate search that ends a study.")] = 100,
     robots: Annotated[int, typer.Option(help="Robots under each of the six conditions of a trial.")] = 4,
-    plants: options.NamesOption = "kinematic",
+    plants: options.PlantsOption = "kinematic",
     place: options.Place = options.PLACE,
     offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
     study_seed: Annotated[int, typer.Option(help="Seed of the first study's sampler.")] = 0,

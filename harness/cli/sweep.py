@@ -14,10 +14,10 @@ from servobench.harness.cli.verdict import judge
 
 def sweep(
     out: options.FolderOption,
-    plants: options.NamesOption = "kinematic",
-    controllers: options.NamesOption = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
-    tasks: options.NamesOption = "random",
-    mismatch: Annotated[str, typer.Option(help="Comma-separated mismatches.")] = "moderate",
+    plants: options.PlantsOption = "kinematic",
+    controllers: options.ControllersOption = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
+    tasks: options.TasksOption = "random",
+    mismatch: options.MismatchesOption = "moderate",
     robot: options.RobotOption = "ur5",
     vary: Annotated[
         list[str] | None,

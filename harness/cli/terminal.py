@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import sys
 from collections.abc import Iterable, Iterator
@@ -53,6 +54,11 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
         console.print(table)
     if legend:
         console.print(legend)
+
+
+def print_json(value: object) -> None:
+    """Print a value as JSON."""
+    console.print(json.dumps(value, indent=2, ensure_ascii=False), soft_wrap=True, markup=False, highlight=False)
 
 
 def print_markdown(tables: Iterable[tuple[str, pd.DataFrame]]) -> None:

@@ -1,0 +1,66 @@
+"""What a shell completes: names of plants, controllers, tasks, robots, estimators and mismatches, also within lists."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+
+def plants(incomplete: str) -> list[str]:
+    """Return the plants whose names begin so."""
+    from servobench.harness.config.registry import plant_names
+
+    return _matching(incomplete, plant_names())
+
+
+def controllers(incomplete: str) -> list[str]:
+    """Return the controllers whose names begin so; after `law+` the pairs with this law."""
+    from servobench.controllers.parts import ESTIMATORS
+    from servobench.harness.config.registry import controller_names
+
+    law, plus, _ = incomplete.partition("+")
+    return _matching(incomplete, [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names())
+
+
+def tasks(incomplete: str) -> list[str]:
+    """Return the tasks whose names begin so."""
+    from servobench.harness.run.tasks import TASKS
+
+    return _matching(incomplete, TASKS)
+
+
+def estimators(incomplete: str) -> list[str]:
+    """Return the estimators whose names begin so."""
+    from servobench.controllers.parts import ESTIMATORS
+
+    return _matching(incomplete, ESTIMATORS)
+
+
+def mismatches(incomplete: str) -> list[str]:
+    """Return the profiles and axes of mismatch whose names begin so; after a `+` the axes."""
+    from servobench.plant.robot.mismatch import AXES, PROFILES
+
+    before, plus, last = incomplete.rpartition("+")
+    axes = [f"{axis}=" for axis in AXES]
+    return [before + plus + name for name in _matching(last, axes if plus else [*PROFILES, *axes])]
+
+
+def robots(incomplete: str) -> list[str]:
+    """Return the robots whose names begin so."""
+    from servobench.harness.config.robots import robot_names
+
+    return _matching(incomplete, robot_names())
+
+
+def listed(complete: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
+    """Return what completes the last name of a comma-separated list."""
+
+    def complete_last(incomplete: str) -> list[str]:
+        before, comma, last = incomplete.rpartition(",")
+        words = complete(last) + _matching(last, ["all"] * (not comma))
+        return [before + comma + word for word in words]
+
+    return complete_last
+
+
+def _matching(incomplete: str, names: Iterable[str]) -> list[str]:
+    return [name for name in names if name.startswith(incomplete)]

@@ -1,0 +1,102 @@
+"""What there is, listed for readers and for programs, and completed by the shell."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kit.command import servobench
+from servobench.harness.cli.main import command_line
+from servobench.harness.config.describe import plain
+from servobench.harness.config.registry import controller_names
+from servobench.harness.config.settings import flatten
+from servobench.harness.run.tasks import TASKS
+from servobench.plant.kinematic import ENTRY
+
+
+def shown(monkeypatch, capsys, *arguments):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert servobench(monkeypatch, *arguments) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["plants", "controllers", "tasks"])
+def test_lists_fit_into_80_columns_and_no_name_is_broken(monkeypatch, capsys, kind):
+    text = shown(monkeypatch, capsys, kind)
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+    listed = [line.split()[0] for line in text.split("\n\n")[0].splitlines() if not line.startswith(" ")]
+    assert listed == [each["name"] for each in json.loads(shown(monkeypatch, capsys, kind, "--json"))]
+
+
+def test_all_names_and_summaries_are_there_as_json(monkeypatch, capsys):
+    assert [
+        each["name"] for each in json.loads(shown(monkeypatch, capsys, "controllers", "--json"))
+    ] == controller_names()
+    listed = json.loads(shown(monkeypatch, capsys, "tasks", "--json"))
+    assert listed == [{"name": name, "summary": entry.summary} for name, entry in TASKS.items()]
+
+
+def test_settings_are_explained_to_readers_and_programs(monkeypatch, capsys):
+    found = json.loads(shown(monkeypatch, capsys, "plants", "kinematic", "--json"))
+    wanted = {f"kinematic.{key}": value for key, value in flatten(ENTRY.config()).items()}
+    assert {each["setting"]: each["default"] for each in found} == wanted
+    lag = next(each for each in found if each["setting"] == "kinematic.lag")
+    assert (lag["unit"], lag["allowed"]) == ("s", "≥ 0")
+    text = shown(monkeypatch, capsys, "plants", "kinematic")
+    assert "kinematic.lag = 0.05\n    [s] τ, time constant of the joints' velocity loops; 0 means none (≥ 0)" in text
+
+
+def test_values_that_json_has_no_word_for_are_text():
+    found = plain((math.inf, -math.inf, Path("a.csv"), None, np.array([1.0, 2.0]), True, 3))
+    assert found == ["inf", "-inf", "a.csv", None, [1.0, 2.0], True, 3]
+
+
+def completed(*words):
+    command, incomplete = command_line(), words[-1]
+    for word in words[:-2] if words[-2].startswith("-") else words[:-1]:
+        command = command.commands[word]
+    named = words[-2] if words[-2].startswith("-") else None
+    options = (
+        each for each in command.params if named in each.opts or (not named and each.param_type_name == "argument")
+    )
+    context = command.make_context("x", [], resilient_parsing=True)
+    return [item.value for item in next(options).shell_complete(context, incomplete)]
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (("run", "ukf_m"), ["ukf_mfac", "ukf_mfac:published", "ukf_mpc", "ukf_mpc:published"]),
+        (("run", "--controller", "mfac+br"), ["mfac+broyden"]),
+        (("run", "--estimator", "ka"), ["kalman"]),
+        (("run", "--plant", ""), ["kinematic", "bullet", "fmu"]),
+        (("run", "--task", "exp"), ["exp1", "exp2", "exp3", "exp4"]),
+        (("run", "--robot", "ur5"), ["ur5", "ur5e"]),
+        (("run", "--mismatch", "mod"), ["moderate"]),
+        (("run", "--mismatch", "moderate+camera_m"), ["moderate+camera_move="]),
+        (("compare", "--controllers", "rls,ukf_mp"), ["rls,ukf_mpc", "rls,ukf_mpc:published"]),
+        (("compare", "--tasks", "a"), ["all"]),
+        (("sweep", "--plants", "kinematic,b"), ["kinematic,bullet"]),
+        (("plants", "k"), ["kinematic"]),
+        (("record", "--controller", "calib"), ["calibrated"]),
+        (("init", "--tasks", "exp2,ci"), ["exp2,circle"]),
+    ],
+)
+def test_the_shell_completes_names_also_within_lists(words, wanted):
+    assert completed(*words) == wanted
+
+
+def test_a_run_takes_its_controller_first(monkeypatch, capsys, tmp_path):
+    short = ("--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(tmp_path / "out"))
+    assert servobench(monkeypatch, "run", "constant", *short) == 0
+    assert (
+        "kinematic-constant" in (tmp_path / "out" / "manifest.json").read_text()
+        or "constant" in capsys.readouterr().out
+    )
+    assert servobench(monkeypatch, "run", "constant", "--controller", "rls") == 2
+    assert "two controllers are named, constant and --controller rls; a run has one" in capsys.readouterr().err
