@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest
 
@@ -55,7 +56,9 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
             found.examples.append(request)
     for example in found.examples:
         found.plants[example.plant] = found.controllers[example.controller] = found.tasks[example.task] = None
-        found.mismatches[str(example.mismatch)] = found.robots[example.robot] = None
+        found.mismatches[str(example.mismatch)] = None
+        if not find_plant(example.plant).own_robot:
+            found.robots[example.robot] = None
     found.digest, found.seeds = digest.hexdigest(), seeds.merged()
     _refuse_repetition(requests, names)
     return found

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.ending import COMPLETED, Ending, is_defect
@@ -168,6 +169,7 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
     outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
     return {
         **request.as_row(),
+        "robot": OWN_ROBOT if drawn.true is None else request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
         "settling_band": SETTLING_BAND * spec.feature.scale,

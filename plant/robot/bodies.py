@@ -1,8 +1,8 @@
 """Masses, inertia and torques of links: moved between frames, and estimated where nobody has published them.
 
 An estimated link is a solid cylinder of its tube's radius, as long as its joints are apart plus a joint housing of one
-diameter, of the mean density of the UR5's links. A joint's torque limit is three times what holds the stretched arm
-with its rated load against gravity, which is what the shoulder of a UR5 has.
+diameter, of the mean density of the UR5's links. A joint's torque limit is one and a half times what holds the
+stretched arm with its rated load against gravity; a UR5 has 1.2 times that in its shoulder and more in its wrists.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from servobench.plant.robot.robot import Links
 DENSITY: Final = 1100.0  # [kg/m³] of the UR5's links as cylinders, in the mean
 TUBE_SHARE: Final = 0.055  # radius of the first tube over the arm's length from the shoulder on
 TAPER: Final = 0.65  # radius of the last tube over that of the first
-TORQUE_FACTOR: Final = 3.0  # torque limit over the torque that holds the stretched arm
+TORQUE_FACTOR: Final = 1.5  # torque limit over the torque that holds the stretched arm
 LEAST_TORQUE: Final = 5.0  # [Nm]
 GRAVITY: Final = 9.81  # [m/s²]
 PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
@@ -70,7 +70,7 @@ def estimate_links(
 
 
 def _holding_torque(length: FloatArray, mass: FloatArray, payload: float) -> FloatArray:
-    """Return three times the torque, (n,) Nm, of the level, stretched arm about each joint."""
+    """Return the torque limits, (n,) Nm, that follow from the weight of the level, stretched arm beyond each joint."""
     n = len(length)
     ends = np.cumsum(length)
     middles = ends - length / 2.0

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.dh_file import read_dh_robot
-from servobench.plant.robot.makers import universal_robot
 from servobench.plant.robot.measured import MAX_DEVIATION, nearest_title, read_calibration
 from servobench.plant.robot.robot import Robot
 
@@ -37,14 +39,13 @@ def _read_calibrated(path: Path) -> Robot:
     Raises:
         ValueError: the file is missing, malformed, or fits no data sheet.
     """
-    tool = universal_robot("UR5").arm.tool
-    title, deviation = nearest_title(read_calibration(path, tool))
+    title, deviation = nearest_title(read_calibration(path, np.zeros(3)))
     if deviation > MAX_DEVIATION:
         raise ValueError(
             f"calibration file {path} fits no arm of Universal Robots: the {title} comes nearest, and its flange is "
             f"{1e3 * deviation:.0f} mm away"
         )
-    sheet = universal_robot(title)
+    sheet = find_robot(title.lower())
     return Robot(
         name=path.stem,
         title=sheet.title,

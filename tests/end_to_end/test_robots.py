@@ -1,0 +1,73 @@
+"""Other robots in the plants that are compiled and rendered, and in pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kit.command import servobench
+from kit.plants import NEEDS_BULLET
+from kit.robots import FOUR_JOINTS, calibration_text
+from servobench.fmus.validate import validate_fmu
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.episode import run_experiment
+from servobench.harness.run.request import RunRequest
+from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
+
+SHORT = Settings({"exp2": {"duration": 3.0}})
+
+
+@pytest.fixture
+def ur10e(tmp_path):
+    path = tmp_path / "ur10e.yaml"
+    path.write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
+    return str(path)
+
+
+@pytest.fixture
+def four(tmp_path):
+    path = tmp_path / "four.toml"
+    path.write_text(FOUR_JOINTS)
+    return str(path)
+
+
+def test_the_fmu_of_a_panda_has_seven_joints_and_its_reference_run(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "panda.fmu"
+    arguments = "--robot", "panda", "--mismatch", "moderate", "--seed", "3", "-o", str(path)
+    assert servobench(monkeypatch, "fmu", "export", *arguments) == 0
+    found = validate_fmu(path)
+    assert (found.problems, found.deviation < 1e-9) == ((), True)
+    capsys.readouterr()
+    assert servobench(monkeypatch, "fmu", "info", str(path)) == 0
+    shown = capsys.readouterr().out
+    assert "Panda with mismatched kinematics" in shown
+    assert "joint_offset[7]" in shown
+
+
+@pytest.mark.parametrize("name", ["panda", "four", "ur10e"])
+def test_an_arm_is_the_same_as_fmu_and_in_numpy(name, request):
+    robot = name if name == "panda" else request.getfixturevalue(name)
+    runs = [
+        run_experiment(RunRequest(plant, "map_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
+        for plant in ("kinematic", "fmu")
+    ]
+    features = [run.steps.filter(regex="^true_feature_").to_numpy() for run in runs]
+    assert [run.row["outcome"] for run in runs] == ["settled", "settled"]
+    np.testing.assert_allclose(features[0], features[1], atol=1e-9)
+
+
+@NEEDS_BULLET
+@pytest.mark.parametrize("name", ["panda", "ur10e"])
+def test_a_rendered_arm_settles_and_can_be_shown(name, request):
+    from servobench.harness.pictures.replay import Replay, logged_run
+
+    robot = name if name == "panda" else request.getfixturevalue(name)
+    result = run_experiment(RunRequest("bullet", "map_mfac", "exp2", "moderate", 3, robot=robot), SHORT)
+    assert (result.row["outcome"], result.row["reason"]) == ("settled", "")
+    shown = logged_run(result.row, result.steps, {})
+    with Replay(shown) as replay:
+        replay.place(0)
+        first = replay.overview([])
+        replay.place(len(shown.joint_position) - 1)
+        assert (first != replay.overview([])).any()
+        assert replay.camera_view().shape == (240, 320, 3)

@@ -1,0 +1,94 @@
+"""Runs with another robot than the UR5: names, tables, tasks, and what cannot be put together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kit.robots import FOUR_JOINTS
+from servobench.harness.batch.manifest import describe_robot
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import carry_out_together, run_experiment
+from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve, resolve_sections
+from servobench.harness.run.tasks import TASKS
+from servobench.harness.run.teaching import taught
+from servobench.plant.robot.catalogue import find_robot
+
+PANDA = RunRequest("kinematic", "map_mfac", "exp2", "moderate", 3, robot="panda")
+SHORT = Settings({"exp2": {"duration": 3.0}})
+
+
+def test_a_run_of_a_panda_settles_and_says_whose_it_is():
+    result = run_experiment(PANDA, SHORT)
+    assert (result.row["outcome"], result.row["robot"]) == ("settled", "panda")
+    assert result.row["run_id"] == "kinematic-panda-map_mfac-exp2-moderate-3"
+    assert sum(name.startswith("joint_position_") for name in result.steps) == 7
+
+
+def test_the_ur5_is_not_named():
+    assert replace(PANDA, robot="ur5").run_id == "kinematic-map_mfac-exp2-moderate-3"
+    assert [taught(entry, find_robot("ur5")) for entry in TASKS.values()] == [each.default for each in TASKS.values()]
+
+
+def test_runs_of_a_panda_side_by_side_have_the_rows_of_single_ones():
+    requests = [replace(PANDA, task="random", seed=seed) for seed in (1, 2)]
+    settings = Settings({"random": {"duration": 1.0}})
+    together = carry_out_together([resolve(each, settings) for each in requests])
+    for request, many in zip(requests, together, strict=True):
+        single = run_experiment(request, settings, steps=False).row
+        for name in ("status", "rms_error_evaluated", "final_error", "mismatch_values"):
+            if name in single:
+                assert many.row[name] == single[name]
+
+
+@pytest.mark.parametrize("task", ["circle", "lemniscate", "line", "target", "unreachable", "endurance", "random"])
+def test_a_task_is_as_far_away_as_the_arm_is_long(task):
+    robot, entry = find_robot("ur3e"), TASKS[task]
+    own, scale = taught(entry, robot), robot.workspace.scale
+    for name in ("centre", "begin", "end", "target"):
+        if hasattr(own, name):
+            np.testing.assert_allclose(getattr(own, name), scale * np.array(getattr(entry.default, name)))
+    for name in ("radius", "shortest", "lowest"):
+        if hasattr(own, name):
+            assert getattr(own, name) == pytest.approx(scale * getattr(entry.default, name))
+    for name in ("duration", "lap_time", "laps"):
+        assert getattr(own, name, None) == getattr(entry.default, name, None)
+
+
+def test_the_endless_circle_is_as_large_as_the_short_one():
+    requests = [replace(PANDA, task=task, mismatch="none") for task in ("circle", "endurance")]
+    circle, endurance = (build_experiment(each, Settings()).scenario.reference for each in requests)
+    np.testing.assert_allclose(circle.at(1.0), endurance.at(1.0))
+
+
+def test_a_taught_random_move_is_free_of_contact():
+    work = find_robot("panda").workspace
+    for seed in range(5):
+        request = replace(PANDA, task="random", mismatch="none", seed=seed)
+        assert work.clear(build_experiment(request, Settings()).scenario.start)
+
+
+def test_a_batch_has_one_robot():
+    with pytest.raises(ConfigurationError, match="a batch has one robot, got panda, ur5"):
+        resolve_sections([PANDA, replace(PANDA, robot="ur5")], Settings())
+
+
+def test_the_manifest_says_which_arm_it_was(tmp_path):
+    path = tmp_path / "four.toml"
+    path.write_text(FOUR_JOINTS)
+    told = describe_robot(str(path))
+    assert (told["title"], len(told["home_rad"])) == ("four", 4)
+    assert "estimated from the lengths" in told["note"]
+
+
+def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
+    from servobench.harness.run import resolved
+    from servobench.plant.kinematic import ENTRY
+
+    monkeypatch.setattr(resolved, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
+    with pytest.raises(ConfigurationError, match="brings a robot of its own, so --robot panda does not apply"):
+        resolve(PANDA, Settings())

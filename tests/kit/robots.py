@@ -1,0 +1,57 @@
+"""Files that describe robots, for tests."""
+
+import numpy as np
+
+FOUR_JOINTS = """
+convention = "standard"
+a = [0.0, 0.45, 0.4, 0.1]
+d = [0.35, 0.0, 0.0, 0.0]
+alpha = [1.570796326794897, 0.0, 0.0, 0.0]
+joint_lower = [-3.0, -2.0, -2.8, -2.8]
+joint_upper = [3.0, 2.0, 2.8, 2.8]
+joint_speed = [2.0, 2.0, 2.0, 2.0]
+"""
+
+
+def calibration_text(row, seed):
+    """Return a factory calibration of an arm of Universal Robots that is wrong by tenths of a millimetre."""
+    rng = np.random.default_rng(seed)
+    half = np.pi / 2
+    blocks = {
+        "shoulder": (0, 0, row.d1, 0, 0, 0),
+        "upper_arm": (0, 0, 0, half, 0, 0),
+        "forearm": (row.a2, 0, 0, 0, 0, 0),
+        "wrist_1": (row.a3, 0, row.d4, 0, 0, 0),
+        "wrist_2": (0, -row.d5, 0, half, 0, 0),
+        "wrist_3": (0, row.d6, 0, half, np.pi, -np.pi),
+    }
+    lines = ["kinematics:"]
+    for name, numbers in blocks.items():
+        values = np.array(numbers, dtype=float) + 3e-4 * rng.uniform(-1.0, 1.0, 6)
+        keys = zip(("x", "y", "z", "roll", "pitch", "yaw"), values.tolist(), strict=True)
+        lines.append(f"  {name}: {{{', '.join(f'{key}: {value}' for key, value in keys)}}}")
+    return "\n".join([*lines, "  hash: calib_1", ""])
+
+
+def odd_urdf():
+    """Return a URDF with joints about x, −y and a slanted axis, fixed links between them, and a finger."""
+    joints = [
+        ("joint_1", "revolute", "foot", "link_1", "0 0 0.3", "0 0 0", "0 0 1", 2.5),
+        ("joint_2", "revolute", "link_1", "link_2", "0 0 0", "0 0 0", "0 -1 0", 1.5),
+        ("bridge", "fixed", "link_2", "bridge_link", "0.2 0 0", "0.1 0 0", None, None),
+        ("joint_3", "revolute", "bridge_link", "link_3", "0.2 0 0", "0 0 0", "0 1 0.2", 2.5),
+        ("joint_4", "revolute", "link_3", "link_4", "0.35 0 0", "0 0.2 0", "0.1 1 0", 2.5),
+        ("hand_joint", "fixed", "link_4", "hand", "0.1 0 0", "0 1.5708 0", None, None),
+        ("finger_joint", "prismatic", "hand", "finger", "0 0 0.05", "0 0 0", "1 0 0", 0.04),
+    ]
+    names = ["foot", *(joint[3] for joint in joints)]
+    parts = [f'<link name="{name}"/>' for name in names]
+    for name, kind, parent, child, xyz, rpy, axis, limit in joints:
+        turning = "" if axis is None else f'<axis xyz="{axis}"/>'
+        if limit is not None:
+            turning += f'<limit lower="-{limit}" upper="{limit}" effort="50" velocity="2"/>'
+        parts.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/>{turning}</joint>'
+        )
+    return f'<robot name="odd">{"".join(parts)}</robot>'

@@ -1,0 +1,243 @@
+"""Robots by name and by file: the makers' numbers, the readers of files, and the workspace that is found for them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
+from servobench.plant.bullet.drives import DriveConfig, drives_for
+from servobench.plant.bullet.urdf import arm_urdf
+from servobench.plant.robot.arm import rotation_from_rpy
+from servobench.plant.robot.bodies import at_far_end, estimate_links
+from servobench.plant.robot.catalogue import ROBOTS, find_robot
+from servobench.plant.robot.clearance import segment_distance
+from servobench.plant.robot.limits import JointLimits, narrowed
+from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
+from servobench.plant.robot.measured import nearest_title, read_calibration
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+from servobench.plant.robot.teaching import find_workspace
+from servobench.plant.robot.ur5 import nominal_ur5
+
+RNG = np.random.default_rng(7)
+
+
+def flange(arm, q):
+    return arm.frames(q)[..., -1, :3, 3]
+
+
+def found(robot):
+    """Return the workspace of a robot, found once more."""
+    limits, links = robot.limits, robot.links
+    return find_workspace(robot.arm, (limits.lower, limits.upper), (links.radius, links.aside))
+
+
+@pytest.mark.parametrize("title", UNIVERSAL_ROBOTS)
+def test_an_arm_of_universal_robots_stretches_as_its_table_says(title):
+    row = UNIVERSAL_ROBOTS[title]
+    # At zero the arm lies along −x, its wrist turned to −y: the sums of the table's lengths.
+    expected = row.a2 + row.a3, -row.d4 - row.d6, row.d1 - row.d5
+    np.testing.assert_allclose(flange(row.arm(), np.zeros(6)), expected, atol=1e-12)
+
+
+def test_the_panda_stands_upright_at_zero_as_its_maker_draws_it():
+    np.testing.assert_allclose(flange(find_robot("panda").arm, np.zeros(7)), (0.088, 0.0, 0.926), atol=1e-12)
+
+
+def test_the_robot_without_a_name_is_the_ur5_of_the_bench():
+    robot, old = find_robot("ur5"), nominal_ur5()
+    np.testing.assert_array_equal(robot.nominal.X_BC, old.X_BC)
+    np.testing.assert_array_equal(robot.arm.translation, old.arm.translation)
+    assert (robot.workspace.scale, robot.workspace.clear) == (1.0, None)
+
+
+@pytest.fixture(scope="module", params=["ur3e", "panda", "four.toml"])
+def robot(request, tmp_path_factory):
+    if request.param in ROBOTS:
+        return find_robot(request.param)
+    path = tmp_path_factory.mktemp("robots") / request.param
+    path.write_text(FOUR_JOINTS)
+    return find_robot(str(path))
+
+
+def test_a_workspace_is_fit_to_work_in(robot):
+    work, arm = robot.workspace, robot.arm
+    assert work.clear(work.home)
+    box = RNG.uniform(work.lower, work.upper, (300, robot.n))
+    assert work.clear(box).mean() > 0.5
+    assert (work.lower >= robot.limits.lower).all()
+    assert (work.upper <= robot.limits.upper).all()
+    np.testing.assert_allclose(arm.ball_position(work.home)[:2], work.centre[:2], atol=1e-5)
+    for start, target in work.moves.values():
+        assert work.clear(np.stack([start, target])).all()
+        assert np.linalg.norm(arm.ball_position(target) - arm.ball_position(start)) > 0.2 * work.scale
+    gains = [np.linalg.svd(arm.ball_jacobian(q), compute_uv=False)[-1] for q in (work.stretched, work.home)]
+    assert gains[0] < 0.4 * gains[1]
+
+
+def test_the_moves_that_leave_the_training_region_on_a_ur5_leave_it_here(robot):
+    work = robot.workspace
+
+    def outside(q):
+        return bool(((q < work.lower) | (q > work.upper)).any())
+
+    assert outside(work.moves["exp1"][1])
+    assert outside(work.moves["exp4"][0])
+    assert not outside(work.moves["exp2"][0])
+
+
+def test_a_workspace_is_found_again_bit_for_bit():
+    robot = find_robot("ur3e")
+    again = found(robot)
+    for name in ("home", "lower", "upper", "stretched"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(robot.workspace, name))
+
+
+def test_an_arm_that_cannot_reach_its_bench_is_refused():
+    robot = find_robot("panda")
+    pinned = replace(robot.limits, lower=np.full(7, -0.01), upper=np.full(7, 0.01))
+    with pytest.raises(ValueError, match="no posture in which its ball is over the table"):
+        found(replace(robot, limits=pinned))
+
+
+def test_the_distance_of_segments_is_that_of_the_nearest_of_many_points():
+    first, second, share = RNG.normal(size=(50, 2, 3)), RNG.normal(size=(50, 2, 3)), np.linspace(0.0, 1.0, 201)
+    points = [s[:, 0, None] + share[:, None] * (s[:, 1] - s[:, 0])[:, None] for s in (first, second)]
+    nearest = np.linalg.norm(points[0][:, :, None] - points[1][:, None], axis=-1).min((1, 2))
+    np.testing.assert_allclose(segment_distance(first, second), nearest, atol=2e-3)
+
+
+def test_a_maker_s_limits_hold_beside_those_that_are_set():
+    limits = narrowed(find_robot("panda").limits, 7, 1.0, 2.0)
+    assert (limits.speed == 1.0).all()
+    np.testing.assert_array_equal(limits.upper, [2.0, 1.7628, 2.0, -0.0698, 2.0, 2.0, 2.0])
+    with pytest.raises(ValueError, match="joint_lower must be below joint_upper"):
+        JointLimits(np.zeros(1), np.zeros(1), np.ones(1))
+
+
+def test_estimated_links_are_of_the_size_of_published_ones():
+    own, estimated = find_robot("ur5").links, estimate_links(find_robot("ur5").arm)
+    assert 0.5 < estimated.mass.sum() / own.mass.sum() < 1.5
+    assert 0.5 < estimated.torque[1] / own.torque[1] < 2.0
+
+
+def test_drives_in_proportion_to_a_ur5_are_those_of_the_ur5():
+    default, own = DriveConfig(), drives_for(find_robot("ur5"))
+    assert (own.torque_limit, own.velocity_bandwidth) == (default.torque_limit, default.velocity_bandwidth)
+    assert own.coulomb_friction == pytest.approx(default.coulomb_friction)
+    assert (own.payload, own.assumed_payload, own.rotor_inertia) == (2.5, 0.9, (0.1,))
+    assert drives_for(find_robot("panda")).torque_limit == (87.0,) * 4 + (12.0,) * 3
+
+
+def test_inertia_in_a_urdf_has_the_moments_of_its_tensor():
+    robot = find_robot("panda")
+    link = ET.fromstring(arm_urdf(robot.arm, "ball.obj", robot)).findall("link")[3]
+    written = [float(link.find("inertial/inertia").get(axis)) for axis in ("ixx", "iyy", "izz")]
+    np.testing.assert_allclose(written, np.linalg.eigvalsh(robot.links.inertia[2]), rtol=1e-9)
+
+
+def test_a_body_in_the_frame_of_its_joint_is_the_same_body_at_the_far_end():
+    arm = find_robot("panda").arm
+    centre, tensor = RNG.normal(size=(7, 3)), RNG.normal(size=(7, 3, 3))
+    far, turned = at_far_end(arm, centre, tensor @ np.swapaxes(tensor, -1, -2))
+    R = rotation_from_rpy(arm.rpy[1:])
+    np.testing.assert_allclose(np.matvec(R, far) + arm.translation[1:], centre, atol=1e-12)
+    moments = np.linalg.eigvalsh(tensor @ np.swapaxes(tensor, -1, -2))
+    np.testing.assert_allclose(np.linalg.eigvalsh(turned), moments, rtol=1e-9)
+
+
+# Files
+
+
+@pytest.mark.parametrize("title", UNIVERSAL_ROBOTS)
+def test_a_calibration_file_tells_whose_it_is(tmp_path, title):
+    path = tmp_path / "mine.yaml"
+    path.write_text(calibration_text(UNIVERSAL_ROBOTS[title], seed=1))
+    found_title, deviation = nearest_title(read_calibration(path, np.zeros(3)))
+    assert found_title == title
+    assert deviation < 3e-3
+
+
+def test_a_calibrated_robot_is_held_against_its_data_sheet(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(calibration_text(UNIVERSAL_ROBOTS["UR3e"], seed=1))
+    robot = find_robot(str(path))
+    assert "factory calibration of a UR3e" in robot.note
+    np.testing.assert_array_equal(robot.arm.translation, find_robot("ur3e").arm.translation)
+    true, _ = sample_mismatch(Mismatch.parse("none"), robot, 0)
+    apart = np.linalg.norm(true.arm.ball_position(robot.workspace.home) - robot.arm.ball_position(robot.workspace.home))
+    assert 1e-5 < apart < 5e-3
+
+
+def test_a_calibration_of_another_arm_is_refused_with_the_remedy(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
+    with pytest.raises(ValueError, match="is that of a UR10e .* the robot is a UR5; use --robot ur10e"):
+        sample_mismatch(Mismatch.parse(f"factory={path}"), find_robot("ur5"), 0)
+    with pytest.raises(ValueError, match="which a Panda does not have"):
+        sample_mismatch(Mismatch.parse("factory"), find_robot("panda"), 0)
+    with pytest.raises(ValueError, match="calibration of one real UR5, and the robot is a UR3e"):
+        sample_mismatch(Mismatch.parse("factory"), find_robot("ur3e"), 0)
+    path.write_text(path.read_text().replace("x: -0.6", "x: -0.9"))
+    with pytest.raises(ValueError, match="fits no arm of Universal Robots"):
+        find_robot(str(path))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("d = [0.35, 0.0, 0.0, 0.0]\n", "", "the key 'd' is missing"),
+        ("d = [0.35,", "d = [", "d must have shape"),
+        ("joint_speed = [2.0", "joint_speed = [-2.0", "joint_speed.* must be above 0"),
+        ("joint_upper", "joint_uper", "the key 'joint_upper' is missing"),
+        ("convention =", "length = 3\nconvention =", "has no setting 'length'"),
+        ("a = [", "a = [[", "is not valid TOML"),
+        ('"standard"', '"craig"', "convention must be one of standard, modified"),
+    ],
+)
+def test_a_wrong_dh_table_is_named(tmp_path, before, after, message):
+    path = tmp_path / "arm.toml"
+    assert before in FOUR_JOINTS
+    path.write_text(FOUR_JOINTS.replace(before, after))
+    with pytest.raises(ValueError, match=f"robot file .*arm.toml.*{message}"):
+        find_robot(str(path))
+
+
+def test_an_unknown_robot_is_told_the_nearest():
+    with pytest.raises(ValueError, match="unknown robot 'pandda': did you mean 'panda'"):
+        find_robot("pandda")
+    with pytest.raises(ValueError, match="robot file nowhere.urdf cannot be read"):
+        find_robot("nowhere.urdf")
+
+
+def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
+    pytest.importorskip("yourdfpy")
+    own = find_robot("ur3e")
+    path = tmp_path / "written.urdf"
+    path.write_text(arm_urdf(own.arm, "ball.obj", own).replace('type="continuous">', 'type="continuous">\n'))
+    read = find_robot(str(path))
+    postures = RNG.uniform(-3.0, 3.0, (5, 6))
+    np.testing.assert_allclose(flange(read.arm, postures), flange(own.arm, postures), atol=1e-9)
+    np.testing.assert_allclose(read.links.mass, own.links.mass)
+    np.testing.assert_allclose(read.links.centre, own.links.centre, atol=1e-9)
+    assert "6 joints" in read.note
+    assert "estimated: torque limits" in read.note
+
+
+def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
+    yourdfpy = pytest.importorskip("yourdfpy")
+    path = tmp_path / "odd.urdf"
+    path.write_text(odd_urdf())
+    read = find_robot(str(path))
+    oracle = yourdfpy.URDF.load(str(path), load_meshes=False)
+    q = np.array([0.3, -0.4, 0.5, 0.2])
+    oracle.update_cfg({f"joint_{i}": value for i, value in enumerate(q.tolist(), 1)})
+    np.testing.assert_allclose(flange(read.arm, q), oracle.get_transform("hand", "foot")[:3, 3], atol=1e-9)
+    np.testing.assert_array_equal(read.limits.upper, [2.5, 1.5, 2.5, 2.5])
+    with pytest.raises(ValueError, match="has no link 'hnd'"):
+        find_robot(f"{path}#hnd")
+    with pytest.raises(ValueError, match="no chain of at least three turning joints"):
+        find_robot(f"{path}#link_1")
