@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.dh_file import read_dh_robot
+from servobench.plant.robot.makers import universal_robot
 from servobench.plant.robot.measured import MAX_DEVIATION, nearest_title, read_calibration
 from servobench.plant.robot.robot import Robot
 
@@ -45,7 +45,7 @@ def _read_calibrated(path: Path) -> Robot:
             f"calibration file {path} fits no arm of Universal Robots: the {title} comes nearest, and its flange is "
             f"{1e3 * deviation:.0f} mm away"
         )
-    sheet = find_robot(title.lower())
+    sheet = universal_robot(title)
     return Robot(
         name=path.stem,
         title=sheet.title,

@@ -11,6 +11,7 @@ Automation Letters 4 (2019). Radii of tubes are appearance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from math import pi
 from typing import Final
 
@@ -97,6 +98,7 @@ UNIVERSAL_ROBOTS: Final = {
 }  # fmt: skip
 
 
+@cache
 def universal_robot(title: str) -> Robot:
     """Return an arm of Universal Robots by its title, such as "UR10e"."""
     if title == "UR5":
