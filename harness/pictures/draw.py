@@ -25,7 +25,7 @@ from servobench.harness.pictures.tracks import Group, load_groups
 
 FOLDER = "figures"
 FORMATS = ("png", "pdf")
-RESOLUTION = 200  # dpi of PNG
+RESOLUTION = 150  # dpi of PNG
 SCREEN = 1000.0 / WIDTH  # dpi at which a figure is shown in a page
 DENSITY = 1.5  # pixels of a picture in a page for each that it is shown with
 PALETTE = 64  # colours
@@ -153,7 +153,8 @@ def _drawings(
         yield "tracking", task, draw_tracking(ensembles[task], tracks, styles)
         yield "tracking_path", task, draw_paths({task: tracks}, styles)
     yield "jacobian", "", draw_jacobians(ensembles, styles)
-    for what, measured in _parts(dict.fromkeys(runs["task"]), TASKS_A_FIGURE):
+    several = len(runs) > 1  # of a single run, its row in the table of runs says it all
+    for what, measured in _parts(dict.fromkeys(runs["task"] if several else ()), TASKS_A_FIGURE):
         chosen = runs[runs["task"].isin(list(measured))]
         for kind, columns in (("settling", ACCURACY), ("effort", EFFORT), ("smoothness", SMOOTHNESS)):
             yield kind, what, draw_measures(chosen, columns, styles)

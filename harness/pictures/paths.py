@@ -56,7 +56,7 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles) -> Figure | None:
     rows = -(-len(blocks) // columns)
     lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
     ratios = [max(block.extent.ratio(i) for block in line) for line in lines for i in range(len(views))]
-    width = PANEL if columns > 1 else 4.2
+    width = PANEL if columns > 1 else 3.6
     figure = Figure(figsize=(WIDTH, 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views))), layout="constrained")
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
     for number, block in enumerate(blocks):

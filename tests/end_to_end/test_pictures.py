@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,7 +14,7 @@ from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.batch import results
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures.conditions import draw_conditions
-from servobench.harness.pictures.draw import draw_figures, folder_figures, picture_of
+from servobench.harness.pictures.draw import HEADINGS, draw_figures, folder_figures, picture_of
 from servobench.harness.pictures.interactive import interactive_paths
 from servobench.harness.pictures.panels import ENDED
 from servobench.harness.pictures.style import method_styles
@@ -58,6 +61,11 @@ def test_a_comparison_gives_the_figures_of_the_paper_and_more(tmp_path):
     ]  # fmt: skip
 
 
+def test_the_page_of_results_names_every_kind_of_figure_in_its_order():
+    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8").split("## Figures")[1]
+    assert re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE) == list(HEADINGS)
+
+
 def test_every_axis_of_every_figure_has_a_unit_and_the_figure_names_every_controller(tmp_path):
     for named in folder_figures(comparison(tmp_path / "out")):
         figure = named.figure
@@ -90,7 +98,7 @@ def test_figures_are_files_in_two_formats_and_the_same_each_time(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     paths = draw_figures(folder)
     assert {path.suffix for path in paths} == {".png", ".pdf"}
-    assert len(paths) == 18
+    assert len(paths) == 12
     before = {path.name: path.read_bytes() for path in paths}
     assert before == {path.name: path.read_bytes() for path in draw_figures(folder)}
 
