@@ -20,7 +20,7 @@ from servobench.harness.pictures.style import TEXT, WIDTH
 from servobench.harness.run.ending import COMPLETED
 from servobench.plant.checks import FloatArray
 
-SETTLING, NEVER = "settling_time_s", 1.12  # and where a run without a value stands, over the largest value
+SETTLING, NEVER = "settling_time_s", 1.3  # and where a run without a value stands, over the largest value
 ACCURACY: Final = (SETTLING, "rms_error_evaluated")
 EFFORT: Final = ("control_effort_rad", "saturation_fraction")
 SMOOTHNESS: Final = ("joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3", "command_switches")
@@ -99,7 +99,7 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | 
     axes.set(xscale="log", yticks=range(len(known)), yticklabels=list(known), xlabel="time of a controller's step [µs]")
     axes.set_xlim(right=top)
     axes.set_ylim(len(known) - 0.4, -0.6)
-    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.0f}"))
     return figure
 
 
@@ -148,8 +148,11 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
         values = values.where(runs.reindex(columns=["task_kind"])["task_kind"] != "curve")
     largest, least = float(values.max()), float(values.min())
     wide = least > 0.0 and largest / least > WIDE_RANGE
-    edge = (largest * NEVER if largest > 0.0 else 1.0) if not wide else largest * (largest / least) ** 0.08
+    edge = largest * (NEVER if never.any() else 1.06) if largest > 0.0 else 1.0
+    if wide:
+        edge = largest * (largest / least) ** 0.08
     if values.isna().all() and not never.any():
+        axes.tick_params(axis="x", bottom=False, labelbottom=False)
         axes.text(0.5, 0.5, "does not apply", transform=axes.transAxes, ha="center", va="center", color="0.4",
                   fontsize=TEXT - 1.0)  # fmt: skip
     for i, name in enumerate(names):
@@ -166,7 +169,7 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
         if own.sum() > 1 and math.isfinite(middle):
             axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
         if never[own].any():
-            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="right", va="bottom", xytext=(4, 2),
+            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="right", va="center", xytext=(-5, 0),
                           textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
     axes.set_yticks(range(len(names)), names)
     if wide:

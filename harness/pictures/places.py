@@ -14,7 +14,7 @@ from servobench.harness.pictures.style import TEXT, MethodStyle
 from servobench.plant.checks import FloatArray
 
 SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
-BEYOND: Final = "over half of the runs never"  # label of a mark at the upper edge
+UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
 LETTERS: Final = 30  # of a line of text within a panel
 
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
@@ -74,7 +74,7 @@ def draw_curves(
         known = ~np.isnan(y)
         if not known.any():
             continue
-        edges = np.nan_to_num(np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=10.0 * top)
+        edges = np.nan_to_num(np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=1.05 * top)
         axes.fill_between(x[known], *edges, color=style.colour, alpha=0.12, linewidth=0.0)
         _draw_line(axes, x[known], y[known], style, first, top)
         for name in names[1:]:
@@ -82,7 +82,7 @@ def draw_curves(
         if len(names) > 1:
             shared.append(("all methods" if len(groups) == 1 else ", ".join(names), y))
     for names_text, y in shared:
-        constant = f" {y[0]:g} throughout" if (y == y[0]).all() else ""
+        constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
         words = textwrap.fill(f"one line{constant}: {names_text}", LETTERS)
         upper = float(np.nanmean(np.minimum(y, top))) < top / 2.0
         level, side = (0.96, "top") if upper else (0.04, "bottom")
@@ -101,8 +101,9 @@ def same_curves(values: Curves) -> list[list[str]]:
 
 def _draw_line(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle, name: str, top: float) -> None:
     look: dict[str, Any] = {"color": style.colour, "markerfacecolor": style.face, "markersize": 4.5, "linewidth": 1.2}
-    axes.plot(x, np.where(np.isfinite(y), y, 10.0 * top), label=name, linestyle=style.line, marker=style.marker, **look)
     beyond = ~np.isfinite(y)
+    shown = np.where(beyond, UPPER * top, y)
+    axes.plot(x, shown, label=name, linestyle=style.line, marker=style.marker, markevery=~beyond, **look)
     if beyond.any():
-        axes.plot(x[beyond], np.full(np.count_nonzero(beyond), 0.97 * top), linestyle="none", marker=6,
+        axes.plot(x[beyond], np.full(np.count_nonzero(beyond), UPPER * top), linestyle="none", marker=6,
                   **(look | {"markersize": 6.5}))  # fmt: skip

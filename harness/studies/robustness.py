@@ -6,6 +6,7 @@ take longer, so that there is time to recover.
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -233,11 +234,13 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
             axes.set_ylabel(scale.label)
         for axes in grid.flat[len(lines) :]:
             axes.set_axis_off()
-        figure.suptitle(f"{title}: {robots} robots a point on {plant}, bands are 95 % intervals", fontsize=TEXT + 1.0)
-        notes = [_name_flat(flat, curves)] if 0 < len(flat) < len(curves) else []
+        notes = [f"{robots} robots a point on {plant}, bands are 95 % intervals"]
+        if 0 < len(flat) < len(curves):
+            notes.append(_name_flat(flat, curves))
         if any(np.isinf(e.value) for axis in curves.values() for estimates in axis.values() for e in estimates):
-            notes.append("Triangles at the upper edge: half of the runs or more never settle.")
-        figure.supxlabel("\n".join(textwrap.fill(note, NOTE) for note in notes), fontsize=TEXT - 0.5)
+            notes.append("carets at the upper edge: half of the runs or more never settle")
+        words = "\n".join(textwrap.fill(note, NOTE) for note in notes)
+        figure.suptitle(f"{title}\n{words}", fontsize=TEXT + 0.5)
         add_legend(figure, grid.flat)
     return save_figure(figure, stem)
 
@@ -250,9 +253,10 @@ def _is_flat(curves: Curves) -> bool:
 def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
     """Return a sentence on the axes along which nothing differs."""
     found = next(iter(curves[flat[0]].values()))[0]
-    titles = [line for line in LINES if line.axis in flat]
-    words = "; ".join(f"{line.title}, up to {line.places[-1].number:g}" for line in titles)
-    return f"Every method has {found.value:g} at every place, with an interval from {found.low:.0f}, along: {words}."
+    words = "; ".join(
+        re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title) for line in LINES if line.axis in flat
+    )
+    return f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: {words}"
 
 
 def _mark_limits(axes: Axes, line: Line, limits: Mapping[str, float], styles: Styles) -> None:

@@ -92,14 +92,13 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
     draw_map(runs, tmp_path)
     success = figures[0]
     assert [axes.get_xlabel() for axes in success.axes] == ["sensor noise [times the usual]"]
-    note = success.get_supxlabel().replace("\n", " ")
-    assert "Every method has 100 at every place, with an interval from 44, along: link lengths" in note
-    assert "tool wrong by up to [mm], up to 100" in note
+    note = success.get_suptitle().replace("\n", " ")
+    assert "every method has 100 (interval from 44) throughout: link lengths wrong by up to 30 %; tool wrong" in note
     (axes,) = success.axes
     drawn = {line.get_label(): line for line in axes.get_lines() if len(line.get_xdata())}
     assert np.asarray(drawn["rls"].get_xdata()).tolist() == [0, 1, 2, 4, 8]  # to scale, without any shift
     assert np.asarray(drawn["rls"].get_ydata()).tolist() == [100, 100, 100, 0, 0]
     assert "ukf_mpc" not in drawn
-    assert axes.texts[0].get_text().replace("\n", " ") == "one line 100 throughout: ukf_mfac, ukf_mpc"
+    assert axes.texts[0].get_text().replace("\n", " ") == "one line, 100 throughout: ukf_mfac, ukf_mpc"
     assert [text.get_text() for text in success.legends[0].get_texts()] == ["ukf_mfac", "ukf_mpc", "rls"]
-    assert "half of the runs or more never settle" in figures[1].get_supxlabel()
+    assert "half of the runs or more never settle" in figures[1].get_suptitle()
