@@ -1,9 +1,10 @@
 """The contract of a controller: reset, step, diagnostics, save, restore; and what it may know about the robot.
 
-A controller never sees a plant, a simulator, a file or the truth. Adding one: a frozen configuration dataclass, a
-builder, and a `ControllerEntry` that is named in `harness.config.registry` or published under the entry-point group
-`servobench.controllers`. Most controllers are a Jacobian estimator and a control law composed by
-`servobench.controllers.servo.ServoController`; one that is not derives from `Controller`.
+A controller never sees a plant, a simulator, a file or the truth. One of your own is a subclass of `Controller` in a
+file, constructed as `Mine(knowledge)` or as `Mine(config, knowledge)` with an annotated frozen dataclass of settings.
+One that is published has a `ControllerEntry` under the entry-point group `servobench.controllers`. Most controllers are
+a Jacobian estimator and a control law composed by `servobench.controllers.servo.ServoController`; one that is not
+derives from `Controller`.
 """
 
 from __future__ import annotations
@@ -113,9 +114,9 @@ class Controller(ABC):
             The joint-velocity command, within the joint-speed limits.
         """
 
-    @abstractmethod
     def diagnostics(self) -> Diagnostics:
-        """Return named numbers about the last step; for the log only."""
+        """Return named numbers about the last step, for the log only; by default none."""
+        return {}
 
     def save(self) -> object:
         """Return the state, for `restore`."""

@@ -195,6 +195,8 @@ class Command:
 
     def __post_init__(self) -> None:
         """Check that everything is finite and freeze the array."""
+        if isinstance(self.joint_velocity, np.ndarray) and self.joint_velocity.dtype.kind == "c":
+            raise ValueError(f"joint_velocity must be real, got {self.joint_velocity.dtype}")
         value = np.array(self.joint_velocity, dtype=np.float64)
         if value.ndim == 0:
             raise ValueError(f"joint_velocity must have shape (n,), got {value}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
     from servobench.harness.batch.api import Results, compare, load, run
+    from servobench.harness.check.controllers import check_controller
     from servobench.plant.signals import Command, Observation
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Observation",
     "Results",
     "RobotKnowledge",
+    "check_controller",
     "compare",
     "load",
     "run",
@@ -32,6 +34,7 @@ __all__ = [
 _HOMES = {
     "servobench.controllers.controller": ("Controller", "ControllerEntry", "RobotKnowledge"),
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
+    "servobench.harness.check.controllers": ("check_controller",),
     "servobench.plant.signals": ("Command", "Observation"),
 }
 

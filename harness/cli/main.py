@@ -12,8 +12,10 @@ from rich.markup import escape
 
 from servobench.harness.cli import lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
+from servobench.harness.cli.check import check
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.init import init
+from servobench.harness.cli.new import new
 from servobench.harness.cli.options import INTERRUPTED, grouped
 from servobench.harness.cli.record import record
 from servobench.harness.cli.sweep import sweep
@@ -21,6 +23,7 @@ from servobench.harness.cli.sweep import sweep
 INPUT_ERROR = 2  # exit code
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
+    "Your own controller": (new, check),
     "What there is": (lists.plants, lists.controllers, lists.tasks, init),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
     "Tools": (runs.train, runs.collect),

@@ -1,0 +1,300 @@
+"""The contract of a controller, checked on made-up arms: `check_controller`."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from servobench.controllers.controller import Controller, ControllerEntry
+from servobench.harness.check.drive import Conditions, Driver, at, attributes, differing, watching_draws
+from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
+from servobench.harness.check.rig import PERIOD, Rig
+from servobench.harness.config.defaults import default_config
+from servobench.harness.config.entries import Build, folder_of
+from servobench.harness.config.own import own_object
+from servobench.harness.config.registry import choose_controller, find_controller, offer, offering
+from servobench.harness.config.settings import ConfigurationError
+
+JOINTS, FEATURES = 6, 3
+OTHER_SIZES: Final = (7, 2)
+STEPS: Final = 24
+STEPS_IF_SLOW: Final = 4
+SLOW: Final = 0.02  # [s] a step, beyond which runs are short
+LIMIT_TOLERANCE: Final = 1e-9
+APPROACH: Final = 60  # [periods] after which the error should have become smaller
+ROUGH: Final = (1e-3, 1e3, 1e6)  # scales of features
+SEED_REMEDY: Final = "make one in reset: self.rng = np.random.default_rng(seed)"
+
+
+def check_controller(
+    controller: str | type[Controller] | Controller | ControllerEntry,
+    begin: Callable[[str], None] = lambda _name: None,
+    found: Callable[[Finding], None] = lambda _finding: None,
+) -> Report:
+    """Check a controller against its contract, in this process.
+
+    In a test: `report = servobench.check_controller(Mine); assert report.ok, report`.
+
+    Args:
+        controller: a name, a place such as "./mine.py:Mine", a class, an object or an entry; see `servobench.run`.
+        begin: called with the name of each check before it is carried out.
+        found: called with each finding.
+
+    Returns:
+        What each check found; each failure says what to change.
+
+    Raises:
+        ConfigurationError: the controller cannot be loaded; it is a ValueError.
+    """
+    with offering():
+        name = choose_controller(controller) if isinstance(controller, str) else offer(own_object(controller))
+        findings = []
+        for finding in ControllerChecks(find_controller(name)).carry_out(begin):
+            findings.append(finding)
+            found(finding)
+    return Report(name, tuple(findings))
+
+
+class ControllerChecks:
+    """The checks of one controller."""
+
+    def __init__(self, entry: ControllerEntry, rig: Callable[[int, int], Rig] = Rig) -> None:
+        """Prepare the checks.
+
+        Args:
+            entry: what builds the controller.
+            rig: makes an arm of n joints and m features.
+        """
+        self.entry, self.rig, self.steps = entry, rig, STEPS
+        self.folder = folder_of(entry.build.make if isinstance(entry.build, Build) else entry.build)
+        self._times: list[float] = []
+        self._printed = ""
+
+    def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
+        """Yield what each check finds."""
+        return findings_of(self.checks(), self.folder, begin)
+
+    def checks(self) -> list[Check]:
+        """Return the checks in their order."""
+        alike = ("command", "repeatable")
+        return [
+            Check("constructor", self.constructor),
+            Check("command", self.command, ("constructor",)),
+            Check("limits", self.limits, ("command",)),
+            Check("diagnostics", self.diagnostics, ("command",)),
+            Check("repeatable", self.repeatable, ("command",)),
+            Check("reset", self.reset, alike),
+            Check("separate", self.separate, alike),
+            Check("save", self.save, (*alike, "separate")),
+            Check("at target", self.at_target, ("command",)),
+            Check("lost feature", self.lost_feature, ("command",)),
+            Check("large numbers", self.large_numbers, ("command",)),
+            Check("other sizes", self.other_sizes, ("command",)),
+            Check("no preview", self.no_preview, ("command",)),
+            Check("approach", self.approach, ("command",)),
+            Check("time", self.time, ("command",)),
+            Check("output", self.output, ("command",)),
+        ]
+
+    def constructor(self) -> None:
+        """It can be built."""
+        self._build()
+
+    def command(self) -> None:
+        """Each step returns n finite numbers."""
+        driver, printed = self._driver(), io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            driver.begin().run(STEPS_IF_SLOW)
+            if np.median(driver.times) > SLOW:
+                self.steps = STEPS_IF_SLOW
+            driver.run(self.steps - STEPS_IF_SLOW)
+        self._times, self._printed = driver.times, printed.getvalue()
+
+    def limits(self) -> None:
+        """No joint is commanded faster than its limit."""
+        driver = self._driver()
+        ratio = np.max(np.abs(driver.begin().run(self.steps)) / driver.rig.spec.joint_velocity_limit)
+        if ratio > 1.0 + LIMIT_TOLERANCE:
+            raise CheckFailed(
+                f"{at(driver.controller.step)}: a command is {ratio:.3g} times the joint-speed limit; shorten it: "
+                "u / max(1.0, np.max(np.abs(u) / knowledge.spec.joint_velocity_limit))"
+            )
+
+    def diagnostics(self) -> None:
+        """What is logged are named numbers and a Jacobian."""
+        driver = self._driver().begin()
+        driver.step()
+        controller, spec = driver.controller, driver.rig.spec
+        named: Any = controller.diagnostics()
+        try:
+            shapes = {str(name): np.shape(np.asarray(value, dtype=np.float64)) for name, value in named.items()}
+        except (AttributeError, TypeError, ValueError) as error:
+            raise CheckFailed(
+                f"{at(controller.diagnostics)}: diagnostics must return names with numbers, got {named!r}"
+            ) from error
+        for name, shape in shapes.items():
+            if shape:
+                raise CheckFailed(f"{at(controller.diagnostics)}: {name} must be one number, got shape {shape}")
+        J: Any = controller.estimated_jacobian()
+        if J is not None and (np.shape(J) != (spec.m, spec.n) or not np.isfinite(J).all()):
+            raise CheckFailed(
+                f"{at(controller.estimated_jacobian)}: estimated_jacobian must return {(spec.m, spec.n)} finite "
+                f"numbers or None, got shape {np.shape(J)}"
+            )
+
+    def repeatable(self) -> None:
+        """The same seed gives the same commands."""
+        with watching_draws(self.folder) as draws:
+            first, second = (self._driver().begin().run(self.steps) for _ in range(2))
+        if np.array_equal(first, second):
+            return
+        if draws.places:
+            why = f"{draws.places[0]}: a generator of random numbers is made without a seed; {SEED_REMEDY}"
+        elif draws.shared:
+            why = f"it draws from the generator of {draws.shared[0]}, which no seed of a run sets; {SEED_REMEDY}"
+        else:
+            why = (
+                "two new controllers command differently with the same seed: it depends on the clock, or on a variable "
+                "of the module or the class; keep all state in attributes that reset sets"
+            )
+        raise CheckFailed(why)
+
+    def reset(self) -> None:
+        """A run leaves nothing behind for the next."""
+        fresh, used = self._driver().begin(), self._driver(seed=1)
+        new = attributes(fresh.controller)
+        first = fresh.run(self.steps)
+        used.begin().run(self.steps)
+        used.conditions = Conditions()
+        kept = differing(new, attributes(used.begin().controller))
+        again = used.run(self.steps)
+        if not np.array_equal(first, again):
+            name = f" in self.{', self.'.join(kept)}" if kept else ""
+            raise CheckFailed(
+                f"{at(used.controller.reset)}: reset keeps what an earlier run left{name}; set it anew there"
+            )
+
+    def separate(self) -> None:
+        """Two controllers in one process do not disturb each other."""
+        alone = self._driver().begin().run(self.steps)
+        one, other = self._driver().begin(), self._driver(seed=1).begin()
+        together = []
+        for _ in range(self.steps):
+            together.append(one.step())
+            other.step()
+        if not np.array_equal(alone, together):
+            raise CheckFailed(
+                "two controllers in one process disturb each other through a variable of the module or the class; "
+                "keep all state in attributes that reset sets"
+            )
+
+    def save(self) -> str | None:
+        """A saved state continues as the run did."""
+        driver = self._driver().begin()
+        driver.run(2)
+        try:
+            saved = driver.controller.save()
+        except Exception as error:  # noqa: BLE001 - of the user's attributes
+            return f"it cannot be saved and continued in several ways: {type(error).__name__}: {error}"
+        state = driver.q, driver.observation, driver.rng.bit_generator.state, driver.k
+        first = driver.run(2)
+        driver.controller.restore(saved)
+        driver.q, driver.observation, driver.rng.bit_generator.state, driver.k = state
+        if not np.array_equal(first, driver.run(2)):
+            raise CheckFailed(
+                "after restore it commands differently; save and restore must cover all that step changes"
+            )
+        return None
+
+    def at_target(self) -> None:
+        """At rest at the target, where the error and all motion are zero, commands are finite."""
+        self._driver(at_goal=True).begin().run(self.steps)
+
+    def lost_feature(self) -> None:
+        """Commands are finite while the feature is not seen, also from the start."""
+        for lost in (range(1, 4), range(3)):
+            self._driver(lost=lost).begin().run(min(self.steps, 6))
+
+    def large_numbers(self) -> None:
+        """Commands are finite for small and large features."""
+        for scale in ROUGH:
+            self._driver(scale=scale).begin().run(min(self.steps, 6))
+
+    def other_sizes(self) -> str | None:
+        """It takes its sizes from `knowledge.spec`."""
+        n, m = OTHER_SIZES
+        what = f"{n} joints and {m} features"
+        try:
+            controller = self.entry.build(default_config(self.entry), self.rig(n, m).knowledge(truth=self._truth))
+        except ConfigurationError as error:
+            if "ValueError" in str(error):
+                return f"it refuses {what}: {error}"
+            raise CheckFailed(f"{error}; this happens with {what}: take n and m from knowledge.spec") from error
+        except ValueError as error:
+            return f"it refuses {what}: {error}"
+        try:
+            Driver(controller, self.rig(n, m)).begin().run(min(self.steps, 6))
+        except CheckFailed as failure:
+            raise CheckFailed(f"{failure}; this happens with {what}: take n and m from knowledge.spec") from failure
+        except Exception as error:
+            error.args = (f"{error}; this happens with {what}: take n and m from knowledge.spec",)
+            raise
+        return None
+
+    def no_preview(self) -> str | None:
+        """It runs with a reference of one row."""
+        try:
+            self._driver(preview=0).begin().run(min(self.steps, 6))
+        except (IndexError, ValueError, ConfigurationError) as error:
+            return f"it needs a preview of the reference, run.preview_time: {' '.join(str(error).split())}"
+        return None
+
+    def approach(self) -> str | None:
+        """It brings the feature nearer to its target."""
+        driver = self._driver().begin()
+        before = driver.error()
+        driver.run(APPROACH if self.steps == STEPS else self.steps)
+        after, seconds = driver.error(), driver.k * PERIOD
+        if after <= before:
+            return None
+        hint = "; is the error reference[0] - observation.feature?" if after > 1.5 * before else ""
+        return f"on a made-up arm the error grows from {before:.2g} to {after:.2g} m in {seconds:g} s{hint}"
+
+    def time(self) -> str | None:
+        """A step fits into a control period."""
+        typical, longest = float(np.median(self._times)), max(self._times[1:])
+        period = f"the period of {1e3 * PERIOD:g} ms"
+        if typical > PERIOD:
+            raise CheckFailed(
+                f"a step takes {1e3 * typical:.0f} ms, longer than {period}: a robot would get its commands too late; "
+                "move work to the constructor, or choose a longer run.period"
+            )
+        return f"a step took {1e3 * longest:.0f} ms, longer than {period}" if longest > PERIOD else None
+
+    def output(self) -> str | None:
+        """It prints nothing."""
+        lines = len(self._printed.splitlines())
+        if not lines:
+            return None
+        return f"it prints {lines} lines in {self.steps} steps; numbers for the log are returned by diagnostics"
+
+    @property
+    def _truth(self) -> bool:
+        return self.entry.needs_truth
+
+    def _build(self, preview: int | None = None) -> tuple[Controller, Rig]:
+        rig = self.rig(JOINTS, FEATURES)
+        knowledge = rig.knowledge(truth=self._truth)
+        if preview is not None:
+            knowledge = replace(knowledge, preview=preview)
+        return self.entry.build(default_config(self.entry), knowledge), rig
+
+    def _driver(self, **conditions: Any) -> Driver:  # noqa: ANN401 - those of `Conditions`
+        chosen = Conditions(**conditions)
+        controller, rig = self._build(chosen.preview)
+        return Driver(controller, rig, chosen)

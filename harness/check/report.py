@@ -1,0 +1,106 @@
+"""What checks find: a list of findings, each ok, failed or a note."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import describe_at
+
+Verdict: TypeAlias = Literal["ok", "failed", "note"]
+WIDTH: Final = 14  # of the names of checks, in print
+
+
+class Finding(NamedTuple):
+    """What one check found."""
+
+    check: str
+    """what was checked, in one or two words"""
+    verdict: Verdict
+    """a note is no defect, but worth knowing"""
+    text: str = ""
+    """what is wrong, where, and what to change; empty if it is ok"""
+
+    def __str__(self) -> str:
+        """Return it as a line."""
+        return f"{self.verdict:7s}{self.check:{WIDTH}s}{self.text}".rstrip()
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the checks of one subject found."""
+
+    subject: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def failures(self) -> tuple[Finding, ...]:
+        """The checks that failed."""
+        return tuple(each for each in self.findings if each.verdict == "failed")
+
+    @property
+    def ok(self) -> bool:
+        """Whether no check failed; notes are allowed."""
+        return not self.failures
+
+    def __str__(self) -> str:
+        """Return all findings, a line each."""
+        return "\n".join([f"{self.subject}:", *map(str, self.findings)])
+
+    __repr__ = __str__
+
+
+class CheckFailed(Exception):
+    """A check found a defect; the message says what to change."""
+
+
+class Check(NamedTuple):
+    """One check of a subject."""
+
+    name: str
+    carry_out: Callable[[], str | None]
+    """returns a note or nothing, and raises `CheckFailed`"""
+    needs: tuple[str, ...] = ()
+    """checks without which this one tells nothing new"""
+
+
+def findings_of(checks: Iterable[Check], folder: Path, begin: Callable[[str], None]) -> Iterator[Finding]:
+    """Carry out checks one after the other and yield what each finds.
+
+    Args:
+        checks: a check is left out if one that it needs was not ok.
+        folder: that of the user's code.
+        begin: called with the name of each check before it is carried out.
+    """
+    good: set[str] = set()
+    for check in checks:
+        if not good.issuperset(check.needs):
+            continue
+        begin(check.name)
+        try:
+            with np.errstate(divide="raise", over="raise", invalid="raise"):
+                note = check.carry_out()
+        except CheckFailed as failure:
+            yield Finding(check.name, "failed", str(failure))
+        except ConfigurationError as error:
+            yield Finding(check.name, "failed", str(error))
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the checked code does
+            yield Finding(check.name, "failed", describe_at(error, folder) + _remedy(error))
+        else:
+            good.add(check.name)
+            yield Finding(check.name, "note", note) if note else Finding(check.name, "ok")
+
+
+def _remedy(error: BaseException) -> str:
+    if isinstance(error, ValueError) and "read-only" in str(error):
+        return "; what step is given must not be changed: work on a copy, such as e = reference[0].copy()"
+    if isinstance(error, FloatingPointError):
+        return "; such a number ends a run: guard the division, or the power, against it"
+    if isinstance(error, SystemExit):
+        return "; raise an error instead, so that the other runs go on"
+    return ""

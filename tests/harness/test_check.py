@@ -1,0 +1,98 @@
+"""The checks of controllers: a broken one fails the one right check with the one right line, a whole one none."""
+
+from __future__ import annotations
+
+import pytest
+
+import servobench
+from kit.broken_controllers import BROKEN, NOTED
+from kit.command import servobench as command
+from kit.own import CONFIGURED, WHOLE, write
+from servobench.harness.check.controllers import check_controller
+
+KILLERS = """
+import ctypes
+import os
+import time
+import numpy as np
+import servobench
+
+
+class Segv(servobench.Controller):
+    def __init__(self, knowledge):
+        self.n = knowledge.spec.n
+
+    def reset(self, observation, seed):
+        pass
+
+    def step(self, observation, reference):
+        return servobench.Command(np.full(self.n, ctypes.string_at(0)[0]))
+
+
+class Hang(Segv):
+    def step(self, observation, reference):
+        while True:
+            time.sleep(0.1)
+
+
+class Exit(Segv):
+    def step(self, observation, reference):
+        os._exit(9)
+"""
+KILLING = {
+    "Segv": ("command", "kill.py:17: it killed the process by SIGSEGV"),
+    "Hang": ("command", "kill.py:23: no answer after 3 s; is there a loop without an end"),
+    "Exit": ("command", "it ended the process with exit code 9"),
+}
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_controller_fails_one_check_with_one_line(tmp_path, what):
+    text, check, line = BROKEN[what]
+    write(tmp_path, text)
+    report = check_controller("./mine.py")
+    assert [each.check for each in report.failures] == [check], report
+    assert report.failures[0].text.startswith(line), report
+    assert "\n" not in report.failures[0].text
+    assert not report.ok
+
+
+@pytest.mark.parametrize("what", NOTED)
+def test_what_is_no_defect_is_a_note(tmp_path, what):
+    text, check, line = NOTED[what]
+    write(tmp_path, text)
+    report = check_controller("./mine.py")
+    assert report.ok, report
+    noted = {each.check: each.text for each in report.findings if each.verdict == "note"}
+    assert noted[check].startswith(line), report
+
+
+@pytest.mark.parametrize("text", [WHOLE, CONFIGURED])
+def test_a_whole_controller_passes_every_check(tmp_path, text):
+    write(tmp_path, text)
+    report = servobench.check_controller("./mine.py")
+    assert {each.verdict for each in report.findings} == {"ok"}
+    assert len(report.findings) == 16
+    assert str(report).startswith("Mine:\nok     constructor\nok     command\n")
+
+
+@pytest.mark.parametrize("kind", KILLING)
+def test_a_controller_that_kills_its_process_or_never_answers_loses_no_output(tmp_path, monkeypatch, capsys, kind):
+    write(tmp_path, KILLERS, "kill.py")
+    check, line = KILLING[kind]
+    assert command(monkeypatch, "check", f"./kill.py:{kind}", "--limit", "3") == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["ok", "constructor"]
+    assert lines[1].startswith(f"failed {check:15s}{line}"), lines
+    assert lines[2:] == [f"./kill.py:{kind}: 1 of 2 checks failed"]
+
+
+def test_a_controller_that_cannot_be_loaded_is_refused_as_elsewhere(tmp_path, monkeypatch, capsys):
+    write(tmp_path, WHOLE.replace("def step", "def stepp"))
+    assert command(monkeypatch, "check", "./mine.py") == 2
+    assert capsys.readouterr().err == "servobench: mine.py:6: class Mine lacks step, which it must define\n"

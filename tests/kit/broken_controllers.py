@@ -1,0 +1,78 @@
+"""Controllers with one defect each, the check that finds it, and the line that says so."""
+
+# ruff: noqa: E501 - a case a line
+
+from __future__ import annotations
+
+from kit.own import WHOLE
+
+STEP = "        return servobench.Command(np.zeros(self.n))\n"
+HEAD = "import ctypes, itertools, os, random, sys, time\nfrom numpy.random import default_rng\n"
+BODY = HEAD + WHOLE  # so that line numbers are those of WHOLE + 2
+
+
+def stepping(*lines: str, reset: str = "pass", module: str = "", inside: str = "") -> str:
+    """Return a file whose `step` has these lines, `reset` this one, the class these attributes."""
+    text = BODY.replace(STEP, "".join(f"        {line}\n" for line in lines))
+    text = text.replace("seed):\n        pass", f"seed):\n        {reset}")
+    return text.replace('"""Does not move."""', f'"""Does not move."""{inside}') + module
+
+
+COMMAND = "return servobench.Command(np.{} * np.ones(self.n))"
+BROKEN = {  # file, check, begin of its line
+    "array": (stepping("return np.zeros(self.n)"), "command", "mine.py:17: step must return a servobench.Command, got ndarray"),
+    "list": (stepping("return [0.0] * self.n"), "command", "mine.py:17: step must return a servobench.Command, got list"),
+    "int": (stepping("return 0"), "command", "mine.py:17: step must return a servobench.Command, got int"),
+    "none": (stepping("servobench.Command(np.zeros(self.n))"), "command", "mine.py:17: step must return a servobench.Command, got NoneType"),
+    "complex": (stepping("return servobench.Command(1j * np.zeros(self.n))"), "command", "mine.py:18: ValueError: joint_velocity must be real, got complex128"),
+    "text": (stepping("return servobench.Command(['a'] * self.n)"), "command", "mine.py:18: ValueError: could not convert string to float"),
+    "nan": (stepping(COMMAND.format("nan")), "command", "mine.py:18: ValueError: joint_velocity must be finite, got [nan"),
+    "infinite": (stepping(COMMAND.format("inf")), "command", "mine.py:18: ValueError: joint_velocity must be finite, got [inf"),
+    "scalar": (stepping("return servobench.Command(0.0)"), "command", "mine.py:18: ValueError: joint_velocity must have shape (n,)"),
+    "too short": (stepping("return servobench.Command(np.zeros(self.n - 1))"), "command", "mine.py:17: the command must have shape (6,), a number for each joint, got (5,)"),
+    "a column": (stepping("return servobench.Command(np.zeros((self.n, 1)))"), "command", "mine.py:17: the command must have shape (6,), a number for each joint, got (6, 1)"),
+    "huge": (stepping("return servobench.Command(np.full(self.n, 1e9))"), "limits", "mine.py:17: a command is 1e+09 times the joint-speed limit; shorten it"),
+    "a little too fast": (stepping("return servobench.Command(np.full(self.n, 1.01))"), "limits", "mine.py:17: a command is 1.01 times the joint-speed limit"),
+    "exception in step": (stepping("return observation.joints"), "command", "mine.py:18: AttributeError: 'Observation' object has no attribute 'joints'"),
+    "exception later": (stepping("self.k += 1", "if self.k > 9: raise RuntimeError('late')", STEP.strip(), reset="self.k = 0"), "command", "mine.py:19: RuntimeError: late"),
+    "exception in reset": (stepping(STEP.strip(), reset="self.y = {}['y']"), "command", "mine.py:15: KeyError: 'y'"),
+    "reset without seed": (BODY.replace("observation, seed)", "observation)"), "command", "TypeError: Mine.reset() takes 2 positional arguments but 3 were given"),
+    "step without reference": (BODY.replace("observation, reference)", "observation)"), "command", "TypeError: Mine.step() takes 2 positional arguments"),
+    "division": (stepping("u = np.ones(self.n) / (0.0 * observation.feature[0])", "return servobench.Command(u)"), "command", "mine.py:18: FloatingPointError: divide by zero encountered in divide; such a number ends a run"),
+    "singular matrix": (stepping("return servobench.Command(np.linalg.solve(np.zeros((6, 6)), np.ones(6)))"), "command", "mine.py:18: LinAlgError: Singular matrix"),
+    "writes into the feature": (stepping("observation.feature[:] = 0.0", STEP.strip()), "command", "mine.py:18: ValueError: assignment destination is read-only; what step is given must not be changed"),
+    "writes into the reference": (stepping("reference -= 1.0", STEP.strip()), "command", "mine.py:18: ValueError: output array is read-only; what step is given must not be changed"),
+    "writes by force": (stepping("reference.flags.writeable = True", "reference[0] = 0.0", STEP.strip()), "command", "mine.py:17: step changes what it is given; work on a copy"),
+    "exit": (stepping("sys.exit(3)"), "command", "mine.py:18: SystemExit: 3; raise an error instead"),
+    "exception in diagnostics": (BODY.replace("return {}", "return {'a': self.a}"), "diagnostics", "mine.py:21: AttributeError: 'Mine' object has no attribute 'a'"),
+    "no names in diagnostics": (BODY.replace("return {}", "return [1.0]"), "diagnostics", "mine.py:20: diagnostics must return names with numbers, got [1.0]"),
+    "text in diagnostics": (BODY.replace("return {}", "return {'mode': 'fast'}"), "diagnostics", "mine.py:20: diagnostics must return names with numbers, got {'mode': 'fast'}"),
+    "array in diagnostics": (BODY.replace("return {}", "return {'u': np.zeros(3)}"), "diagnostics", "mine.py:20: u must be one number, got shape (3,)"),
+    "wrong Jacobian": (BODY + "\n    def estimated_jacobian(self):\n        return np.zeros((2, 2))\n", "diagnostics", "mine.py:23: estimated_jacobian must return (3, 6) finite numbers or None, got shape (2, 2)"),
+    "unseeded generator": (stepping("return servobench.Command(self.rng.uniform(-1, 1, self.n))", reset="self.rng = default_rng()"), "repeatable", "mine.py:15: a generator of random numbers is made without a seed; make one in reset"),
+    "numpy's generator": (stepping("return servobench.Command(np.random.uniform(-1, 1, self.n))"), "repeatable", "it draws from the generator of numpy.random"),
+    "Python's generator": (stepping("return servobench.Command(np.full(self.n, random.random()))"), "repeatable", "it draws from the generator of random,"),
+    "clock": (stepping("return servobench.Command(np.full(self.n, time.perf_counter() % 1.0))"), "repeatable", "two new controllers command differently with the same seed: it depends on the clock"),
+    "module variable": (stepping("return servobench.Command(np.full(self.n, 1.0 / (1 + next(COUNT))))", module="\n\nCOUNT = itertools.count()\n"), "repeatable", "two new controllers command differently with the same seed"),
+    "class attribute": (stepping("Mine.k += 1", "return servobench.Command(np.full(self.n, 1.0 / Mine.k))", inside="\n\n    k = 0\n"), "repeatable", "two new controllers command differently"),
+    "mutable default": (stepping("return servobench.Command(np.full(self.n, self.learn()))", module="\n    def learn(self, seen=[]):\n        seen.append(0)\n        return 1.0 / len(seen)\n"), "repeatable", "two new controllers command differently"),
+    "forgets nothing": (stepping("self.k = getattr(self, 'k', 0) + 1", "return servobench.Command(np.full(self.n, 1.0 / self.k))"), "reset", "mine.py:14: reset keeps what an earlier run left in self.k; set it anew there"),
+    "integral is kept": (stepping("self.total = self.total + 0.01", "return servobench.Command(np.full(self.n, self.total))").replace("        self.n =", "        self.total = 0.0\n        self.n ="), "reset", "mine.py:15: reset keeps what an earlier run left in self.total"),
+    "shared but reset": (stepping("STATE['k'] += 1", "return servobench.Command(np.full(self.n, 1.0 / STATE['k']))", reset="STATE['k'] = 0", module="\n\nSTATE = {'k': 0}\n"), "separate", "two controllers in one process disturb each other"),
+    "saves too little": (stepping("self.k += 1", "return servobench.Command(np.full(self.n, 1.0 / self.k))", reset="self.k = 0", module="\n    def save(self):\n        return None\n\n    def restore(self, state):\n        pass\n"), "save", "after restore it commands differently"),
+    "error over its norm": (stepping("e = reference[0] - observation.feature", "return servobench.Command(np.full(self.n, 0.1 * (e / np.linalg.norm(e))[0]))"), "at target", "mine.py:19: FloatingPointError: invalid value encountered in divide"),
+    "refuses a lost feature": (stepping("assert observation.feature_valid", STEP.strip()), "lost feature", "mine.py:18: AssertionError"),
+    "overflow": (stepping("return servobench.Command(np.full(self.n, 1.0 / np.exp(np.max(np.abs(observation.feature)))))"), "large numbers", "mine.py:18: FloatingPointError: overflow"),
+    "six joints": (stepping("return servobench.Command(np.zeros(6))"), "other sizes", "mine.py:17: the command must have shape (7,), a number for each joint, got (6,); this happens with 7 joints and 2 features"),
+    "three features": (stepping("return servobench.Command(np.full(self.n, 0.0 * observation.feature[2]))"), "other sizes", "mine.py:18: IndexError: index 2 is out of bounds for axis 0 with size 2; this happens with 7 joints and 2 features"),
+    "slow": (stepping("time.sleep(0.06)", STEP.strip()), "time", "a step takes "),
+    "constructor": (BODY.replace("knowledge.spec.n", "knowledge.n"), "constructor", "mine.py:12: AttributeError: 'RobotKnowledge' object has no attribute 'n'"),
+}  # fmt: skip
+NOTED = {
+    "printing": (stepping("print('step')", STEP.strip()), "output", "it prints 24 lines in 24 steps"),
+    "refuses sizes": (BODY.replace("        self.n = knowledge.spec.n", "        self.n = knowledge.spec.n\n        if self.n != 6:\n            raise ValueError('six joints are needed')"), "other sizes", "it refuses 7 joints and 2 features: mine.py:14: ValueError: six joints are needed"),
+    "looks ahead": (stepping("return servobench.Command(np.full(self.n, 0.0 * reference[1, 0]))"), "no preview", "it needs a preview of the reference, run.preview_time"),
+    "wrong sign": (stepping("e = observation.feature - reference[0]", "u = self.J(observation.joint_position).T @ e", "return servobench.Command(np.clip(u, -1.0, 1.0))").replace("        self.n =", "        self.J = knowledge.nominal_jacobian\n        self.n ="), "approach", "on a made-up arm the error grows"),
+    "a lock": (stepping(STEP.strip(), reset="import threading; self.lock = threading.Lock()"), "save", "it cannot be saved and continued in several ways: TypeError: cannot pickle"),
+    "slow now and then": (stepping("self.k += 1", "time.sleep(0.06 * (self.k == 9))", STEP.strip(), reset="self.k = 0"), "time", "a step took "),
+}  # fmt: skip
