@@ -120,7 +120,7 @@ def installed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("controller", ["nominal_rate", "nominal_broyden"])
 def test_the_controllers_of_the_example_settle_on_a_real_plant(installed, controller):
-    installed(read("own_controller.md"))
+    installed(section(read("own_controller.md"), "As a distribution"))
     assert controller in registry.controller_names()
     request = RunRequest("kinematic", controller, "exp2", "moderate", 3)
     settings = read_settings(None, ["nominal_rate.gain=1.5", "nominal_broyden.law.proportional_gain=1.5"])

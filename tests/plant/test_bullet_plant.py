@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kit.plants import configure
+from kit.plants import NEEDS_BULLET, configure
 from servobench.plant.bullet.bullet_plant import BulletConfig, build_bullet
 from servobench.plant.plant import PlantSetup
 from servobench.plant.robot import ur5
@@ -25,11 +25,13 @@ def test_the_camera_sees_the_circle_of_the_workspace_with_a_margin(height):
     assert (pixel < (camera.width - 15, camera.height - 15)).all()
 
 
+@NEEDS_BULLET
 def test_a_period_that_physics_does_not_divide_is_refused():
     with pytest.raises(ValueError, match=r"period must be a whole multiple of the plant's own step of 0\.001 s"):
         build_bullet(configure(BulletConfig, scenery=False, latency=0.0), PlantSetup(MODEL, HOME, 0.0305))
 
 
+@NEEDS_BULLET
 def test_a_gear_ratio_of_zero_is_refused():
     arm = MODEL.arm
     stuck = SerialArm(arm.joint_names, arm.translation, arm.rpy, arm.joint_offset, np.eye(6)[0], arm.tool)
