@@ -12,7 +12,9 @@ from kit.documents import FENCED
 SAVED = re.compile(r"`([\w/]+\.\w+)`:\s*$")  # the line before a block that is a file
 ELLIPSIS = "..."
 PROGRESS = re.compile(r"^(running|training)\b.*[━╸]|^report: ")  # times and sizes differ
-LATE = re.compile(r"; \* some steps took longer than the period")  # only on a busy machine
+VARYING = re.compile(
+    r"; \* some steps took longer than the period|\d+ (?=figure files)"
+)  # the first: on a busy machine
 CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")  # the last column of a table of runs: microseconds of wall clock
 
 
@@ -39,7 +41,7 @@ def plain(printed):
         if PROGRESS.search(line) or not line.strip():
             continue
         if line.startswith(" ") or line == ELLIPSIS:
-            found += [LATE.sub("", " ".join(text))] if text else []
+            found += [VARYING.sub("", " ".join(text))] if text else []
             found.append(" ".join(CLOCK.sub("", line).split()))
             text = []
         else:
