@@ -12,9 +12,7 @@ from kit.documents import FENCED
 SAVED = re.compile(r"`([\w/]+\.\w+)`:\s*$")  # the line before a block that is a file
 ELLIPSIS = "..."
 PROGRESS = re.compile(r"^(running|training)\b.*[━╸]|^report: ")  # times and sizes differ
-VARYING = re.compile(
-    r"; \* some steps took longer than the period|\d+ (?=figure files)"
-)  # the first: on a busy machine
+VARYING = re.compile(r"; \* some steps took longer than the period|\d+ (?=figure files)")  # 1: when busy
 CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")  # the last column of a table of runs: microseconds of wall clock
 
 
