@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
+from servobench.harness.analysis.cells import Cell, Row, as_text
 from servobench.harness.analysis.comparison import (
     achieved_share,
     achievement,
@@ -59,11 +60,18 @@ MAX_REASON: Final = 60  # characters of a reason that are shown in a table
 
 def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
     """Yield for each plant, task and condition how each controller does, and how each pair of them differs."""
+    for words, controllers, pairs in statistics_rows(runs, metric, never):
+        yield words, as_text(controllers)
+        if pairs:
+            yield "pairs", as_text(pairs)
+
+
+def statistics_rows(
+    runs: pd.DataFrame, metric: str | None = None, never: float | None = None
+) -> Iterator[tuple[str, list[Row], list[Row]]]:
+    """Yield for each plant, task and condition its words, a row for each controller and one for each pair of them."""
     for words, place in split_conditions(runs):
-        yield words, judge_controllers(place)
-        pairs = compare_controllers(place, metric, never)
-        if len(pairs):
-            yield "pairs", pairs
+        yield words, _controller_rows(place), _pair_rows(place, metric, never)
 
 
 def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
@@ -75,25 +83,29 @@ def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
     Returns:
         Text; medians and rates have 95 % intervals. Errors are in the unit of the plant's feature or a handier one.
     """
+    return as_text(_controller_rows(runs))
+
+
+def _controller_rows(runs: pd.DataFrame) -> list[Row]:
     unit, factor = MEASURES["steady_state_error"].scale(runs)
-    rows = []
+    rows: list[Row] = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
         failed = ended[~ended.isin(ACHIEVED)].value_counts()
         final = column_of(own, "steady_state_error").where(own["status"] == COMPLETED)
         rows.append(
             {
-                "controller": str(name),
-                "runs": str(len(own)),
-                f"{achievement(runs)}, %": f"{achieved_share(own):.1f}",
-                "settling time, s": f"{_median(settling_times(own)):.2f}",
-                "overshoot, %": f"{_median(100.0 * column_of(own, 'overshoot')):.1f}",
-                f"RMS end, {unit}": f"{_median(factor * column_of(own, 'rms_error_evaluated')):.1f}",
-                f"worst 5 %, {unit}": f"{factor * tail_mean(final, TAIL):.1f}",
-                "failures": ", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none",
+                "controller": Cell(str(name)),
+                "runs": Cell(len(own)),
+                f"{achievement(runs)}, %": Cell(achieved_share(own), ".1f"),
+                "settling time, s": Cell(_median(settling_times(own)), ".2f"),
+                "overshoot, %": Cell(_median(100.0 * column_of(own, "overshoot")), ".1f"),
+                f"RMS end, {unit}": Cell(_median(factor * column_of(own, "rms_error_evaluated")), ".1f"),
+                f"worst 5 %, {unit}": Cell(factor * tail_mean(final, TAIL), ".1f"),
+                "failures": Cell(", ".join(f"{count} {kind}" for kind, count in failed.items()) or "none"),
             }
         )
-    return pd.DataFrame(rows)
+    return rows
 
 
 def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> pd.DataFrame:
@@ -107,9 +119,13 @@ def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: fl
     Raises:
         ConfigurationError: no such column of numbers.
     """
+    return as_text(_pair_rows(runs, metric, never))
+
+
+def _pair_rows(runs: pd.DataFrame, metric: str | None, never: float | None) -> list[Row]:
     pairs = list(combinations(dict.fromkeys(runs["controller"]), 2))
     if not pairs:
-        return pd.DataFrame()
+        return []
     if metric is None:
         metric = "rms_error_evaluated" if len(split_tasks(runs)[1]) else "settling_time_s"
     numbers = [str(name) for name in runs.select_dtypes("number").columns]
@@ -122,17 +138,15 @@ def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: fl
     measure = MEASURES.get(metric, Measure(metric.replace("_", " "), 2, "1"))
     unit, factor = measure.scale(runs)
     what = measure.name if unit == "1" else f"{measure.name}, {unit}"
-    return pd.DataFrame(
-        [
-            {
-                "pair": f"{pair.first} − {pair.second}",
-                "pairs": str(pair.difference.count),
-                f"difference in {what}": f"{pair.difference.scaled(factor):.2f}",
-                "p after Holm": f"{pair.corrected_p_value:.2g}",
-            }
-            for pair in compared
-        ]
-    )
+    return [
+        {
+            "pair": Cell(f"{pair.first} − {pair.second}"),
+            "pairs": Cell(pair.difference.count),
+            f"difference in {what}": Cell(pair.difference.scaled(factor), ".2f"),
+            "p after Holm": Cell(pair.corrected_p_value, ".2g"),
+        }
+        for pair in compared
+    ]
 
 
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from servobench.harness.cli.terminal import console, print_markdown, print_tables
+from servobench.harness.cli.terminal import console, print_json, print_markdown, print_tables
 
 SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 
@@ -22,15 +22,29 @@ def statistics(
         float | None, typer.Option(help="Stands for the value of a run without one; default: twice the largest.")
     ] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
 ) -> None:
     """Judge the controllers of a folder, with 95 % intervals.
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.tables import statistics_tables
+    from servobench.harness.analysis.cells import as_plain
+    from servobench.harness.analysis.tables import statistics_rows, statistics_tables
     from servobench.harness.batch import results
+    from servobench.harness.config.settings import ConfigurationError
 
-    tables = statistics_tables(results.load_runs(folder), metric, never)
+    if markdown and as_json:
+        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
+    runs = results.load_runs(folder)
+    if as_json:
+        print_json(
+            [
+                {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
+                for place, controllers, pairs in statistics_rows(runs, metric, never)
+            ]
+        )
+        return
+    tables = statistics_tables(runs, metric, never)
     print_markdown(tables) if markdown else print_tables(tables)
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
+from servobench.harness.analysis.cells import Cell
 from servobench.harness.analysis.comparison import split_conditions, split_tasks
 from servobench.harness.analysis.folder import describe_folder
+from servobench.harness.analysis.statistics import Estimate
 from servobench.harness.analysis.summary import outcome_legend, summary_legend, summary_tables, sweep_tables
 from servobench.harness.analysis.tables import (
     compare_controllers,
@@ -229,3 +233,22 @@ def test_times_that_are_not_known_get_no_column(tmp_path):
 def test_a_long_reason_is_shortened_in_the_table_of_runs():
     table = runs_table(pd.DataFrame([made_up_row("a", reason="x" * 200)]))
     assert table["reason"][0] == "x" * 59 + "…"
+
+
+def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
+    monkeypatch.setattr(results, "load_runs", lambda folder: runs)
+    assert servobench(monkeypatch, "statistics", str(tmp_path), "--json", "--never", "10") == 0
+    (place,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    quick, slow = place["controllers"]
+    settled = slow["settled, %"]
+    assert (slow["controller"], slow["runs"], settled["value"], settled["count"]) == ("slow", 20, 80.0, 20)
+    assert quick["settled, %"]["low"] == pytest.approx(83.9, abs=0.05)
+    assert slow["worst 5 %, mm"] == "inf"
+    (pair,) = place["pairs"]
+    assert pair["difference in settling time, s"]["value"] < -1.0
+    assert servobench(monkeypatch, "statistics", str(tmp_path), "--json", "--markdown") == 2
+
+
+def test_a_number_that_there_is_not_is_null_for_programs():
+    nothing = {"value": None, "low": None, "high": None, "count": 0}
+    assert Cell(Estimate(np.nan, np.nan, np.nan, 0), ".1f").plain() == nothing
