@@ -162,6 +162,7 @@ def test_a_stretch_of_a_run_keeps_its_times_and_rows(run):
 
 def test_an_interruption_leaves_no_film_and_no_ffmpeg(run, tmp_path, monkeypatch):
     pytest.importorskip("imageio_ffmpeg", reason="the extra animation is not installed")
+    encoder.find_ffmpeg("")  # which starts one the first time
     started = []
     popen = subprocess.Popen
     monkeypatch.setattr(encoder.subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
