@@ -18,6 +18,7 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.controllers.servo import Servo, ServoController
+from servobench.plant.settings import did_you_mean
 
 Kind = TypeVar("Kind")
 PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed
@@ -25,7 +26,8 @@ PUBLISHED: Final = ":published"  # after the name of a method: without aids, its
 
 def _find(kind: str, name: str, parts: Mapping[str, Part[Kind]]) -> Part[Kind]:
     if name not in parts:
-        raise ValueError(f"{kind} must be one of {', '.join(sorted(parts))}, got {name!r}")
+        hint = did_you_mean(name, parts)
+        raise ValueError(f"{kind} must be one of {', '.join(sorted(parts))}, got {name!r}{hint}")
     return parts[name]
 
 
@@ -188,5 +190,7 @@ def compose(law: str, estimator: str) -> ControllerEntry:
     Raises:
         ValueError: an unknown name.
     """
+    if law in ESTIMATORS and estimator in LAWS:
+        raise ValueError(f"the law stands first: write {estimator}+{law}")
     summary = f"the law {law} with the Jacobian of the estimator {estimator}"
     return Method(f"{law}+{estimator}", law, estimator, summary).entry()

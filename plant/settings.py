@@ -18,7 +18,7 @@ A field that got another name or unit leaves its old name behind, so that old fi
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import Field, field, fields, is_dataclass, replace
 from functools import cache, wraps
 from pathlib import Path
@@ -159,10 +159,26 @@ def _refuse_renamed(name: str, kind: type, values: Iterable[str]) -> None:
 def suggest(word: str, known: Iterable[str]) -> str:
     """Return what to say after an unknown word: the nearest known one, then all of them, or the first of many."""
     names = sorted(known)
-    nearest = difflib.get_close_matches(word, names, n=1)
-    hint = f"did you mean {nearest[0]!r}? " if nearest else ""
+    near = nearest(word, names)
+    return f"{f'did you mean {near!r}? ' if near else ''}valid: {listed(names)}"
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that is most like a word that somebody may have mistyped; None if none is like it."""
+    near = difflib.get_close_matches(word.lower(), known, n=1)
+    return near[0] if near else None
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return what to say after a list of known words: the nearest one; nothing if none is like `word`."""
+    near = nearest(word, known)
+    return f"; did you mean {near!r}?" if near else ""
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names with commas between them, or the first of many."""
     more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
-    return f"{hint}valid: {', '.join(names[:MAX_LISTED])}{more}"
+    return f"{', '.join(names[:MAX_LISTED])}{more}"
 
 
 def _suggest_setting(key: str, section: object) -> str:
@@ -210,7 +226,8 @@ def describe(error: ValidationError, name: str = "") -> str:
         key, word = _BOUNDS[kind]
         wanted = f"{word} {context[key]:g}"
     elif kind == "literal_error":
-        wanted = "one of " + context["expected"].replace("'", "").replace(" or ", ", ")
+        words = context["expected"].replace("'", "").replace(" or ", ", ")
+        return f"{name} must be one of {words}, got {came!r}{did_you_mean(str(came), words.split(', '))}"
     elif kind == "too_short":
         wanted = f"of length {context['min_length']} or more"
     elif kind in {"unexpected_keyword_argument", "missing"}:

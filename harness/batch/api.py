@@ -24,6 +24,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.resolved import check_settings
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
 Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
@@ -72,7 +73,9 @@ def run(
     """
     with offering():
         request = RunRequest(plant, _name(controller), task, read_mismatch(mismatch), seed, robot=robot)
-        return run_experiment(request, Settings(settings or {}))
+        given = Settings(settings or {})
+        check_settings(given, [request.plant, request.controller, request.task])
+        return run_experiment(request, given)
 
 
 def compare(

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch import results
+from servobench.harness.batch.asked import check_effects, difference
 from servobench.harness.batch.blocks import BLOCK, CHUNK, Cell, Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.grid import Grid
-from servobench.harness.batch.lock import locked
+from servobench.harness.batch.lock import check_empty, locked
 from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Workers, open_workers
@@ -27,7 +28,7 @@ from servobench.harness.config.registry import offered
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import ResolvedRun, known_sections, resolve_sections, select
+from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve_sections, select
 from servobench.harness.run.together import side_by_side_key
 
 Row = dict[str, Any]
@@ -98,6 +99,8 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     Raises:
         ConfigurationError: a campaign that cannot be carried out, or a folder that cannot be used.
     """
+    if not how.resume:
+        check_empty(folder, can_resume=len(campaign.cells) > 1)
     runs = survey(Grid(_request, campaign.cells))
     sections = check_campaign(campaign, runs, how.observer)
     jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
@@ -135,7 +138,8 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer) -> dict
         ConfigurationError: a name, setting or mismatch that cannot be used, or a seed that is kept for tuning.
     """
     refuse_tuning_seeds(chain.from_iterable(runs.seeds))
-    campaign.settings.check_sections([*known_sections(), *runs.plants, *runs.controllers])
+    check_settings(campaign.settings, [*runs.plants, *runs.controllers, *runs.tasks])
+    check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
     for request in runs.examples:
         build_once(select(request, sections), observer.training)
@@ -150,7 +154,10 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
     """
     there = results.read_manifest(folder)
     if there.get("campaign") != manifest["campaign"]:
-        raise ConfigurationError(f"{folder} holds results of other runs or settings; name another folder with --out")
+        raise ConfigurationError(
+            f"{folder} holds results of other runs or settings: {difference(there, manifest)}; "
+            "name another folder with --out"
+        )
     for name, record in manifest[OWN].items():
         if record["sha256"] != there.get(OWN, {}).get(name, record)["sha256"]:
             raise ConfigurationError(

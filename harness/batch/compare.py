@@ -57,7 +57,7 @@ def parse_seeds(text: str) -> Sequence[int]:
             begin, end = (int(part) for part in text.split(":"))
             seeds: Sequence[int] = range(begin, end)
         elif "," in text:
-            seeds = tuple(dict.fromkeys(int(part) for part in text.split(",") if part.strip()))
+            seeds = tuple(int(part) for part in text.split(",") if part.strip())
         else:
             seeds = range(int(text))
     except ValueError as error:
@@ -66,6 +66,9 @@ def parse_seeds(text: str) -> Sequence[int]:
         ) from error
     if not seeds or min(seeds) < 0:
         raise ConfigurationError(f"seeds must name at least one seed, none of them negative; got {text!r}")
+    twice = [seed for seed in seeds if seeds.count(seed) > 1] if isinstance(seeds, tuple) else []
+    if twice:
+        raise ConfigurationError(f"seeds name {twice[0]} twice, got {text!r}")
     return seeds
 
 

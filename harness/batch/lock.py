@@ -52,11 +52,16 @@ def _lock(descriptor: int) -> bool:
     return os.fstat(descriptor).st_nlink > 0  # another process held this file and has removed it since
 
 
-def check_empty(folder: Path) -> None:
+def check_empty(folder: Path, *, can_resume: bool = False) -> None:
     """Refuse a folder with anything in it.
+
+    Args:
+        folder: that is to be made.
+        can_resume: whether the batch could go on in it.
 
     Raises:
         ConfigurationError: it has.
     """
     if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
-        raise ConfigurationError(f"results folder {folder} exists already; name another one with --out")
+        resume = ", or continue its batch with --resume" if can_resume and folder.is_dir() else ""
+        raise ConfigurationError(f"results folder {folder} exists already; name another one with --out{resume}")

@@ -11,7 +11,7 @@ from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
 
 Variation: TypeAlias = tuple[str, tuple[Magnitude, ...]]
@@ -28,7 +28,15 @@ class SweepPlan:
     periods: tuple[float | None, ...] = (None,)  # [s] of control; None for that of the section `run`
 
     def cells(self) -> Grid[Cell]:
-        """Return the runs, seeds varying fastest."""
+        """Return the runs, seeds varying fastest.
+
+        Raises:
+            ConfigurationError: an axis that is varied and stands in a mismatch, too.
+        """
+        for axis, _ in self.variations:
+            for text in self.batch.mismatches:
+                if axis in dict(read_mismatch(text).axes):
+                    raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
         places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
         make = partial(_cell, self.batch.robot)
         return Grid(make, places or [Place()], self.noise_factors, self.latencies, self.periods, *self.batch.axes())

@@ -79,6 +79,8 @@ def open_workers(
         ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a time limit is
             asked for on a cluster.
     """
+    if scheduler is not None and count is not None:
+        raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
     count = count or default_workers()
     if scheduler is not None:
         if run_timeout is not None:

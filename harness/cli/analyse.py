@@ -74,11 +74,13 @@ def analyse(
 def _source(jacobian: str) -> Source:
     from servobench.harness.analysis.loops.equilibrium import SOURCES
     from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.settings import did_you_mean
 
     for source in SOURCES:
         if source == jacobian:
             return source
-    raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}")
+    hint = did_you_mean(jacobian, SOURCES)
+    raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
 
 
 def _resolved(controllers: list[str], mismatch: str, seed: int, settings: Settings) -> list[ResolvedRun]:
@@ -86,12 +88,12 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, settings: Settin
     from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolved import known_sections, resolve
+    from servobench.harness.run.resolved import check_settings, resolve
 
     if seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {seed}")
     names = options.split_controllers(",".join(controllers))
-    settings.check_sections([*known_sections(), *names])
+    check_settings(settings, [PLANT, TASK, *names])
     return [resolve(RunRequest(PLANT, name, TASK, read_mismatch(mismatch), seed), settings) for name in names]
 
 

@@ -180,12 +180,30 @@ def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str]
 
     if text.strip() == "all":
         return tuple(known)
-    names = tuple(dict.fromkeys(split_words(text)))
+    names = split_words(text)
     if not names:
         raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:
         find(name)
+    refuse_repetition(kind, names)
     return names
+
+
+def refuse_repetition(option: str, values: Sequence[object]) -> None:
+    """Refuse a list that names something twice."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    for value in values:
+        if values.count(value) > 1:
+            raise ConfigurationError(f"--{option} names {value} twice")
+
+
+def split_mismatches(text: str) -> tuple[str, ...]:
+    """Return the mismatches that a user named; each is read, so that a mistyped one is refused at once."""
+    from servobench.harness.run.request import read_mismatch
+    from servobench.plant.robot.mismatch import PROFILES
+
+    return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
 
 
 def default_plant() -> str:

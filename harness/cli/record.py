@@ -115,13 +115,13 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolved import known_sections
+    from servobench.harness.run.resolved import check_settings
     from servobench.plant.bullet.bullet_plant import BulletConfig
 
     chosen = {"mismatch": read_mismatch(asked["mismatch"]), "controller": choose_controller(asked["controller"])}
     request = RunRequest(**asked | chosen)
     if request.seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {request.seed}")
-    settings.check_sections([*known_sections(), request.plant, request.controller])
+    check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", BulletConfig())))

@@ -104,7 +104,7 @@ def compare(
         options.split_plants(plants),
         options.split_controllers(controllers),
         options.split_tasks(tasks),
-        options.split_words(mismatch),
+        options.split_mismatches(mismatch),
         parse_seeds(seeds),
         options.known_robot(robot),
     )
@@ -130,10 +130,10 @@ def train(
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import cache_folder
-    from servobench.harness.run.resolved import known_sections
+    from servobench.harness.run.resolved import check_settings
 
     settings, controller = overrides.settings(), choose_controller(controller)
-    settings.check_sections([*known_sections(), controller])
+    check_settings(settings, [controller])
     with telling(console, "training") as tell:
         trained = train_networks(controller, settings, tell, robot)
     table = Table("network", "held-out error")

@@ -113,7 +113,7 @@ def tune(
 
     names = options.split_names("controllers", controllers, tuple(SPACES), find_tunable)
     try:
-        runs = TuningSet(options.split_words(plants), robots, offset)
+        runs = TuningSet(options.split_plants(plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error

@@ -47,7 +47,7 @@ def sweep(
             options.split_plants(plants),
             options.split_controllers(controllers),
             options.split_tasks(tasks),
-            options.split_words(mismatch),
+            options.split_mismatches(mismatch),
             parse_seeds(seeds),
             options.known_robot(robot),
         ),
@@ -85,4 +85,5 @@ def _numbers(option: str, text: str) -> list[float]:
         raise ConfigurationError(f"--{option} must be comma-separated numbers, got {text!r}") from error
     if not numbers or min(numbers) < 0:
         raise ConfigurationError(f"--{option} must be numbers from 0 on, got {text!r}")
-    return list(dict.fromkeys(numbers))
+    options.refuse_repetition(option, [f"{number:g}" for number in numbers])
+    return numbers

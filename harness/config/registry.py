@@ -8,6 +8,7 @@ gives as files or objects are offered under a name for as long as a command or c
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
+from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config.entries import make_entry
 from servobench.harness.config.extras import check_installed
 from servobench.harness.config.own import OwnController, describe_import, is_place, read_own
@@ -183,6 +185,17 @@ def _points(group: str) -> dict[str, EntryPoint]:
     return points
 
 
+def _part(kind: str, name: str) -> str:
+    """Return what to say about a controller that is the name of a law or an estimator; nothing about another."""
+    if kind == "plant" or name not in {*LAWS, *ESTIMATORS}:
+        return ""
+    is_law = name in LAWS
+    pair = f"{name}+ukf" if is_law else f"mfac+{name}"
+    methods = [method for method in METHODS if name in re.split("[_:]", method)]
+    ready = f"; methods with it: {', '.join(methods)}" if methods else ""
+    return f"it is {'a law' if is_law else 'an estimator'} and makes a pair, such as {pair}{ready}"
+
+
 @cache
 def plugin_packages() -> frozenset[str]:
     """Return the names of the top-level packages that publish plants or controllers, this one left out."""
@@ -197,7 +210,7 @@ def _load(group: str, kind: str, name: str) -> object:
         known = plant_names() if group == PLANT_GROUP else controller_names()
         if group == CONTROLLER_GROUP and Path(f"{name}.py").is_file():
             raise ConfigurationError(f"unknown controller {name!r}: did you mean your file './{name}.py'?")
-        raise ConfigurationError(f"unknown {kind} {name!r}: {suggest(name, known)}")
+        raise ConfigurationError(f"unknown {kind} {name!r}: {_part(kind, name) or suggest(name, known)}")
     point = points[name]
     try:
         return point.load()

@@ -1,7 +1,8 @@
 """Settings from TOML files and `--set section.key=value`, mapped onto the frozen dataclasses beside each class.
 
 A section is the name of a plant, a controller or a task, or `run`; keys below it are the fields of its dataclass,
-nested with dots. Nothing else is read from the files, and an unknown section or key is refused.
+nested with dots. Nothing else is read from the files, and an unknown section or key is refused. A file may serve many
+commands, so it may have sections of what does not run; an assignment is meant for one, and must have an effect there.
 """
 
 from __future__ import annotations
@@ -11,11 +12,19 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
-from servobench.plant.settings import override, suggest
+from servobench.plant.settings import listed, override, suggest
 
 Config = TypeVar("Config")
+
+
+class Assignment(NamedTuple):
+    """What a user wrote after --set."""
+
+    section: str
+    key: str  # with dots
+    text: str  # as it was written
 
 
 class ConfigurationError(ValueError):
@@ -28,9 +37,11 @@ class Settings:
 
     Attributes:
         sections: section -> nested keys -> plain values as TOML gives them.
+        assigned: those of `sections` that came as single assignments.
     """
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    assigned: tuple[Assignment, ...] = ()
 
     def check_sections(self, known: Iterable[str]) -> None:
         """Refuse sections that nothing would read.
@@ -42,6 +53,20 @@ class Settings:
         for section in self.sections:
             if section not in names:
                 raise ConfigurationError(f"unknown section {section!r}: {suggest(section, names)}")
+
+    def check_running(self, running: Iterable[str]) -> None:
+        """Refuse assignments to sections that are not read here.
+
+        Raises:
+            ConfigurationError: names the first of them and the sections that are read.
+        """
+        names = list(running)
+        for section, _, text in self.assigned:
+            if section not in names:
+                raise ConfigurationError(
+                    f"--set {text}: {section!r} does not run here, so this has no effect; what runs: "
+                    f"{listed(names)}; settings of other runs may stand in a file (--config)"
+                )
 
     def resolve(self, section: str, default: Config) -> Config:
         """Return the configuration `default` with the overrides of `section` applied.
@@ -72,9 +97,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")
-    for assignment in assignments:
-        _assign(sections, assignment)
-    return Settings(sections)
+    return Settings(sections, tuple(_assign(sections, text) for text in assignments))
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass
@@ -89,7 +112,7 @@ def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - 
     return flat
 
 
-def _assign(sections: dict[str, Any], assignment: str) -> None:
+def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
     key, equals, text = assignment.partition("=")
     mapped = re.fullmatch(r"\s*(.+?\.toml)\.(.+)", key)  # a plant's name may be that of a file, fmu:crane.toml
     path = [mapped[1], *mapped[2].strip().split(".")] if mapped else key.strip().split(".")
@@ -105,3 +128,4 @@ def _assign(sections: dict[str, Any], assignment: str) -> None:
         if not isinstance(target, dict):
             raise ConfigurationError(f"--set {assignment}: {name!r} is a value, not a section")
     target[path[-1]] = value
+    return Assignment(path[0], ".".join(path[1:]), assignment)

@@ -17,6 +17,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.network_cache import network_source
+from servobench.harness.run.plausible import check_joints, check_reach, check_times
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
@@ -160,11 +161,15 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
     Whatever else fails is left to the run, whose row says so. Arguments and errors are those of `build`.
     """
     try:
-        build(run, progress=progress).plant.close()
+        experiment = build(run, progress=progress)
+        experiment.plant.close()
     except ConfigurationError:
         raise
-    except Exception:  # noqa: BLE001 - of a plug-in; its run will fail in the same way
+    except (Exception, SystemExit):  # noqa: BLE001 - of a plug-in; its run will fail in the same way
         return
+    if experiment.drawn.true is not None:
+        check_joints(run, experiment.scenario, experiment.plant.spec)
+        check_reach(run, experiment.scenario, find_robot(run.request.robot), experiment.plant.spec)
 
 
 def train_networks(
@@ -244,9 +249,11 @@ def _equations(model: HandEyeModel | None) -> TrueModel:
 def _build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
     name = resolved.request.task
     try:
-        return find_task(name).build(resolved.task, setting)
+        scenario = find_task(name).build(resolved.task, setting)
     except ValueError as error:
         raise ConfigurationError(f"task {name}: {error}") from error
+    check_times(resolved, scenario.duration)
+    return scenario
 
 
 def _build_plant(resolved: ResolvedRun, entry: PlantEntry, setup: PlantSetup) -> Plant:

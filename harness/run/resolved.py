@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import controller_names, find_controller, installed_plant, plant_names
+from servobench.harness.config.registry import (
+    controller_names,
+    find_controller,
+    find_plant,
+    installed_plant,
+    plant_names,
+)
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
@@ -101,6 +109,50 @@ def _with_period(run: RunSettings, period: float) -> RunSettings:
         raise ConfigurationError(f"run: {error}") from error
 
 
+def check_settings(settings: Settings, running: Iterable[str]) -> None:
+    """Refuse settings that nothing would read, here or elsewhere, and assignments to what does not run.
+
+    Args:
+        settings: overrides of the defaults.
+        running: the sections that are read here, apart from `run`.
+
+    Raises:
+        ConfigurationError: an unknown section; an assignment to one that does not run; or an unknown key or a bad value
+            in a section of a file that does not run.
+    """
+    names = ["run", *dict.fromkeys(running)]
+    pairs = [section for section in settings.sections if _is_pair(section)]
+    settings.check_sections([*known_sections(), *pairs, *names])
+    settings.check_running(names)
+    for section in settings.sections:
+        if section not in names:
+            with contextlib.suppress(MissingPart):
+                settings.resolve(section, _default(section))
+
+
 def known_sections() -> list[str]:
-    """Return every section that a configuration may have."""
+    """Return every section that a configuration may have, but for those of pairs and of mapped FMUs."""
     return ["run", *plant_names(), *controller_names(), *TASKS]
+
+
+class MissingPart(Exception):
+    """A plant or controller that cannot be loaded here."""
+
+
+def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
+    """Return the defaults of a section; a plug-in that cannot be loaded has none.
+
+    Raises:
+        MissingPart: such a plug-in.
+    """
+    try:
+        if section in TASKS:
+            return find_task(section).default
+        return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
+    except Exception as error:
+        raise MissingPart from error
+
+
+def _is_pair(section: str) -> bool:
+    law, plus, estimator = section.partition("+")
+    return bool(plus) and law in LAWS and estimator in ESTIMATORS

@@ -36,6 +36,7 @@ from servobench.harness.pictures.panels import Styles, add_legend
 from servobench.harness.pictures.places import Curves, draw_curves, same_curves
 from servobench.harness.pictures.style import TEXT, WIDTH, figure_style, method_styles
 from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.resolved import check_settings
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
@@ -112,6 +113,8 @@ def make_map(
     Returns:
         The files of the pictures.
     """
+    check_settings(settings, [plant, TASK, *controllers])
+    settings = Settings(settings.sections)  # each part reads some of them
     static, moved = map_cells(plant, controllers, seeds)
     parts = (STATIC_CAMERA, static, settings), (MOVED_CAMERA, moved, moved_settings(settings))
     for name, cells, chosen in parts:

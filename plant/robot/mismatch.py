@@ -30,6 +30,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.measured import measured_arm
 from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_generator
+from servobench.plant.settings import nearest, suggest
 
 MAX_TILT = radians(45.0)
 MAX_MOVE_TILT = radians(30.0)
@@ -103,6 +104,23 @@ def _not_a_magnitude(axis: str, text: str) -> ValueError:
     )
 
 
+def _unknown_word(text: str, word: str) -> ValueError:
+    """Return what is wrong with one word of a mismatch: mistyped, out of place, or unknown."""
+    name = word.partition("=")[0]
+    if name in PROFILES:
+        remedy = "a profile stands first, and there is one at most"
+        if "=" in word and name != "factory":
+            remedy = f"the profile {name} has no magnitude"
+        return ValueError(f"mismatch {text!r}: {word!r} is not known here; {remedy}")
+    near = nearest(name, [*PROFILES, *AXES])
+    hint = f"did you mean {near!r}? " if near else ""
+    examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
+    return ValueError(
+        f"mismatch {text!r}: {word!r} is not known here; {hint}wanted one profile ({', '.join(PROFILES)}, "
+        f"factory=FILE) and then axes such as {examples}, joined by '+'"
+    )
+
+
 @dataclass(frozen=True)
 class Mismatch:
     """How far the true robot may be from the nominal one; `str` gives back the text that `parse` reads."""
@@ -110,13 +128,15 @@ class Mismatch:
     profile: str = "none"
     """A key of `PROFILES`; empty where only axes are given."""
     axes: tuple[tuple[str, Magnitude], ...] = ()
-    """Axes with their magnitudes, on top of the profile; the last entry of an axis counts."""
+    """Axes with their magnitudes, on top of the profile; each at most once."""
     calibration: str | None = None
     """Calibration file of the profile `factory`; None for the one that the package brings."""
 
     def __post_init__(self) -> None:
         """Check the magnitudes."""
         for axis, magnitude in self.axes:
+            if [name for name, _ in self.axes].count(axis) > 1:
+                raise ValueError(f"mismatch {str(self)!r} has the axis {axis} twice; give it once")
             size = magnitude.size(axis)
             if AXES[axis][0] is SHARE:
                 check_number(axis, size, at_least=0.0, below=1.0)
@@ -141,11 +161,7 @@ class Mismatch:
             elif name in AXES:
                 axes.append((name, Magnitude.parse(name, value)))
             else:
-                examples = ", ".join(f"{axis}={example}" for axis, (_, example) in AXES.items())
-                raise ValueError(
-                    f"mismatch {text!r}: {word!r} is not known here; wanted one profile ({', '.join(PROFILES)}, "
-                    f"factory=FILE) and then axes such as {examples}, joined by '+'"
-                )
+                raise _unknown_word(text, word)
         return cls(profile, tuple(axes), calibration)
 
     def __str__(self) -> str:
@@ -154,7 +170,11 @@ class Mismatch:
         return "+".join([profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes])
 
     def with_axis(self, axis: str, magnitude: Magnitude) -> Mismatch:
-        """Return this mismatch with one axis put on top of it."""
+        """Return this mismatch with one axis put on top of it.
+
+        Raises:
+            ValueError: it has this axis already.
+        """
         profile = "" if self == Mismatch() else self.profile
         return replace(self, profile=profile, axes=(*self.axes, (axis, magnitude)))
 
@@ -177,10 +197,10 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         text: such as "0:180:30deg" or "5/10/20mm".
 
     Raises:
-        ValueError: an unknown axis, a malformed or an empty range.
+        ValueError: an unknown axis, a malformed or an empty range, or a magnitude out of its bounds.
     """
     if axis not in AXES:
-        raise ValueError(f"unknown mismatch axis {axis!r}; valid: {', '.join(AXES)}")
+        raise ValueError(f"unknown mismatch axis {axis!r}: {suggest(axis, AXES)}")
     example = {"%": "30:10%", "deg": "180:30deg", "mm": "60:20mm"}[re.sub("[0-9.]", "", AXES[axis][1])]
     number = r"[0-9]*\.?[0-9]+"
     match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
@@ -193,7 +213,10 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
         numbers = [round(begin + i * step, 9) for i in range(count)]
     if not numbers:
         raise ValueError(f"the range {text!r} of {axis} is empty")
-    return tuple(Magnitude.parse(axis, f"{number!r}{match[2]}") for number in numbers)
+    magnitudes = tuple(Magnitude.parse(axis, f"{number!r}{match[2]}") for number in numbers)
+    for magnitude in magnitudes:
+        Mismatch("", ((axis, magnitude),))  # which refuses one that is out of bounds
+    return magnitudes
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from servobench.controllers.methods import PUBLISHED
 from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.plant.settings import did_you_mean
 
 PROPOSED: Final = "rbfnn_mfac"
 MPC: Final = "ukf_mpc"
@@ -46,7 +47,9 @@ def find_divisions(text: str) -> tuple[str, ...]:
     """
     words = {"both": tuple(DIVISIONS)} | {name.split()[-1]: (name,) for name in DIVISIONS}
     if text not in words:
-        raise ConfigurationError(f"--division must be one of {', '.join(sorted(words))}, got {text!r}")
+        raise ConfigurationError(
+            f"--division must be one of {', '.join(sorted(words))}, got {text!r}{did_you_mean(text, words)}"
+        )
     return words[text]
 
 

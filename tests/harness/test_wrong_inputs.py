@@ -1,0 +1,231 @@
+"""A hundred wrong inputs over all commands: each is one right line and exit code 2, and nothing is written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from kit.command import servobench
+from kit.folders import comparison
+
+RUN = ("run", "--plant", "kinematic", "--controller", "constant")
+COMPARE = ("compare", "--controllers", "constant", "--tasks", "exp2")
+SWEEP = ("sweep", "--controllers", "constant", "--out", "new")
+FILES = {  # name -> content
+    "unknown_section.toml": "[kinematc]\nlag = 0.1\n",
+    "unknown_key.toml": "[bullet]\nlagg = 0.1\n",
+    "former_key.toml": "[fmu]\nlatency_periods = 2\n",
+    "bad_value.toml": "[ukf_mpc.law]\nhorizon_time = -1\n",
+    "no_section.toml": "lag = 0.1\n",
+    "no_toml.toml": "[kinematic\n",
+    "text.csv": "time_s,x_m,y_m,z_m\n0,0,0,far\n",
+    "backwards.csv": "time_s,x_m,y_m,z_m\n1,0,0,1.2\n0,0,0,1.2\n",
+    "columns.csv": "t,x,y,z\n0,0,0,1.2\n",
+    "far.csv": "time_s,x_m,y_m,z_m\n0,0,0,1.25\n5,0,9,1.25\n",
+    "list.yaml": "kinematics:\n  - 1\n",
+    "number.yaml": "3\n",
+    "empty.yaml": "",
+    "words.yaml": "kinematics:\n  shoulder: {x: far}\n",
+    "broken.yaml": "kinematics: [\n",
+    "no.fmu": "this is no archive",
+    "no_fmu.toml": "[fmu]\nfile = 3\n",
+}
+WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
+    # names
+    (("run", "--plant", "kinematik"), "unknown plant 'kinematik': did you mean 'kinematic'?"),
+    (("run", "--plant", "fmu:"), "mapping . cannot be read"),
+    (("run", "--plant", "fmu:none.toml"), "none.toml"),
+    (("run", "--plant", "fmu:no_fmu.toml"), "no_fmu.toml"),
+    (("run", "--controller", "ukf_mfca"), "unknown controller 'ukf_mfca': did you mean 'ukf_mfac'?"),
+    (("run", "--controller", "UKF_MFAC"), "unknown controller 'UKF_MFAC': did you mean 'ukf_mfac'?"),
+    (("run", "--controller", "mfac"), "unknown controller 'mfac': it is a law and makes a pair, such as mfac+ukf"),
+    (("run", "--controller", "kalman"), "'kalman': it is an estimator and makes a pair, such as mfac+kalman"),
+    (("run", "--controller", "ukf+mfac"), "controller 'ukf+mfac': the law stands first: write mfac+ukf"),
+    (("run", "--controller", "mfac+rsl"), "got 'rsl'; did you mean 'rls'?"),
+    (("run", "--controller", "mfca+rls"), "got 'mfca'; did you mean 'mfac'?"),
+    (("run", "--controller", "mfac", "--estimator", "kalmann"), "got 'kalmann'; did you mean 'kalman'?"),
+    (("run", "--controller", "ukf_mfac", "--estimator", "ukf"), "law must be one of"),
+    (("run", "--controller", "ukf_mfac:publishd"), "did you mean 'ukf_mfac:published'?"),
+    ((*RUN, "--task", "circel"), "unknown task 'circel': did you mean 'circle'?"),
+    (("plants", "bulet"), "unknown plant 'bulet': did you mean 'bullet'?"),
+    (("controllers", "mfac"), "it is a law and makes a pair, such as mfac+ukf; methods with it:"),
+    (("controllers", "rbf_pdi"), "unknown controller 'rbf_pdi': did you mean 'rbf_pid'?"),
+    (("tasks", "exp22"), "unknown task 'exp22': did you mean 'exp2'?"),
+    # mismatches
+    ((*RUN, "--mismatch", "moderat"), "'moderat' is not known here; did you mean 'moderate'?"),
+    ((*RUN, "--mismatch", "camera_rotaton=5deg"), "did you mean 'camera_rotation'?"),
+    ((*RUN, "--mismatch", "links"), "with one of the units '%', none, such as links=10%; got ''"),
+    ((*RUN, "--mismatch", "links=5mm"), "links needs a magnitude with one of the units '%', none"),
+    ((*RUN, "--mismatch", "links=-5%"), "links needs a magnitude"),
+    ((*RUN, "--mismatch", "links=100%"), "links must be at least 0 and below 1, got 1.0"),
+    ((*RUN, "--mismatch", "links=5%+links=6%"), "'links=5%+links=6%' has the axis links twice; give it once"),
+    ((*RUN, "--mismatch", "moderate+severe"), "'severe' is not known here; a profile stands first"),
+    ((*RUN, "--mismatch", "links=5%+moderate"), "'moderate' is not known here; a profile stands first"),
+    ((*RUN, "--mismatch", "moderate=2"), "the profile moderate has no magnitude"),
+    ((*RUN, "--mismatch", "moderate+"), "'' is not known here"),
+    ((*RUN, "--mismatch", ""), "'' is not known here"),
+    ((*RUN, "--mismatch", "camera_rotation=200deg"), "camera_rotation must be at least 0 and at most 3.14159"),
+    ((*RUN, "--mismatch", "factory=none.yaml"), "calibration file none.yaml cannot be read"),
+    ((*RUN, "--mismatch", "factory=list.yaml"), "list.yaml holds something that is not a number"),
+    ((*RUN, "--mismatch", "factory=number.yaml"), "number.yaml holds something that is not a number"),
+    ((*RUN, "--mismatch", "factory=empty.yaml"), "empty.yaml holds something that is not a number"),
+    ((*RUN, "--mismatch", "factory=words.yaml"), "words.yaml holds something that is not a number"),
+    ((*RUN, "--mismatch", "factory=broken.yaml"), "broken.yaml is not valid YAML"),
+    # settings
+    ((*RUN, "--set", "kinematic"), "--set needs section.key=value, such as kinematic.lag=0.1; got 'kinematic'"),
+    ((*RUN, "--set", "kinematic.lag"), "--set needs section.key=value"),
+    ((*RUN, "--set", "kinematc.lag=1"), "unknown section 'kinematc': did you mean 'kinematic'?"),
+    ((*RUN, "--set", "kinematic.lga=1"), "kinematic has no setting 'lga': did you mean 'lag'?"),
+    ((*RUN, "--set", "kinematic.latency=1"), "kinematic has no setting 'latency': did you mean 'sensing.latency'?"),
+    ((*RUN, "--set", "kinematic.lag=slow"), "kinematic.lag must be a number, got 'slow'"),
+    ((*RUN, "--set", "kinematic.lag=-1"), "kinematic.lag must be at least 0, got -1"),
+    ((*RUN, "--set", "kinematic.lag=[1]"), "kinematic.lag must be a number"),
+    ((*RUN, "--set", "kinematic.sensing=1"), "kinematic.sensing is a section of its own, got 1"),
+    ((*RUN, "--set", "kinematic.sensing.drop_probability=1"), "drop_probability must be below 1, got 1"),
+    ((*RUN, "--set", "kinematic.sensing.latency_periods=2"), "it is now latency, in seconds"),
+    ((*RUN, "--set", "constant.initial.source=prob"), "did you mean 'probe'?"),
+    ((*RUN, "--set", "bullet.lag=0.1"), "--set bullet.lag=0.1: 'bullet' does not run here, so this has no effect"),
+    ((*RUN, "--set", "bullet.latency_periods=2"), "'bullet' does not run here"),
+    ((*RUN, "--set", "ukf_mfac.law.gain=3"), "what runs: run, kinematic, constant, exp2; settings of other runs"),
+    ((*RUN, "--set", "circle.laps=3"), "'circle' does not run here"),
+    ((*RUN, "--set", "run.period=0"), "run.period must be above 0, got 0"),
+    ((*RUN, "--set", "run.preview=3"), "run has no setting 'preview' any more: it is now preview_time, in seconds"),
+    ((*RUN, "--set", "run.preview_time=60"), "run.preview_time must be no longer than the run of 10 s, got 60 s"),
+    ((*RUN, "--set", "run.camera_moves_at=0.2"), "has no effect: no mismatch moves the camera"),
+    ((*RUN, "--set", "kinematic.sensing.latency=5000"), "latency must be shorter than the run of 10 s, got 5000 s"),
+    ((*RUN, "--set", "kinematic.command_delay=10"), "command_delay must be shorter than the run of 10 s, got 10 s"),
+    ((*RUN, "--set", "kinematic.sensing.frame_period=20"), "frame_period must be shorter than the run of 10 s"),
+    ((*RUN, "--set", "exp2.start=[9,0,0,0,0,0]"), "start must be within the joints' limits, -6.283 to 6.283"),
+    ((*RUN, "--set", "exp2.target=[0,0,0,0,-7,0]"), "target must be within the joints' limits"),
+    ((*RUN, "--set", "exp2.start=[1,2]"), "task exp2: start must have shape (6,), got (2,)"),
+    ((*RUN, "--set", "exp2.duration=0"), "exp2.duration must be above 0, got 0"),
+    ((*RUN, "--config", "none.toml"), "configuration file none.toml cannot be read"),
+    ((*RUN, "--config", "unknown_section.toml"), "unknown section 'kinematc': did you mean 'kinematic'?"),
+    ((*RUN, "--config", "unknown_key.toml"), "bullet has no setting 'lagg'"),
+    ((*RUN, "--config", "former_key.toml"), "fmu has no setting 'latency_periods'"),
+    ((*RUN, "--config", "bad_value.toml"), "ukf_mpc.law.horizon_time must be above 0, got -1"),
+    ((*RUN, "--config", "no_section.toml"), "'lag' stands outside a [section]"),
+    ((*RUN, "--config", "no_toml.toml"), "is not valid TOML"),
+    # targets
+    ((*RUN, "--task", "target", "--set", "target.target=[9,9,9]"), "(9, 9, 9) m in the camera frame, is"),
+    ((*RUN, "--task", "target", "--set", "target.target=[1,2]"), "target must have shape (3,), got (2,)"),
+    ((*RUN, "--task", "circle", "--set", "circle.radius=30"), "m out of the arm's reach; for a target out of reach"),
+    ((*RUN, "--task", "line", "--set", "line.end=[200,100,1200]"), "a point of its curve, (200, 100, 1200) m"),
+    ((*RUN, "--task", "waypoints"), "task waypoints: a CSV file is needed: --set waypoints.file=PATH"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=far.csv"), "task waypoints: a point of its curve"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=text.csv"), "text.csv, row 1: z_m is not a number: 'far'"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=backwards.csv"), "waypoint times must ascend"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=columns.csv"), "with the columns time_s, x_m, y_m, z_m"),
+    # lists, seeds and places
+    ((*RUN, "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
+    ((*RUN, "--seed", "10000"), "seed 10000 cannot be used to judge: 10000:20000 are kept for tuning"),
+    ((*RUN, "--seed", "two"), "invalid value for '--seed'"),
+    ((*RUN, "--view"), "--view shows the plant bullet only, got --plant kinematic"),
+    ((*RUN, "--out", "file/new"), "cannot be made"),
+    ((*RUN, "--out", "full"), "results folder full exists already; name another one with --out"),
+    (("compare", "--controllers", "constant,constant"), "--controllers names constant twice"),
+    (("compare", "--controllers", "constant,all"), "unknown controller 'all'"),
+    (("compare", "--controllers", "map_mfac,rbfnn_mfac_plus"), "is asked for twice"),
+    (("compare", "--plants", "kinematic,kinematic"), "--plants names kinematic twice"),
+    (("compare", "--tasks", "exp1,circle,exp1"), "--tasks names exp1 twice"),
+    (("compare", "--tasks", ","), "--tasks is empty; valid: exp1"),
+    ((*COMPARE, "--mismatch", "none,severe,none"), "--mismatch names none twice"),
+    ((*COMPARE, "--mismatch", ""), "--mismatch is empty; valid: none, factory, moderate, severe"),
+    ((*COMPARE, "--mismatch", "none,sever"), "did you mean 'severe'?"),
+    ((*COMPARE, "--seeds", "3,1,3"), "seeds name 3 twice, got '3,1,3'"),
+    ((*COMPARE, "--seeds", "5:1"), "seeds must name at least one seed"),
+    ((*COMPARE, "--seeds", "1:2:3"), "seeds must be a count (5), a list (3,1,4) or a range (100:120), got '1:2:3'"),
+    ((*COMPARE, "--workers", "0"), "--workers"),
+    ((*COMPARE, "--run-timeout", "0"), "--run-timeout"),
+    ((*COMPARE, "--resume"), "--resume needs --out, the folder to continue in"),
+    ((*COMPARE, "--resume", "--out", "none"), "none is not a results folder"),
+    ((*COMPARE, "--debug", "--workers", "2"), "one by one in this process; leave --workers away"),
+    ((*COMPARE, "--scheduler", "here"), "--scheduler needs an address such as tcp://127.0.0.1:8786, got 'here'"),
+    ((*COMPARE, "--scheduler", "tcp://x:1", "--workers", "2"), "--workers are processes of this machine"),
+    ((*COMPARE, "--sed", "3"), "no such option: --sed"),
+    # sweeps
+    ((*SWEEP, "--out", "full"), "exists already; name another one with --out, or continue its batch with --resume"),
+    ((*SWEEP, "--vary", "camera_rotaton=0:30:10deg"), "unknown mismatch axis 'camera_rotaton': did you mean"),
+    ((*SWEEP, "--vary", "links=5"), "--vary: links must be at least 0 and below 1, got 5.0"),
+    ((*SWEEP, "--vary", "links"), "--vary: links needs begin:end:step with a unit, such as links=0:30:10%"),
+    ((*SWEEP, "--vary", "links=0:30:0%"), "is empty"),
+    ((*SWEEP, "--vary", "links=5/5%"), "twice"),
+    ((*SWEEP, "--vary", "links=0:10:5%", "--mismatch", "links=5%"), "--vary links varies an axis that the mismatch"),
+    ((*SWEEP, "--noise", "1,1"), "--noise names 1 twice"),
+    ((*SWEEP, "--noise", "-1"), "--noise must be numbers from 0 on, got '-1'"),
+    ((*SWEEP, "--latency", "2"), "--latency is in seconds, below 1"),
+    ((*SWEEP, "--latency", "0.05,0.05"), "--latency names 0.05 twice"),
+    ((*SWEEP, "--period", "0"), "run: period must be above 0, got 0"),
+    ((*SWEEP, "--set", "run.full_jacobian=true"), "has no effect: this command keeps no steps"),
+    ((*SWEEP, "--period", "0.02", "--set", "run.period=0.05"), "has no effect: --period gives the control period"),
+    ((*SWEEP, "--latency", "0.1", "--set", "kinematic.sensing.latency=0"), "no effect: --latency gives the latency"),
+    ((*SWEEP, "--latency", "0.9", "--set", "random.duration=0.5"), "latency must be shorter than the run of 0.5 s"),
+    # results and pictures
+    (("statistics", "none"), "none is not a results folder"),
+    (("statistics", "results", "--metric", "setling_time_s"), "did you mean 'settling_time_s'?"),
+    (("report", "none"), "none is not a results folder"),
+    (("collect", "none"), "none is not a results folder"),
+    (("record", "results", "--kinds", "mp5"), "did you mean 'mp4'?"),
+    (("record", "results", "--kinds", "gif,gif"), "--kinds names gif twice"),
+    (("record", "results", "--run", "nothing"), "results has no run 'nothing'"),
+    (("record", "results", "--seed", "3"), "--seed belongs to a new run"),
+    (("record", "--run", "some"), "--run names a run of a results folder, and no folder is given"),
+    (("record", "--plant", "kinematic", "--set", "bullet.lag=1"), "'bullet' does not run here"),
+    (("record", "--plant", "kinematic", "--seed", "-1"), "seed must not be negative, got -1"),
+    # studies and tools
+    (("analyse", "mfac"), "it is a law and makes a pair"),
+    (("analyse", "pid+true", "--jacobian", "tru"), "--jacobian must be one of true, nominal, estimated, got 'tru'"),
+    (("analyse", "pid+true", "--seed", "-1"), "seed must not be negative, got -1"),
+    (("analyse", "pid+true", "--set", "bullet.lag=1"), "'bullet' does not run here"),
+    (("robustness", "--out", "new", "--plant", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
+    (("robustness", "--out", "new", "--plant", "kinematic", "--set", "exp2.duration=3"), "'exp2' does not run here"),
+    (("claims", "--out", "new", "--division", "equiped"), "got 'equiped'; did you mean 'equipped'?"),
+    (("claims", "--out", "new", "--seeds", "2"), "--seeds must be at least 6"),
+    (("claims", "--out", "new", "--check", "none.csv"), "none.csv"),
+    (("tune", "--controllers", "ukf_mfa"), "ukf_mfac"),
+    (("tune", "--controllers", "ukf_mfac", "--plants", "kinematic,kinematic"), "--plants names kinematic twice"),
+    (("tune", "--controllers", "ukf_mfac", "--robots", "3"), "robots must be 2, 4, 6"),
+    (("train", "--controller", "ukf_mpc"), "controller ukf_mpc has no networks to train"),
+    (("train", "--controller", "rbfnn_mfac", "--set", "ukf_mfac.law.gain=1"), "'ukf_mfac' does not run here"),
+    (("fmu", "info", "no.fmu"), "no.fmu"),
+    (("fmu", "validate", "none.fmu"), "none.fmu"),
+    (("fmu", "export", "-o", "new.fmu", "--mismatch", "moderat"), "did you mean 'moderate'?"),
+    (("fmu", "export", "-o", "new.fmu", "--fmi", "4"), "4"),
+    (("fmu", "export", "-o", "new.fmu", "--platforms", "x86_64-linx"), "x86_64-linx"),
+    (("comapre",), "comapre"),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A folder with files that are wrong in one way or another."""
+    folder = tmp_path_factory.mktemp("wrong")
+    for name, content in FILES.items():
+        (folder / name).write_text(content)
+    (folder / "file").write_text("not a folder")
+    (folder / "full").mkdir()
+    (folder / "full" / "note.txt").write_text("mine")
+    comparison(folder / "results")
+    return folder
+
+
+def files_of(folder: Path) -> list[str]:
+    return sorted(str(Path(root, name)) for root, _, names in os.walk(folder) for name in names)
+
+
+@pytest.mark.parametrize(("arguments", "words"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
+def test_a_wrong_input_is_one_right_line(place, monkeypatch, capsys, arguments, words):
+    monkeypatch.chdir(place)
+    before = files_of(place)
+    code, told = servobench(monkeypatch, *arguments), capsys.readouterr()
+    assert code == 2, told
+    assert told.err.startswith("servobench: ")
+    assert told.err.count("\n") == 1
+    assert words in told.err
+    assert files_of(place) == before
+
+
+def test_there_are_a_hundred_of_them():
+    assert len({arguments for arguments, _ in WRONG}) == len(WRONG) >= 100
