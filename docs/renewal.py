@@ -5,7 +5,7 @@
     make nightly                  # writes nothing: a line for each stored figure that does not come out again
 
     python docs/renewal.py held_out --robots 2                  # tries a study with few robots, beside the pages
-    python docs/renewal.py long --robots 1 --set circle.laps=3  # further options go to every command
+    python docs/renewal.py long --robots 1 --set endurance.laps=3  # further options go to every command
 
 Runs of other code are made anew, unless `--keep` says that they still count.
 """

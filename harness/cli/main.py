@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import faulthandler
+import os
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any, NoReturn
@@ -16,11 +20,12 @@ from servobench.harness.cli.check import check
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.init import init
 from servobench.harness.cli.new import new
-from servobench.harness.cli.options import INTERRUPTED, grouped
+from servobench.harness.cli.options import FAILED, INTERRUPTED, grouped
 from servobench.harness.cli.record import record
 from servobench.harness.cli.sweep import sweep
 
 INPUT_ERROR = 2  # exit code
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # a folder takes no more files
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
     "Your own controller": (new, check),
@@ -71,6 +76,7 @@ def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public 
 
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
+    _say_where_a_signal_strikes()
     try:
         code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
@@ -82,9 +88,21 @@ def main() -> None:
         if line is None:
             raise
         _refuse(line)
+    except OSError as error:
+        if error.errno not in FULL or "--debug" in sys.argv:
+            raise
+        where = f" ({error.filename})" if error.filename else ""
+        sys.stderr.write(f"servobench: {os.strerror(error.errno)}{where}; finished runs are kept, --resume continues\n")
+        code = FAILED
     if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that say more end by themselves
         sys.stderr.write("servobench: interrupted\n")
     sys.exit(code)
+
+
+def _say_where_a_signal_strikes() -> None:
+    """Let a process that ends by a segmentation fault, as of a plug-in, print the line that it was in."""
+    with contextlib.suppress(AttributeError, OSError, ValueError):  # there may be no standard error
+        faulthandler.enable(sys.__stderr__)
 
 
 def _refuse(line: str) -> NoReturn:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import signal
+import subprocess
+import sys
 from functools import partial
 
 import numpy as np
 import pytest
 
-from kit.command import servobench
+from kit.command import PACKAGE, servobench
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.config.entries import NoSettings
@@ -104,3 +109,25 @@ def test_debug_raises_in_this_process(call, monkeypatch, command):
 
 def test_debug_carries_on_where_nothing_crashes(call):
     assert call(*COMPARE, "constant", "--debug") == 0
+
+
+def test_a_full_disk_is_one_line(call, monkeypatch, capsys):
+    def write(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "Error writing bytes to file")
+
+    monkeypatch.setattr("servobench.harness.batch.results.write_part", write)
+    assert call(*SWEEP, "constant") == 1
+    assert capsys.readouterr().err == (
+        "servobench: No space left on device; finished runs are kept, --resume continues\n"
+    )
+
+
+def test_a_segmentation_fault_says_in_which_line(tmp_path):
+    plugin = "import ctypes\n\ndef strike():\n    ctypes.string_at(0)\n\nstrike()\n"
+    (tmp_path / "striking.py").write_text(plugin)
+    code = "import sys; sys.argv = ['servobench', 'tasks']\n"
+    code += "import servobench.harness.cli.main as main; main.command_line = lambda: __import__('striking')\nmain.main()"
+    environment = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{tmp_path}"}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == -signal.SIGSEGV
+    assert f'File "{tmp_path / "striking.py"}", line 4 in strike' in ended.stderr

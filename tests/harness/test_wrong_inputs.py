@@ -126,7 +126,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--out", "file/new"), "cannot be made"),
     ((*RUN, "--out", "full"), "results folder full exists already; name another one with --out"),
     (("compare", "--controllers", "constant,constant"), "--controllers names constant twice"),
-    (("compare", "--controllers", "constant,all"), "unknown controller 'all'"),
+    (("compare", "--controllers", "constant,all"), "--controllers names constant twice"),
     (("compare", "--controllers", "map_mfac,rbfnn_mfac_plus"), "is asked for twice"),
     (("compare", "--plants", "kinematic,kinematic"), "--plants names kinematic twice"),
     (("compare", "--tasks", "exp1,circle,exp1"), "--tasks names exp1 twice"),
