@@ -101,8 +101,9 @@ def main() -> None:
 
 def _say_where_a_signal_strikes() -> None:
     """Let a process that ends by a segmentation fault, as of a plug-in, print the line that it was in."""
-    with contextlib.suppress(AttributeError, OSError, ValueError):  # there may be no standard error
-        faulthandler.enable(sys.__stderr__)
+    if sys.__stderr__ is not None:
+        with contextlib.suppress(OSError, ValueError):  # it may be closed, or no file
+            faulthandler.enable(sys.__stderr__)
 
 
 def _refuse(line: str) -> NoReturn:

@@ -121,12 +121,11 @@ class ConsoleObserver(Observer):
     def begin(self, total: int, done: int) -> None:
         """Show the bar."""
         self.close()
-        if not self._shows_bar:
-            return
-        self._bar = run_progress(self._console, RateColumn())
-        self._bar.add_task("running", total=total, completed=done)
-        self._bar.start()
         self._done, self._begun, self._total, self._lines = done, done, total, Lines()
+        if self._shows_bar:
+            self._bar = run_progress(self._console, RateColumn())
+            self._bar.add_task("running", total=total, completed=done)
+            self._bar.start()
 
     def finished(self, rows: Sequence[Row]) -> None:
         """Advance the bar."""

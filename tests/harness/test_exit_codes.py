@@ -16,6 +16,7 @@ from kit.command import PACKAGE, servobench
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.config.entries import NoSettings
+from servobench.harness.config.own import own_object
 from servobench.harness.config.registry import offering
 from servobench.plant.signals import Command
 
@@ -54,7 +55,7 @@ def call(monkeypatch, tmp_path):
     """Return a function that runs a command in an empty folder and returns its exit code; it draws nothing."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("servobench.harness.pictures.draw.draw_figures", lambda _: [])
-    with offering(ENTRIES):
+    with offering(map(own_object, ENTRIES)):
         yield partial(servobench, monkeypatch)
 
 
@@ -126,7 +127,9 @@ def test_a_segmentation_fault_says_in_which_line(tmp_path):
     plugin = "import ctypes\n\ndef strike():\n    ctypes.string_at(0)\n\nstrike()\n"
     (tmp_path / "striking.py").write_text(plugin)
     code = "import sys; sys.argv = ['servobench', 'tasks']\n"
-    code += "import servobench.harness.cli.main as main; main.command_line = lambda: __import__('striking')\nmain.main()"
+    code += (
+        "import servobench.harness.cli.main as main; main.command_line = lambda: __import__('striking')\nmain.main()"
+    )
     environment = {**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{tmp_path}"}
     ended = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == -signal.SIGSEGV
