@@ -17,7 +17,10 @@ def check(
     name: Annotated[str, typer.Argument(metavar="CONTROLLER", help="Such as ./mine.py, ./mine.py:Mine or ukf_mfac.")],
     limit: Annotated[float, typer.Option(min=1.0, help="Time limit of one check [s].")] = 60.0,
 ) -> None:
-    """Check a controller against its contract; each failure says what to change."""
+    """Check a controller against its contract.
+
+    Each failure says what to change.
+    """
     from rich.text import Text
 
     from servobench.harness.check.controllers import check_controller
