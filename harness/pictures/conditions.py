@@ -11,6 +11,7 @@ from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.pictures.panels import Styles, add_legend, label_rows, panel_grid
 from servobench.harness.pictures.places import draw_curves
+from servobench.harness.pictures.style import TEXT
 
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
@@ -29,6 +30,7 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
         draw_curves(axes, sizes, values, styles, top=104.0)
         axes.set_xlabel(label)
     label_rows(panels, "settled runs [%]")
+    figure.suptitle("How many moves settle over what is varied; bands are 95 % intervals", fontsize=TEXT + 1.0)
     add_legend(figure, panels)
     return figure
 
