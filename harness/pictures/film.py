@@ -17,6 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.encoder import GIF, MP4, encoding, find_ffmpeg
@@ -228,7 +229,9 @@ def _lap(run: LoggedRun) -> int:
 
 def _title(run: LoggedRun) -> str:
     row = run.track.row
-    return f"{row['controller']}: {row['task']} on {row['plant']}, mismatch {row['mismatch']}, seed {row['seed']}"
+    robot = str(row.get("robot", DEFAULT_ROBOT))
+    arm = "" if robot == DEFAULT_ROBOT else f", {Path(robot).name}"
+    return f"{row['controller']}: {row['task']} on {row['plant']}{arm}, mismatch {row['mismatch']}, seed {row['seed']}"
 
 
 def _frame_rate(time: FloatArray) -> tuple[int, float]:
