@@ -22,7 +22,8 @@ class Cell:
 
     def __str__(self) -> str:
         """Return it as a reader gets it."""
-        return format(self.value, self.spec)
+        text = format(self.value, self.spec)
+        return text.replace("inf", "∞") if isinstance(self.value, float) else text
 
     def plain(self) -> object:
         """Return it as JSON can have it: an estimate with its ends, None for no number, "inf" for infinity."""

@@ -34,6 +34,23 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     }
 
 
+def describe_settings(folder: Path) -> dict[str, str]:
+    """Return every setting of the runs by section and name; empty where the folder does not tell them.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    configuration = results.read_manifest(folder).get("configuration")
+    if not isinstance(configuration, dict):
+        return {}
+    return {
+        f"{section}.{name}": _setting(value)
+        for section, values in configuration.items()
+        if isinstance(values, dict)
+        for name, value in values.items()
+    }
+
+
 def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield name and content of each table beside the runs and steps of a folder, such as answered claims."""
     for path in sorted(folder.iterdir()):
@@ -43,6 +60,14 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
             yield path.stem, pd.read_parquet(path)
         elif path.suffix == ".csv":
             yield path.stem, pd.read_csv(path)
+
+
+def _setting(value: Any) -> str:  # noqa: ANN401 - whatever JSON holds
+    if isinstance(value, list):
+        return ", ".join(map(_setting, value))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return {"inf": "no limit", "None": "not set"}.get(str(value), str(value))
 
 
 def _listed(values: list[Any]) -> str:

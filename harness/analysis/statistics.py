@@ -20,6 +20,13 @@ RESAMPLES: Final = 2000
 MISSING: Final = "–"  # text for a number that there is not
 
 
+def number(value: float, spec: str) -> str:
+    """Return a number formatted with `spec` as a reader wants it: ∞ for infinity, – for no number, never -0."""
+    if np.isnan(value):
+        return MISSING
+    return f"{value:z{spec}}".replace("inf", "∞")
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A number with its interval; `f"{estimate:.2f}"` is `0.75 [0.70, 0.80]`.
@@ -37,8 +44,12 @@ class Estimate:
     count: int
 
     def __format__(self, spec: str) -> str:
-        """Return value and interval, each formatted with `spec`."""
-        return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]" if self.count else MISSING
+        """Return value and interval, each formatted with `spec`; ∞ for infinity, no interval where there is none."""
+        if not self.count or np.isnan(self.value):
+            return MISSING
+        if np.isnan(self.low):
+            return number(self.value, spec)
+        return f"{number(self.value, spec)} [{number(self.low, spec)}, {number(self.high, spec)}]"
 
     def scaled(self, factor: float) -> Estimate:
         """Return the estimate in another unit."""

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from itertools import combinations
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
 import pandas as pd
 
 from servobench.harness.analysis.cells import Cell, Row, as_text
@@ -17,18 +15,15 @@ from servobench.harness.analysis.comparison import (
     column_of,
     compare_pairs,
     outcomes,
-    settled_share,
     settling_times,
     split_conditions,
     split_tasks,
 )
 from servobench.harness.analysis.measures import MEASURES, Measure
 from servobench.harness.analysis.statistics import (
-    MISSING,
     NO_ESTIMATE,
     Estimate,
     median_with_interval,
-    success_rate,
     tail_mean,
 )
 from servobench.harness.config.settings import ConfigurationError
@@ -41,21 +36,7 @@ Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 
 SWEPT: Final = ("noise_factor", "latency_s", "period_s")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
-COSTS: Final = (
-    "controller_time_median_us",
-    "controller_time_p99_us",
-    "controller_time_overruns",
-    "control_effort_rad",
-    "saturation_fraction",
-    "joint_acceleration_peak_rad_s2",
-    "joint_acceleration_rms_rad_s2",
-    "joint_jerk_rms_rad_s3",
-    "command_switches",
-    "jacobian_error_mean",
-)
-CURVE_MEASURES: Final = ("rms_error_second_lap", "rms_error_evaluated", "max_error", "max_joint_position_rad")
 TAIL: Final = 0.95
-MAX_REASON: Final = 60  # characters of a reason that are shown in a table
 
 
 def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
@@ -147,126 +128,6 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None, never: float | None) -> l
         }
         for pair in compared
     ]
-
-
-def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each condition, task and controller how many runs had which outcome, in percent."""
-    named = runs.assign(outcome=outcomes(runs))
-    words = named["outcome"].value_counts().index
-    rows = []
-    for key, group in _groups(named, "task"):
-        counts = {word: int((group["outcome"] == word).sum()) for word in words}
-        shares = {
-            word: f"{success_rate(n, len(group)).scaled(100.0):.0f}" if n else MISSING for word, n in counts.items()
-        }
-        rows.append(key | {"runs": len(group)} | {f"{word} [%]": share for word, share in shares.items()})
-    return pd.DataFrame(rows)
-
-
-def settling_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each condition and controller how many moves settled, how fast, and with what error."""
-    moves, _ = split_tasks(runs)
-    rows = []
-    for key, group in _groups(moves):
-        share = settled_share(group)
-        counts = {
-            "moves": len(group),
-            "settled": int(settling_times(group).notna().sum()),
-            "settled [%]": round(share.value),
-            "settled, 95 %": f"{share.low:.0f} – {share.high:.0f}",
-        }
-        rows.append(key | counts | _medians(group, moves, "settling_time_s", "overshoot", "steady_state_error"))
-    return pd.DataFrame(rows)
-
-
-def tracking_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each condition, task and controller the errors along the curve."""
-    _, curves = split_tasks(runs)
-    rows = []
-    for key, group in _groups(curves, "task"):
-        counts = {"runs": len(group), "completed": int((group["status"] == COMPLETED).sum())}
-        rows.append(key | counts | _medians(group, curves, *filter(partial(_is_informative, curves), CURVE_MEASURES)))
-    return pd.DataFrame(rows)
-
-
-def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each plant and controller what a step costs, as far as known, and how much the joints are used."""
-    rows = []
-    for (plant, controller), group in runs.groupby(["plant", "controller"], sort=False):
-        row: dict[str, Any] = {"plant": plant, "controller": controller}
-        for name in filter(partial(_is_informative, runs), COSTS):
-            heading, factor, digits = _shown(name, runs)
-            row[heading] = _rounded(factor * column_of(group, name).median(), digits)
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a row for each way in which runs of a controller ended early, with one of the reasons."""
-    failed = runs[runs["status"] != COMPLETED]
-    rows = []
-    for (controller, plant, status), group in failed.groupby(["controller", "plant", "status"], sort=False):
-        total = len(runs[(runs["controller"] == controller) & (runs["plant"] == plant)])
-        row = {"controller": controller, "plant": plant, "ended by": status, "runs": f"{len(group)} of {total}"}
-        first = group.iloc[0]
-        rows.append(row | {"for example": first["run_id"], "reason": str(first.get("reason", ""))})
-    return pd.DataFrame(rows)
-
-
-def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return every run as a row: conditions, how it ended, and its measures."""
-    names = (*CONDITIONS, "task", "controller", "seed", "status", "outcome")
-    table = runs[[name for name in names if _is_informative(runs, name)]].copy()
-    for name in MEASURES:
-        if _is_informative(runs, name):
-            heading, factor, digits = _shown(name, runs)
-            table[heading] = (factor * runs[name].astype(float)).round(digits)
-    if "reason" in runs and (runs["reason"].fillna("") != "").any():
-        table["reason"] = [
-            text if len(text) <= MAX_REASON else f"{text[: MAX_REASON - 1]}…" for text in runs["reason"].fillna("")
-        ]
-    return table.reset_index(drop=True)
-
-
-def _groups(runs: pd.DataFrame, *more: str) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    names = [name for name in (*CONDITIONS, *more, "controller") if _is_informative(runs, name)]
-    grouped = runs.groupby(names, sort=False, dropna=False)
-    return [(dict(zip(names, key, strict=True)), group) for key, group in grouped]
-
-
-def _is_informative(runs: pd.DataFrame, name: str) -> bool:
-    """Return whether there is such a column with a value and, where only a sweep varies it, more than one."""
-    return name in runs and runs[name].nunique() > (name in SWEPT)
-
-
-def _shown(name: str, runs: pd.DataFrame) -> tuple[str, float, int]:
-    """Return heading, factor and digits of a column of `runs`."""
-    measure = MEASURES[name]
-    unit, factor = measure.scale(runs)
-    return measure.name if unit == "1" else f"{measure.name} [{unit}]", factor, measure.digits
-
-
-def _medians(group: pd.DataFrame, runs: pd.DataFrame, *names: str) -> dict[str, Any]:
-    """Return medians of columns under their headings in `runs`, each with its interval behind it where there is one.
-
-    A move that never settled counts as one that settles after all others, ∞; of other measures a gap is left out.
-    """
-    cells: dict[str, Any] = {}
-    for name in names:
-        heading, factor, digits = _shown(name, runs)
-        if name == "settling_time_s":
-            middle = median_with_interval(factor * settling_times(group))
-        else:
-            values = factor * column_of(group, name)
-            middle = median_with_interval(values, missing="left_out") if values.notna().any() else NO_ESTIMATE
-        interval = "" if np.isnan(middle.low) else f"{middle.low:.{digits}f} – {middle.high:.{digits}f}"
-        cells[heading] = _rounded(middle.value, digits)
-        cells[f"{MEASURES[name].name}, 95 %"] = interval.replace("inf", "∞")
-    return cells
-
-
-def _rounded(value: float, digits: int) -> float:
-    return round(float(value), digits) if digits or np.isnan(value) else float(round(value))
 
 
 def _median(values: pd.Series[float]) -> Estimate:

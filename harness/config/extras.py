@@ -11,8 +11,6 @@ from servobench.harness.config.settings import ConfigurationError
 EXTRAS: Final = {  # top-level module -> extra
     "pybullet": "bullet",
     "jinja2": "report",
-    "plotly": "report",
-    "itables": "report",
     "optuna": "tune",
     "distributed": "cluster",
     "imageio_ffmpeg": "animation",

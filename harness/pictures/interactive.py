@@ -1,127 +1,124 @@
-"""Paths in space to be turned and zoomed in a browser: a plotly figure that works without a network."""
+"""What the report draws in the reader's browser: paths in space to be turned, and the error of every run over time.
+
+Both are plain numbers, few enough for a page; `report.js` draws them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
-from plotly.offline import get_plotlyjs
+import pandas as pd
 
+from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.style import MethodStyle, method_styles
-from servobench.harness.pictures.tracks import Group, Track, Tracks, each, label_of, load_groups
+from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, longest
+from servobench.plant.checks import FloatArray
 
-MOST_POINTS = 250  # of a path; more cannot be told apart
+MOST_POINTS = 150  # of a path; more cannot be told apart
 MOST_VIEWS = 24  # plant, mismatch and task
-HEIGHT = 620  # px
-CONFIG = {"displaylogo": False, "responsive": True, "showSendToCloud": False}  # nothing leaves the page
-DASHES = {"-": "solid", "--": "dash", "-.": "dashdot", ":": "dot"}
-SYMBOLS = {"o": "circle", "s": "square", "D": "diamond", "^": "diamond-open", "x": "x", "P": "cross", "+": "cross",
-           "X": "x", "v": "square-open", "*": "circle-open"}  # fmt: skip
+CURVE_POINTS = (40, 160)  # of the error of a run: at least, at most
+CURVE_BYTES = 1.2e6  # of all errors together
+NUMBER_BYTES = 6  # of one number in the page
+STEPS_AT_ONCE = 64  # runs whose steps are in memory at a time
+DIGITS = 4  # significant, of a number in the page
+DASHES = {"-": [], "--": [7, 4], "-.": [8, 3, 2, 3], ":": [2, 3]}  # px, of the named line styles
+
+Json = dict[str, Any]
 
 
-def plotly_script() -> str:
-    """Return plotly's own code as a script element, to be put into a page once."""
-    return f'<script type="text/javascript">{get_plotlyjs()}</script>'
+def swatches(names: list[str]) -> dict[str, Json]:
+    """Return colour and dashes of each controller's line as the page draws it."""
+    return {name: {"colour": style.colour, "dash": _dash(style)} for name, style in method_styles(names).items()}
 
 
-def interactive_paths(folder: Path) -> str:
-    """Return the paths of a results folder as HTML that needs `plotly_script`; empty where no run has a path.
-
-    A menu chooses plant, mismatch and task; the legend switches controllers on and off.
+def path_views(folder: Path) -> list[Json]:
+    """Return the paths in space of each plant, mismatch and task; none where no run has one.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    styles = method_styles(results.load_runs(folder)["controller"].tolist())
-    views = [
-        (group, task, tracks)
+    views = (
+        _view(f"{task} on {group.plant}, mismatch {group.mismatch}, seed {group.seed}", tracks)
         for group in load_groups(folder)
         for task, tracks in group.tasks.items()
         if all(len(track.features) >= 3 for track in tracks.values())
-    ][:MOST_VIEWS]
-    if not views:
-        return ""
-    figure, owners = go.Figure(), []
-    for number, (_, _, tracks) in enumerate(views):
-        traces = _traces(each(Track.for_path, tracks), styles)
-        for trace in traces:
-            trace.visible = number == 0
-        figure.add_traces(traces)
-        owners += [number] * len(traces)
-    figure.update_layout(
-        height=HEIGHT,
-        margin={"l": 0, "r": 0, "t": 50, "b": 0},
-        updatemenus=[{"buttons": _buttons(views, owners), "x": 0.0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}],
-        scene=_scene(views[0][2]),
-        legend={"itemsizing": "constant", "y": 0.9},
     )
-    html: str = figure.to_html(full_html=False, include_plotlyjs=False, div_id="paths", config=CONFIG)
-    return html
+    return [view for view, _ in zip(views, range(MOST_VIEWS), strict=False)]
 
 
-def _traces(tracks: Tracks, styles: dict[str, MethodStyle]) -> list[go.Scatter3d]:
-    longest = max(tracks.values(), key=lambda track: len(track.table))
-    reference = longest.vectors("reference_")[:, :3]
-    if longest.point_to_point:
-        desired = _points(reference[:1], "target", "black", "diamond")
-    else:
-        desired = _line(reference, "desired", {"color": "rgba(0,0,0,0.35)", "width": 9})
-    traces = [desired, _points(longest.vectors("true_feature_")[:1, :3], "start", "black", "square-open")]
-    for name, track in tracks.items():
-        style = styles[name]
-        dash = DASHES.get(style.line, "longdash") if isinstance(style.line, str) else "longdash"
-        path = _line(track.vectors("true_feature_")[:, :3], name, {"color": style.colour, "width": 4, "dash": dash})
-        if style.marker:
-            # Marks that are apart from each other, as many as in the printed figures.
-            chosen = np.isin(np.arange(len(path.x)), style.path_arguments(_stack(path))["markevery"])
-            path.mode = "lines+markers"
-            path.marker = {
-                "size": np.where(chosen, 8, 0),
-                "symbol": SYMBOLS.get(style.marker, "diamond"),
-                "color": style.colour,
-                "line": {"width": 0},
-            }
-        traces.append(path)
-    return traces
+def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
+    """Return the true error of each run over time, by its identifier, as far as its steps are kept.
 
+    Of many runs each has few points: each is the largest error of the periods for which it stands. Of more runs than
+    fit into a page, the first ones have a curve.
 
-def _stack(path: go.Scatter3d) -> np.ndarray:
-    points = np.stack([path.x, path.y, path.z], axis=-1).astype(np.float64)
-    return np.nan_to_num(points)
-
-
-def _line(points: np.ndarray, name: str, line: dict[str, object]) -> go.Scatter3d:
-    step = -(-len(points) // MOST_POINTS)
-    x, y, z = points[::step].astype(np.float32).T
-    return go.Scatter3d(x=x, y=y, z=z, mode="lines", name=name, line=line)
-
-
-def _points(points: np.ndarray, name: str, colour: str, symbol: str) -> go.Scatter3d:
-    x, y, z = points.astype(np.float32).T
-    marker = {"size": 6, "color": colour, "symbol": symbol}
-    return go.Scatter3d(x=x, y=y, z=z, mode="markers", name=name, marker=marker)
-
-
-def _buttons(views: list[tuple[Group, str, Tracks]], owners: list[int]) -> list[dict[str, object]]:
-    return [
-        {
-            "label": f"{task} on {group.plant}, mismatch {group.mismatch}, seed {group.seed}",
-            "method": "update",
-            "args": [{"visible": [owner == number for owner in owners]}, {"scene": _scene(tracks)}],
+    Args:
+        folder: a results folder.
+        runs: those wanted, in the order in which they matter.
+    """
+    least, most = CURVE_POINTS
+    wanted = runs.head(int(CURVE_BYTES / (NUMBER_BYTES * least)))
+    points = int(np.clip(CURVE_BYTES / (NUMBER_BYTES * max(1, len(wanted))), least, most))
+    curves: dict[str, Json] = {}
+    units = dict(zip(wanted["run_id"], wanted.reindex(columns=["feature_unit"])["feature_unit"], strict=True))
+    for run_id, steps in _steps(folder, wanted["run_id"].tolist()):
+        unit, factor = handy_unit(units[run_id])
+        bins = np.array_split(factor * steps["error_norm"].to_numpy(dtype=np.float64), min(points, len(steps)))
+        curves[run_id] = {
+            "end": rounded(float(steps["time_s"].iloc[-1])),
+            "unit": unit,
+            "error": [rounded(float(np.nanmax(part))) if np.isfinite(part).any() else None for part in bins],
         }
-        for number, (group, task, tracks) in enumerate(views)
-    ]
+    return curves
 
 
-def _scene(tracks: Tracks) -> dict[str, object]:
-    """Return axes with units, seen from where the camera is: x right, y down, depth away."""
-    labels = [label_of(name) for name in next(iter(tracks.values())).features]
+def rounded(value: float, digits: int = DIGITS) -> float | None:
+    """Return a number with few digits, None where it is not finite: what JSON can hold."""
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+
+
+def _steps(folder: Path, run_ids: list[str]) -> Iterator[tuple[str, pd.DataFrame]]:
+    if not results.has_steps(folder):
+        return
+    for first in range(0, len(run_ids), STEPS_AT_ONCE):
+        try:
+            steps = results.load_steps(
+                folder, run_ids[first : first + STEPS_AT_ONCE], ["run_id", "time_s", "error_norm"]
+            )
+        except ConfigurationError:  # each of these runs ended before its first period
+            continue
+        for run_id, own in steps.groupby("run_id", sort=False):
+            yield str(run_id), own
+
+
+def _view(title: str, tracks: Tracks) -> Json:
+    few = each(Track.for_path, tracks)
+    whole = longest(few)
+    reference = whole.vectors("reference_")[:, :3]
+    still = whole.point_to_point
     return {
-        "xaxis": {"title": {"text": labels[0]}},
-        "yaxis": {"title": {"text": labels[1]}},
-        "zaxis": {"title": {"text": f"depth {labels[2]}"}},
-        "aspectmode": "data",
-        "camera": {"eye": {"x": 0.0, "y": 0.9, "z": -2.1}, "up": {"x": 0.0, "y": -1.0, "z": 0.0}},
+        "title": title,
+        "axes": [label_of(name).replace("z [", "depth z [") for name in whole.features[:3]],
+        "reference": _points(reference[:1] if still else reference),
+        "start": _points(whole.vectors("true_feature_")[:1, :3]),
+        "paths": {name: _points(track.vectors("true_feature_")[:, :3]) for name, track in few.items()},
     }
+
+
+def _points(points: FloatArray) -> list[list[float | None]]:
+    """Return points as rows of a few significant numbers."""
+    step = max(1, -(-len(points) // MOST_POINTS))
+    chosen = points[np.isfinite(points).all(axis=1)]
+    kept = np.unique([*range(0, len(chosen), step), *([len(chosen) - 1] if len(chosen) else [])]).astype(int)
+    return [[rounded(float(x)) for x in point] for point in chosen[kept]]
+
+
+def _dash(style: MethodStyle) -> list[float]:
+    if isinstance(style.line, str):
+        return list(DASHES.get(style.line, []))
+    return [2.0 * float(length) for length in style.line[1]]

@@ -1,52 +1,44 @@
-"""One self-contained page about a results folder: tables that sort, figures, and paths in space to turn.
+"""One self-contained page about a results folder: the result in a sentence, tables, figures, paths and every run.
 
-The page holds its pictures, tables and scripts itself; it needs no network. `notebooks/analysis.ipynb` shows the same
-tables and figures in a notebook.
+The page holds its pictures, tables, data and scripts itself and its policy forbids it to load anything else; it needs
+no network. `notebooks/analysis.ipynb` shows the same tables and figures in a notebook.
 """
 
 from __future__ import annotations
 
 import base64
-import re
+import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
-from itables import options, to_html_datatable
-from itables.javascript import generate_init_offline_itables_html
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import split_tasks
-from servobench.harness.analysis.folder import describe_folder, other_tables
-from servobench.harness.analysis.measures import settling_band
-from servobench.harness.analysis.tables import (
-    cost_table,
-    failure_table,
-    outcome_table,
-    runs_table,
-    settling_table,
-    tracking_table,
-)
+from servobench.harness.analysis import groups
+from servobench.harness.analysis.comparison import outcomes, split_tasks
+from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
+from servobench.harness.analysis.measures import MEASURES, handy_unit, settling_band
+from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import folder_figures, picture_of
-from servobench.harness.pictures.interactive import interactive_paths, plotly_script
-from servobench.harness.pictures.style import figure_style, method_styles
-from servobench.harness.run.outcome import FOLLOWING_BANDS
+from servobench.harness.pictures.interactive import error_curves, path_views, rounded, swatches
+from servobench.harness.pictures.sheet import breakable, marked, sheet
+from servobench.harness.pictures.style import TEXT, figure_style, method_styles
+from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.plant.files import write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
-MAX_PICTURES: Final = 24  # a page stays under 10 MB; all figures are in the folder itself
-ROWS_AT_ONCE: Final = 15  # a longer table gets a search field and pages
-
-INFINITE: Final = re.compile(
-    r'(\[\\")\s*inf(\\", \\"___Infinity___)'
-)  # text and value of a cell of numbers, from itables
+PICTURE_BYTES: Final = 2_000_000  # of all figures in the page; all of them are in the folder itself
+SHOWN_RUNS: Final = 1000  # rows of the table of runs
+SKIPPED: Final = ("joint_speeds",)  # kinds of figures that are in the folder only
 
 
 @dataclass(frozen=True)
@@ -57,13 +49,15 @@ class Picture:
         kind: what it shows; see `harness.pictures.draw`.
         title: alternative text.
         data: the PNG file, base64.
-        width: at which it is shown [px].
+        width: [px] at which its type has the size of the page's.
+        height: [px], likewise.
     """
 
     kind: str
     title: str
     data: str
     width: int
+    height: int
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
@@ -93,39 +87,77 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
 
 def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
     """Return the figure of the conditions that a results folder varies, and its first figures of steps."""
-    pictures: list[Picture] = []
-    with figure_style():
-        overview = draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
-    if overview is not None:
-        pictures.append(_picture("conditions", "share of settled runs over what was varied", overview))
-    for named in folder_figures(folder):
-        if named.kind != "joint_speeds" and len(pictures) < MAX_PICTURES:
-            pictures.append(_picture(named.kind, named.title, named.figure))
+    pictures, size = [], 0
+    for picture in _drawn(folder, runs):
+        size += len(picture.data)
+        if size > PICTURE_BYTES:
+            break
+        pictures.append(picture)
     return pictures
 
 
-def table_options(table: pd.DataFrame) -> dict[str, Any]:
-    """Return how itables shows a table: columns sort by a click, a long table has a search field and pages."""
-    long = len(table) > ROWS_AT_ONCE
-    parts = {"topStart": "search", "topEnd": "pageLength", "bottomStart": "info", "bottomEnd": "paging"}
-    return {
-        "connected": False,
-        "showIndex": False,
-        "layout": {place: part if long else None for place, part in parts.items()},
-        "lengthMenu": [ROWS_AT_ONCE, 60, 250],
-        "maxBytes": "4MB",
-        "scrollX": True,
-        "classes": "display nowrap compact",
-        "text_in_header_can_be_selected": False,
-    }
+def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
+    with figure_style(TEXT):
+        overview = draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
+    if overview is not None:
+        yield _picture("conditions", "share of settled runs over what was varied", overview)
+    for named in folder_figures(folder):
+        if named.kind not in SKIPPED:
+            yield _picture(named.kind, named.title, named.figure)
 
 
-def sortable_table(rows: pd.DataFrame) -> Markup:
-    """Return a table as HTML in which infinity is written as the sign ∞ and still sorts behind all numbers."""
-    return Markup(INFINITE.sub(r"\1∞\2", to_html_datatable(rows, **table_options(rows))))
+def _picture(kind: str, title: str, figure: Figure) -> Picture:
+    figure.suptitle("")  # the page has it as a caption
+    content, width = picture_of(figure)
+    height = round(width * figure.get_figheight() / figure.get_figwidth())
+    return Picture(kind, title, base64.b64encode(content).decode("ascii"), width, height)
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
+    views = path_views(folder)
+    shown = _shown(runs)
+    style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
+    pictures = report_pictures(folder, runs)
+    moves, curves = groups.move_tables(runs), groups.curve_tables(runs)
+    others = [(name, table.map(lambda value: value)) for name, table in other_tables(folder)]
+    estimates = any(picture.kind == "jacobian" for picture in pictures)
+    sections = {"result": True, "moves": moves, "curves": curves, "outcomes": True, "space": views,
+                "estimates": estimates, "cost": True, "runs": True, "others": others, "origin": True}  # fmt: skip
+    facts = describe_folder(folder, runs)
+    return _environment().get_template(TEMPLATE).render(
+        folder=folder.resolve().name,
+        policy=_policy(style, scripts),
+        style=Markup(style),
+        scripts=[Markup(script) for script in scripts],
+        sections=[name for name, content in sections.items() if content],
+        tasks={name: [] for name in sections} | {"moves": list(moves), "curves": list(curves)},
+        sheet=sheet,
+        verdict=judge(runs),
+        scope=_scope(runs, facts),
+        band=settling_band(runs),
+        following=settling_band(runs, FOLLOWING_BANDS),
+        overview=groups.overview(runs),
+        leaders=leaders(runs),
+        moves=moves,
+        curves=curves,
+        outcomes=groups.outcome_table(runs),
+        failures=groups.failure_table(runs),
+        pictures=pictures,
+        views=views,
+        estimates=estimates,
+        costs=groups.cost_table(runs),
+        runs=_numbered(groups.runs_table(shown), shown),
+        shown=len(shown),
+        hidden=len(runs) - len(shown),
+        others=others,
+        facts=facts,
+        settings=describe_settings(folder),
+        data=_data(folder, shown, views),
+    )  # fmt: skip
+
+
+@cache
+def _environment() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -133,28 +165,78 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    paths = interactive_paths(folder)
-    scripts = generate_init_offline_itables_html(options.dt_bundle) + (plotly_script() if paths else "")
-    return environment.get_template(TEMPLATE).render(
-        folder=folder.resolve().name,
-        scripts=Markup(scripts),
-        table=sortable_table,
-        band=settling_band(runs),
-        following=settling_band(runs, FOLLOWING_BANDS),
-        outcomes=outcome_table(runs),
-        facts=describe_folder(folder, runs),
-        others=list(other_tables(folder)),
-        pictures=report_pictures(folder, runs),
-        max_pictures=MAX_PICTURES,
-        paths=Markup(paths),
-        settling=settling_table(runs),
-        tracking=tracking_table(runs),
-        costs=cost_table(runs),
-        failures=failure_table(runs),
-        runs=runs_table(runs),
+    environment.filters |= {"breakable": breakable, "marked": marked}
+    return environment
+
+
+def _asset(name: str) -> str:
+    return (Path(__file__).parent / name).read_text(encoding="utf-8")
+
+
+def _policy(style: str, scripts: list[str]) -> str:
+    """Return the page's Content-Security-Policy: its own style and scripts by their digests, pictures, nothing else."""
+    styles, own = _digests([style]), _digests(scripts)
+    return (
+        f"default-src 'none'; img-src data:; style-src {styles}; script-src {own}; base-uri 'none'; form-action 'none'"
     )
 
 
-def _picture(kind: str, title: str, figure: Figure) -> Picture:
-    content, width = picture_of(figure)
-    return Picture(kind, title, base64.b64encode(content).decode("ascii"), width)
+def _digests(texts: list[str]) -> str:
+    digests = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts)
+    return " ".join(f"'sha256-{digest}'" for digest in digests)
+
+
+def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
+    """Return in a line what was compared on what."""
+    counts = (("controller", "controllers"), ("task", "tasks"), ("plant", "plants"), ("mismatch", "mismatches"))
+    words = [f"{runs[name].nunique()} {many}" if runs[name].nunique() > 1 else str(runs[name].iloc[0])
+             for name, many in counts]  # fmt: skip
+    return f"{len(runs)} runs: {', '.join(words)}; seeds {facts['seeds']}."
+
+
+def _shown(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs that have a row, with their place in the table: of many, those that went wrong before others."""
+    known = runs.reset_index(drop=True)
+    if len(known) <= SHOWN_RUNS:
+        return known
+    wrong = ~outcomes(known).isin(ACHIEVED)
+    return known.loc[wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]].sort_index()
+
+
+def _numbered(table: pd.DataFrame, shown: pd.DataFrame) -> pd.DataFrame:
+    table.insert(0, (groups.WHICH, "run"), shown.index.to_list())
+    return table
+
+
+def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what the scripts draw: runs by their number, with the error over time of those whose steps are kept."""
+    known = [name for name in MEASURES if name in shown and shown[name].notna().any()]
+    scales = {name: MEASURES[name].scale(shown)[1] for name in known}
+    place = shown.groupby(
+        ["controller", *(n for n in ("task", *groups.CONDITIONS) if n in shown)], dropna=False
+    ).ngroup()
+    curves = error_curves(folder, shown)
+    runs = {
+        str(number): {
+            "id": str(row["run_id"]),
+            "controller": str(row["controller"]),
+            "place": int(place[number]),
+            "reason": str(row.get("reason") or ""),
+            "band": rounded(handy_unit(row.get("feature_unit"))[1] * float(row.get("settling_band", float("nan")))),
+            "values": [rounded(scales[name] * float(row[name])) for name in known],
+        }
+        for number, row in zip(shown.index, shown.to_dict("records"), strict=True)
+    }
+    numbers = {str(row): str(number) for number, row in shown["run_id"].items()}
+    return {
+        "measures": [_named(name, shown) for name in known],
+        "runs": runs,
+        "curves": {numbers[name]: curve for name, curve in curves.items()},
+        "swatches": swatches([str(name) for name in dict.fromkeys(shown["controller"])]),
+        "views": views,
+    }
+
+
+def _named(name: str, runs: pd.DataFrame) -> str:
+    unit = MEASURES[name].scale(runs)[0]
+    return MEASURES[name].name if unit == "1" else f"{MEASURES[name].name} [{unit}]"

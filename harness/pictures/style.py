@@ -28,7 +28,7 @@ class MethodStyle:
     """How a method's line looks.
 
     Attributes:
-        colour: as matplotlib and plotly take it.
+        colour: as matplotlib and browsers take it.
         line: matplotlib's line style.
         marker: matplotlib's marker; empty = none.
         shift: 0 … 1, where between two marks of another method this one's marks lie.

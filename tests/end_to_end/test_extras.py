@@ -58,8 +58,6 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
     ("module", "extra", "arguments"),
     [
         ("jinja2", "report", ("report", "made")),
-        ("plotly", "report", ("report", "made")),
-        ("itables", "report", ("report", "made")),
         ("optuna", "tune", ("tune", "--trials", "1")),
         ("distributed", "cluster", ("sweep", "--out", "out", "--seeds", "1", "--scheduler", "tcp://127.0.0.1:9")),
         pytest.param(

@@ -52,7 +52,8 @@ def test_the_wilson_interval_is_that_of_statsmodels(runs, share):
 
 
 def test_an_estimate_is_printed_with_its_interval_and_a_missing_one_as_a_dash():
-    assert f"{Estimate(0.754, 0.5, np.inf, 3):.2f}" == "0.75 [0.50, inf]"
+    assert f"{Estimate(0.754, 0.5, np.inf, 3):.2f}" == "0.75 [0.50, ∞]"
+    assert f"{Estimate(0.754, np.nan, np.nan, 1):.2f}" == "0.75"
     assert f"{Estimate(0.002, 0.001, 0.003, 3).scaled(1000.0):.0f}" == "2 [1, 3]"
     assert f"{NO_ESTIMATE:.1f}" == "–"
 

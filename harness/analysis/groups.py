@@ -1,0 +1,242 @@
+"""Tables for a page: columns in groups, a value with its interval in one cell, a row for each condition and controller.
+
+The columns of such a table are pairs (group, heading) and its cells are text; the columns that say which runs a row
+is about are in the group without a name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from servobench.controllers.methods import PUBLISHED
+from servobench.harness.analysis.comparison import (
+    achieved_share,
+    achievement,
+    column_of,
+    outcomes,
+    settling_times,
+    split_conditions,
+    split_tasks,
+)
+from servobench.harness.analysis.measures import MEASURES
+from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, success_rate
+from servobench.harness.analysis.verdict import scores
+from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.outcome import ACHIEVED, OUTCOMES
+
+WHICH: Final = ""  # the group of columns that say which runs a row is about
+CONDITIONS: Final = {
+    "plant": ("plant", 1.0),
+    "robot": ("robot", 1.0),
+    "mismatch": ("mismatch", 1.0),
+    "noise_factor": ("noise factor", 1.0),
+    "latency_s": ("latency [ms]", 1e3),
+    "period_s": ("period [ms]", 1e3),
+}  # column -> heading and factor
+MOVE_GROUPS: Final = {
+    "Time": ("settling_time_s", "overshoot"),
+    "Error": ("steady_state_error",),
+    "Motion": ("path_length_ratio", "command_switches"),
+}
+CURVE_GROUPS: Final = {
+    "RMS error": ("rms_error_second_lap", "rms_error_evaluated"),
+    "Motion": ("command_switches", "max_joint_position_rad"),
+}
+COST_GROUPS: Final = {
+    "Step of the controller": ("controller_time_median_us", "controller_time_p99_us", "controller_time_overruns"),
+    "Joints": ("control_effort_rad", "saturation_fraction", "joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3"),
+    "Estimate": ("jacobian_error_mean",),
+}
+RUN_GROUPS: Final = {
+    "Time": ("settling_time_s",),
+    "Error": ("steady_state_error", "rms_error_evaluated"),
+    "Motion": ("control_effort_rad",),
+}
+MOST_PLACES: Final = 5  # that have columns of their own in the overview
+
+Row = dict[tuple[str, str], Any]
+
+
+def overview(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return how often each controller did what was asked and how well, a group of columns for each place.
+
+    Where there are many conditions, a group is a task with all its conditions.
+    """
+    places = split_conditions(runs)
+    if len(places) > MOST_PLACES:
+        places = [(str(task), own) for task, own in runs.groupby("task", sort=False)]
+    single = runs["plant"].nunique() * runs["mismatch"].nunique() == 1
+    rows: list[Row] = []
+    for name in ordered(runs["controller"]):
+        row: Row = {(WHICH, "controller"): name}
+        for words, place in places:
+            own = place[place["controller"] == name]
+            where = str(place["task"].iloc[0]) if single and place["task"].nunique() == 1 and len(places) > 1 else words
+            row[where, f"{achievement(place)} [%]"] = f"{achieved_share(own):.0f}" if len(own) else MISSING
+            table, unit, digits = scores(place)
+            heading = f"after [{unit}]" if unit == "s" else f"RMS error [{unit}]"
+            row[where, heading] = (
+                f"{median_with_interval(table[name]):.{digits}f}" if name in table and len(table) else MISSING
+            )
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each move how many runs settled, how fast, and with what error."""
+    return _by_task(split_tasks(runs)[0], MOVE_GROUPS)
+
+
+def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each curve how many runs followed it, and with what error."""
+    return _by_task(split_tasks(runs)[1], CURVE_GROUPS)
+
+
+def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each condition, task and controller what came of its runs, in percent, where not all was as asked."""
+    named = runs.assign(outcome=outcomes(runs))
+    rows = [(key, own["outcome"].value_counts(), len(own)) for key, own in _rows(named, "task")]
+    mixed = [row for row in rows if not set(row[1].index) <= set(ACHIEVED)]
+    words = sorted({str(word) for _, counts, _ in mixed for word in counts.index}, key=_place_of)
+    table = []
+    for key, counts, total in mixed:
+        row: Row = key | {(WHICH, "runs"): str(total)}
+        for word in words:
+            share = success_rate(int(counts.get(word, 0)), total).scaled(100.0)
+            row[_kind_of(word), f"{word} [%]"] = f"{share:.0f}" if word in counts else MISSING
+        table.append(row)
+    return pd.DataFrame(table)
+
+
+def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return for each plant and controller what a step costs, as far as known, and how much the joints are used."""
+    return _table(runs, COST_GROUPS, ["plant"] if runs["plant"].nunique() > 1 else [], counted=False)
+
+
+def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each way in which runs of a controller ended early, with the reason of the first."""
+    failed = runs[runs["status"] != COMPLETED]
+    rows = []
+    for (controller, plant, status), own in failed.groupby(["controller", "plant", "status"], sort=False):
+        total = len(runs[(runs["controller"] == controller) & (runs["plant"] == plant)])
+        first = own.iloc[0]
+        rows.append(
+            {
+                (WHICH, "controller"): str(controller),
+                (WHICH, "plant"): str(plant),
+                (WHICH, "ended by"): str(status),
+                (WHICH, "runs"): f"{len(own)} of {total}",
+                ("The first of them", "run"): str(first["run_id"]),
+                ("The first of them", "reason"): str(first.get("reason") or MISSING),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return every run as a row: which it is, how it ended and what came of it, and its main measures."""
+    named = runs.assign(outcome=outcomes(runs))
+    table: dict[tuple[str, str], list[str]] = {}
+    for name in ("controller", "task", *_varied(runs)):
+        heading, factor = CONDITIONS.get(name, (name, 1.0))
+        table[WHICH, heading] = [_condition(value, factor) for value in named[name]]
+    table[WHICH, "seed"] = named["seed"].astype(str).tolist()
+    for name in ("status", "outcome"):
+        table["How it ended", name] = named[name].astype(str).tolist()
+    for group, names in RUN_GROUPS.items():
+        for name in _known(runs, names):
+            heading, factor, digits = _heading(name, runs)
+            table[group, heading] = [f"{Estimate(factor * value, np.nan, np.nan, 1):.{digits}f}"
+                                     for value in column_of(runs, name)]  # fmt: skip
+    return pd.DataFrame(table)
+
+
+def ordered(names: pd.Series[str]) -> list[str]:
+    """Return names in order of appearance, each method's published division directly after the method."""
+    found = [str(name) for name in dict.fromkeys(names)]
+    methods = list(dict.fromkeys(name.removesuffix(PUBLISHED) for name in found))
+    return [name for method in methods for name in (method, method + PUBLISHED) if name in found]
+
+
+def _by_task(runs: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> dict[str, pd.DataFrame]:
+    return {
+        str(task): _table(own, groups, _varied(runs), counted=True) for task, own in runs.groupby("task", sort=False)
+    }
+
+
+def _table(
+    runs: pd.DataFrame, groups: Mapping[str, Sequence[str]], keys: Sequence[str], *, counted: bool
+) -> pd.DataFrame:
+    """Return medians of measures with their intervals in groups of columns, a row for each of `keys` and controller."""
+    rows = []
+    for key, own in _rows(runs, keys=keys):
+        row: Row = dict(key)
+        if counted:
+            row["Runs", "number"] = str(len(own))
+            row["Runs", f"{achievement(runs)} [%]"] = f"{achieved_share(own):.0f}"
+        for group, names in groups.items():
+            for name in _known(runs, names):
+                heading, factor, digits = _heading(name, runs)
+                row[group, heading] = f"{_median(own, name, factor):.{digits}f}"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _rows(runs: pd.DataFrame, *more: str, keys: Sequence[str] | None = None) -> list[tuple[Row, pd.DataFrame]]:
+    names = [*(_varied(runs) if keys is None else keys), *more]
+    order = {name: i for i, name in enumerate(ordered(runs["controller"]))}
+    found = []
+    for key, own in runs.groupby([*names, "controller"], sort=False, dropna=False):
+        row: Row = {(WHICH, "controller"): str(key[-1])}
+        for name, value in zip(names, key, strict=False):
+            heading, factor = CONDITIONS.get(name, (name, 1.0))
+            row[WHICH, heading] = _condition(value, factor)
+        found.append((row, own))
+    places = list(dict.fromkeys(tuple(row.values())[1:] for row, _ in found))
+    return sorted(
+        found, key=lambda pair: (places.index(tuple(pair[0].values())[1:]), order[pair[0][WHICH, "controller"]])
+    )
+
+
+def _varied(runs: pd.DataFrame) -> list[str]:
+    """Return the columns of conditions that differ between the runs."""
+    return [name for name in CONDITIONS if name in runs and runs[name].nunique(dropna=False) > 1]
+
+
+def _known(runs: pd.DataFrame, names: Sequence[str]) -> list[str]:
+    return [name for name in names if name in MEASURES and column_of(runs, name).notna().any()]
+
+
+def _heading(name: str, runs: pd.DataFrame) -> tuple[str, float, int]:
+    """Return heading, factor and digits of a measure of `runs`."""
+    measure = MEASURES[name]
+    unit, factor = measure.scale(runs)
+    return measure.name if unit == "1" else f"{measure.name} [{unit}]", factor, measure.digits
+
+
+def _median(own: pd.DataFrame, name: str, factor: float) -> Estimate:
+    """Return the median of a measure; a move that never settled counts as ∞, of other measures a gap is left out."""
+    if name == "settling_time_s":
+        return median_with_interval(factor * settling_times(own))
+    values = factor * column_of(own, name)
+    return median_with_interval(values, missing="left_out") if values.notna().any() else NO_ESTIMATE
+
+
+def _condition(value: Any, factor: float) -> str:  # noqa: ANN401 - a name or a number, or nothing
+    if pd.isna(value):
+        return "as configured"
+    return f"{factor * float(value):g}" if isinstance(value, float | np.floating) else str(value)
+
+
+def _kind_of(word: str) -> str:
+    if word in ACHIEVED:
+        return "As asked"
+    return "Reached the last period" if word in OUTCOMES else "Ended early"
+
+
+def _place_of(word: str) -> tuple[int, str]:
+    return (OUTCOMES.index(word), "") if word in OUTCOMES else (len(OUTCOMES), word)

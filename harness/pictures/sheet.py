@@ -1,0 +1,143 @@
+"""A table as the report's template writes it: cells with their interval apart, headings in groups, methods in pairs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Final
+
+import pandas as pd
+from markupsafe import Markup, escape
+
+from servobench.controllers.methods import PUBLISHED
+from servobench.harness.analysis.groups import WHICH
+from servobench.harness.analysis.statistics import MISSING
+
+ESTIMATE: Final = re.compile(r"(?P<value>[^\[\]]+) \[(?P<low>[^,\[\]]+), (?P<high>[^,\[\]]+)\]")
+NUMBER: Final = re.compile(r"[-+]?(\d|∞|–$)")
+BREAKS: Final = re.compile(r"([_:+=/,.])")  # signs after which a long name may go on in the next line
+TICKED: Final = re.compile(r"`([^`]*)`")
+CONTROLLER: Final = (WHICH, "controller")
+INFINITE: Final = "∞"
+FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What stands in a cell.
+
+    Attributes:
+        text: a word or a number.
+        interval: of the number; empty without one.
+        number: whether it is to be read as a number.
+        link: address within the page; empty without one.
+    """
+
+    text: str
+    interval: str = ""
+    number: bool = False
+    link: str = ""
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """A row of cells.
+
+    Attributes:
+        cells: one a column.
+        begins: whether another method begins with it.
+        published: whether it is a method as published.
+        name: identifier of the row in the page; empty without one.
+    """
+
+    cells: list[Cell]
+    begins: bool
+    published: bool
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table.
+
+    Attributes:
+        groups: title and number of columns of each group of columns; empty where there are no groups.
+        headings: of each column, with its unit apart.
+        rows: in order.
+        size: `few`, `some` or `many` columns, for the width at which rows become cards.
+    """
+
+    groups: list[tuple[str, int]]
+    headings: list[tuple[str, str]]
+    rows: list[SheetRow]
+    size: str
+
+
+def sheet(table: pd.DataFrame, *, linked: bool = False) -> Sheet:
+    """Return a table for the template.
+
+    Args:
+        table: its columns are headings or pairs (group, heading).
+        linked: the first column counts runs: its cells link to `#run-<number>`.
+    """
+    columns = [(str(name[0]), str(name[1])) if isinstance(name, tuple) else (WHICH, str(name)) for name in list(table)]
+    groups = [(name, len(list(own))) for name, own in groupby(group for group, _ in columns)]
+    headings = [_heading(heading) for _, heading in columns]
+    size = "few" if len(columns) <= FEW else "some" if len(columns) <= SOME else "many"
+    return Sheet(groups if len(groups) > 1 else [], headings, list(_rows(table, columns, linked=linked)), size)
+
+
+def breakable(text: object) -> Markup:
+    """Return escaped text that may be broken after signs such as `_` and `:`."""
+    return Markup("<wbr>").join(escape(part) for part in BREAKS.sub("\\1\0", str(text)).split("\0"))
+
+
+def marked(text: object) -> Markup:
+    """Return escaped text in which words between backticks are set as code."""
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part)
+        for i, part in enumerate(TICKED.split(str(text)))
+    )
+
+
+def plain(value: Any) -> str:  # noqa: ANN401 - whatever a table beside the runs holds
+    """Return a value as a reader wants it: no name of Python's for nothing, infinity or truth."""
+    if isinstance(value, list | tuple | set | dict):
+        return str(value)
+    if pd.isna(value):
+        return MISSING
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}".replace("inf", "∞")
+    return str(value)
+
+
+def _rows(table: pd.DataFrame, columns: list[tuple[str, str]], *, linked: bool) -> Iterator[SheetRow]:
+    place = columns.index(CONTROLLER) if CONTROLLER in columns else None
+    before = None
+    for values in table.itertuples(index=False, name=None):
+        cells = [_cell(plain(value)) for value in values]
+        owner = None if place is None else str(values[place])
+        method = None if owner is None else owner.removesuffix(PUBLISHED)
+        name = f"run-{values[0]}" if linked else ""
+        if linked:
+            cells[0] = Cell(cells[0].text, number=True, link=f"#{name}")
+        yield SheetRow(cells, method != before, bool(owner and owner.endswith(PUBLISHED)), name)
+        before = method
+
+
+def _cell(text: str) -> Cell:
+    match = ESTIMATE.fullmatch(text)
+    if match and set(match.groups()) == {INFINITE}:  # an interval from ∞ to ∞ says nothing
+        return Cell(INFINITE, number=True)
+    if match:
+        return Cell(match["value"], f"{match['low']} to {match['high']}", number=True)
+    return Cell(text, number=NUMBER.match(text) is not None)
+
+
+def _heading(text: str) -> tuple[str, str]:
+    name, bracket, unit = text.partition(" [")
+    return name, unit.removesuffix("]") if bracket else ""

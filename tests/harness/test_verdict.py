@@ -1,0 +1,113 @@
+"""The sentence with which a report begins, of runs whose result is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.folders import made_up_row
+from servobench.harness.analysis.verdict import judge, knows_truth, leaders, seeds_needed, told_apart
+
+
+def runs_of(seeds: int, **times: float) -> pd.DataFrame:
+    """Return moves of controllers that settle after about these times; NaN never settles."""
+    rows = [
+        made_up_row(f"{name}-{seed}", controller=name, seed=seed, settling_time_s=time + 0.01 * seed)
+        for name, time in times.items()
+        for seed in range(seeds)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_one_run_is_told_as_one_run():
+    verdict = judge(runs_of(1, mine=1.5))
+    assert verdict.result.startswith("`mine` settled in exp1 on kinematic after 1.50 s, with an error of 1.0 mm")
+    assert verdict.cautions == ("One run says nothing about other seeds.",)
+
+
+def test_one_run_that_did_not_succeed_says_what_came_of_it():
+    lost = runs_of(1, mine=np.nan).assign(outcome="joint_at_limit")
+    assert judge(lost).result.startswith("`mine` did not settle in exp1 on kinematic (joint_at_limit): it ended with")
+    crashed = lost.assign(status="crashed", outcome="crashed")
+    assert judge(crashed).result == "`mine` ended exp1 on kinematic early: crashed."
+    curve = runs_of(1, mine=np.nan).assign(task_kind="curve", task="circle")
+    assert judge(curve).result == "`mine` followed circle on kinematic with an RMS error of 2.0 mm."
+
+
+def test_one_controller_is_told_with_intervals():
+    result = judge(runs_of(10, mine=1.0)).result
+    assert result.startswith(
+        "`mine` settled in 10 of 10 runs (95 % interval: 72 to 100 %), after a median of 1.04 s (95"
+    )
+
+
+def test_with_few_seeds_the_order_is_a_hint():
+    verdict = judge(runs_of(5, a=1.0, b=2.0))
+    assert verdict.result.startswith("Both controllers settled in every run, and none of them is shown to be faster")
+    assert verdict.cautions[0].startswith("5 seeds are too few to tell the two controllers apart")
+    assert "at least 6)" in verdict.cautions[0]
+
+
+def test_with_enough_seeds_the_faster_one_is_named():
+    assert judge(runs_of(8, a=1.0, b=2.0)).result.endswith(", of which `a` is shown to be the best.")
+
+
+def test_where_nothing_differs_nobody_is_first():
+    verdict = judge(runs_of(20, a=1.0, b=1.0, c=1.0))
+    assert "none of them is shown to be faster" in verdict.result
+    assert verdict.cautions == ("In how often they did so, no controller can be told apart from the first.",)
+
+
+def test_the_least_and_the_most_reliable_are_named_with_their_runs():
+    verdict = judge(runs_of(12, good=1.0, bad=np.nan))
+    assert verdict.result.startswith("`good` settled in 12 of 12 runs (95 % interval: 76 to 100 %)")
+    assert "least often `bad`, in 0 of 12 runs (95 % interval: 0 to 24 %)." in verdict.result
+    assert verdict.cautions == ("Told apart from the first: `bad`.",)
+
+
+def test_where_nothing_succeeds_nobody_is_praised():
+    assert judge(runs_of(3, a=np.nan, b=np.nan)).result == "None of the 2 controllers settled in any of 6 runs."
+
+
+def test_a_bound_that_knows_the_truth_is_not_ranked():
+    verdict = judge(runs_of(8, calibrated=0.5, a=1.0, b=2.0))
+    assert "`calibrated` knows the true robot: shown, not ranked." in verdict.cautions
+    assert "calibrated" not in verdict.result
+    assert "calibrated" not in leaders(runs_of(8, calibrated=0.5, a=1.0, b=2.0)).to_string()
+    assert knows_truth("pid+true")
+    assert not knows_truth("ukf_mfac")
+
+
+def test_a_third_partys_controller_is_not_loaded_to_write_a_report():
+    assert not knows_truth("./no_such_file.py:Mine")
+    assert not knows_truth("no_such_law+true")
+
+
+def test_runs_that_ended_early_are_counted():
+    runs = runs_of(2, a=1.0, b=1.0)
+    runs.loc[0, ["status", "outcome"]] = "crashed"
+    assert "1 of 4 runs ended early." in judge(runs).cautions
+
+
+def test_who_came_first_is_told_with_those_that_cannot_be_told_apart():
+    runs = pd.concat([runs_of(9, a=1.0, b=2.0), runs_of(9, c=1.0)])
+    (row,) = leaders(runs).to_dict("records")
+    assert row["First", "controller"] == "a"
+    assert row["First", "median"].startswith("1.04 s [")
+    assert row["How sure", "not told apart from the first"] == "c"
+    assert leaders(runs[runs["controller"] == "a"]).empty
+
+
+@pytest.mark.parametrize(("controllers", "seeds"), [(2, 6), (3, 7), (9, 11)])
+def test_the_least_number_of_seeds_is_that_at_which_the_test_can_answer(controllers, seeds):
+    assert seeds_needed(controllers) == seeds
+    names = [f"c{i}" for i in range(controllers)]
+    rng = np.random.default_rng(0)
+
+    def first_pair(count: int) -> bool:
+        table = pd.DataFrame(rng.random((count, controllers)), columns=names)
+        return told_apart(table.assign(c0=table["c1"] - 1.0 - np.arange(count)))[frozenset(("c0", "c1"))]
+
+    assert first_pair(seeds)
+    assert not first_pair(seeds - 1)
