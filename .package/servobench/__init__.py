@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
     from servobench.harness.batch.api import Results, compare, load, run
     from servobench.harness.check.controllers import check_controller
+    from servobench.harness.check.plants import check_plant
     from servobench.plant.signals import Command, Observation
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "Results",
     "RobotKnowledge",
     "check_controller",
+    "check_plant",
     "compare",
     "load",
     "run",
@@ -35,6 +37,7 @@ _HOMES = {
     "servobench.controllers.controller": ("Controller", "ControllerEntry", "RobotKnowledge"),
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.check.controllers": ("check_controller",),
+    "servobench.harness.check.plants": ("check_plant",),
     "servobench.plant.signals": ("Command", "Observation"),
 }
 

@@ -1,4 +1,4 @@
-"""The command `servobench check`: a controller against its contract."""
+"""The command `servobench check`: a controller or a plant against its contract."""
 
 from __future__ import annotations
 
@@ -14,20 +14,31 @@ COLOURS: Final = {"ok": "green", "failed": "bold red", "note": "yellow"}
 
 
 def check(
-    name: Annotated[str, typer.Argument(metavar="CONTROLLER", help="Such as ./mine.py, ./mine.py:Mine or ukf_mfac.")],
+    subject: Annotated[
+        list[str], typer.Argument(metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic.")
+    ],
     limit: Annotated[float, typer.Option(min=1.0, help="Time limit of one check [s].")] = 60.0,
 ) -> None:
-    """Check a controller against its contract.
+    """Check a controller or a plant against its contract.
 
     Each failure says what to change.
     """
     from rich.text import Text
 
     from servobench.harness.check.controllers import check_controller
-    from servobench.harness.check.guarded import check_guarded
+    from servobench.harness.check.guarded import Checks, check_guarded
+    from servobench.harness.check.plants import check_plant
+    from servobench.harness.config.settings import ConfigurationError
 
+    if subject[0] == "plant" and len(subject) == 2:
+        checks: Checks = check_plant
+        name = subject[1]
+    elif len(subject) == 1:
+        checks, name = check_controller, subject[0]
+    else:
+        raise ConfigurationError(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
     findings = []
-    for finding in check_guarded(check_controller, name, limit):
+    for finding in check_guarded(checks, name, limit):
         findings.append(finding)
         console.print(
             Text.assemble((f"{finding.verdict:7s}", COLOURS[finding.verdict]), f"{finding.check:15s}", finding.text),

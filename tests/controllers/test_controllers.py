@@ -18,11 +18,12 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
-from servobench.controllers.methods import METHODS, compose
+from servobench.controllers.methods import METHODS, PUBLISHED, compose
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining
 from servobench.controllers.networks.fit import train
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
+from servobench.harness.check.controllers import ControllerChecks
 from servobench.harness.config.defaults import default_config
 from servobench.plant.signals import Observation
 
@@ -86,6 +87,19 @@ def test_commands_are_finite_and_within_the_limits_for_any_observation(entry, n,
         assert (np.abs(u) <= knowledge.spec.joint_velocity_limit * (1 + 1e-12)).all()
         assert J is None or (J.shape == (m, n) and np.isfinite(J).all())
         assert all(np.shape(value) == () for value in diagnostics.values())
+
+
+EQUIPPED = [entry for name, entry in METHODS.items() if not name.endswith(PUBLISHED)]
+
+
+@pytest.mark.parametrize("entry", [*EQUIPPED, nmpc_calibrated.ENTRY], ids=lambda entry: entry.name)
+def test_a_method_keeps_the_contract_of_controllers(entry):
+    checked = list(ControllerChecks(entry).carry_out())
+    defects = [
+        each for each in checked if each.verdict == "failed" and each.check != "time"
+    ]  # which the machine decides
+    assert not defects
+    assert len(checked) == 16
 
 
 @pytest.mark.parametrize("source", ["nominal", "probe"])

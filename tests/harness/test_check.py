@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+from functools import partial
+
 import pytest
 
 import servobench
@@ -9,6 +13,11 @@ from kit.broken_controllers import BROKEN, NOTED
 from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.check.controllers import check_controller
+from servobench.plant.kinematic import ENTRY as KINEMATIC
+from servobench.plant.plant import PlantEntry
+from servobench.plant.signals import Command
+
+COUNT = itertools.count()
 
 KILLERS = """
 import ctypes
@@ -96,3 +105,46 @@ def test_a_controller_that_cannot_be_loaded_is_refused_as_elsewhere(tmp_path, mo
     write(tmp_path, WHOLE.replace("def step", "def stepp"))
     assert command(monkeypatch, "check", "./mine.py") == 2
     assert capsys.readouterr().err == "servobench: mine.py:6: class Mine lacks step, which it must define\n"
+    assert command(monkeypatch, "check", "robot", "./mine.py") == 2
+    assert "check needs a controller, or the word plant and a plant" in capsys.readouterr().err
+
+
+def plant_with(**methods) -> PlantEntry:
+    """Return the plant `kinematic` with other methods, each of which gets the plant's own first."""
+
+    def build(config, setup):
+        plant = KINEMATIC.build(config, setup)
+        for name, method in methods.items():
+            setattr(plant, name, partial(method, getattr(plant, name)))
+        return plant
+
+    return replace(KINEMATIC, name="broken", build=build)
+
+
+@pytest.mark.parametrize(
+    ("methods", "check", "line"),
+    [
+        (
+            {"reset": lambda own, seed: own(seed + (seed >= 0) * next(COUNT))},
+            "repeatable",
+            "reset with the same seed gives another run",
+        ),
+        ({"reset": lambda own, seed: own(abs(seed))}, "negative seed", "reset must refuse the seed -1"),
+        (
+            {"step": lambda own, u: own(Command(u.joint_velocity[:6]))},
+            "wrong size",
+            "step must refuse 7 joint velocities",
+        ),
+        ({"truth": lambda own: replace(own(), jacobian=2 * own().jacobian)}, "truth", "truth().jacobian misses "),
+        (
+            {"save": lambda own: None, "restore": lambda own, state: None},
+            "save",
+            "after restore the run goes on otherwise",
+        ),
+        ({"close": lambda own: 1 / 0}, "close", "ZeroDivisionError"),
+    ],
+)
+def test_a_broken_plant_fails_one_check_with_one_line(methods, check, line):
+    report = servobench.check_plant(plant_with(**methods))
+    assert [each.check for each in report.failures] == [check], report
+    assert line in report.failures[0].text
