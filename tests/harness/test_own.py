@@ -208,7 +208,7 @@ def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(tmp_path, monk
     [
         ("./mien.py", r"there is no file \./mien\.py: did you mean 'mine\.py'\?"),
         ("nowhere/mine.py", r"there is no file nowhere/mine\.py: nowhere holds no Python file"),
-        ("./mine.py:Mien", r"\./mine\.py has no 'Mien': did you mean 'Mine'\? valid: Mine"),
+        ("./mine.py:Mien", r"\./mine\.py has no 'Mien': did you mean 'Mine'"),
         ("./mine.py:np", r"\./mine\.py:np is of type module, wanted a subclass of servobench\.Controller"),
         ("mine", r"unknown controller 'mine': did you mean your file '\./mine\.py'\?"),
         ("ukf_mfca:published", "unknown controller 'ukf_mfca:published': did you mean 'ukf_mfac:published'"),
