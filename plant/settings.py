@@ -165,8 +165,9 @@ def suggest(word: str, known: Iterable[str]) -> str:
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """Return the known word that is most like a word that somebody may have mistyped; None if none is like it."""
-    near = difflib.get_close_matches(word.lower(), known, n=1)
-    return near[0] if near else None
+    by_letters = {each.lower(): each for each in known}
+    near = difflib.get_close_matches(word.lower(), by_letters, n=1)
+    return by_letters[near[0]] if near else None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

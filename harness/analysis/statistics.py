@@ -24,7 +24,8 @@ def number(value: float, spec: str) -> str:
     """Return a number formatted with `spec` as a reader wants it: ∞ for infinity, – for no number, never -0."""
     if np.isnan(value):
         return MISSING
-    return f"{value:z{spec}}".replace("inf", "∞")
+    sign, rest = (spec[0], spec[1:]) if spec[:1] in {"+", "-", " "} else ("", spec)
+    return format(value, f"{sign}z{rest}").replace("inf", "∞")
 
 
 @dataclass(frozen=True)

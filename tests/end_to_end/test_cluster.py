@@ -76,4 +76,4 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
 )
 def test_a_cluster_that_cannot_be_used_is_refused(limit, message):
     with pytest.raises(ConfigurationError, match=message):
-        open_workers(1, "tcp://127.0.0.1:9", limit).__enter__()
+        open_workers(None, "tcp://127.0.0.1:9", limit).__enter__()

@@ -114,7 +114,7 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens'; valid: links"),
+        (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens': did you mean 'links'? valid: camera_move"),
         (("--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
         (("--noise", "loud"), "--noise must be comma-separated numbers, got 'loud'"),
         (("--noise", "-1"), "--noise must be numbers from 0 on, got '-1'"),
@@ -123,7 +123,7 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
         (("--period", "0"), "run: period must be above 0, got 0.0"),
         (("--period", "0.0333"), "period must be a whole number of milliseconds"),
         (("--scheduler", "nowhere"), "--scheduler needs an address such as tcp://127.0.0.1:8786, got 'nowhere'"),
-        (("--mismatch", "moderate,moderate"), "is asked for twice"),
+        (("--mismatch", "moderate,moderate"), "--mismatch names moderate twice"),
         (("--controllers", "ukf_mfca"), "did you mean 'ukf_mfac'"),
         (("--resume",), "is not a results folder"),
     ],

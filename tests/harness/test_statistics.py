@@ -17,6 +17,7 @@ from servobench.harness.analysis.statistics import (
     Estimate,
     holm,
     median_with_interval,
+    number,
     signed_rank_p_value,
     success_rate,
     tail_mean,
@@ -235,3 +236,17 @@ def test_runs_that_all_ended_before_their_first_period_have_no_metrics_and_are_c
     assert outcomes(runs).tolist() == ["crashed", "crashed"]
     (found,) = compare_pairs(runs, [("a", "b")], never=10.0)
     assert found.p_value == 1.0
+
+
+@pytest.mark.parametrize(
+    ("value", "spec", "text"),
+    [
+        (-0.001, "+.2f", "+0.00"),
+        (-0.001, ".2f", "0.00"),
+        (1.5, "+.1f", "+1.5"),
+        (np.inf, ".2f", "∞"),
+        (NEVER, ".2f", "–"),
+    ],
+)
+def test_a_number_has_the_sign_that_is_asked_for_and_never_a_negative_zero(value, spec, text):
+    assert number(value, spec) == text
