@@ -191,7 +191,8 @@ def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
     counts = (("controller", "controllers"), ("task", "tasks"), ("plant", "plants"), ("mismatch", "mismatches"))
     words = [f"{runs[name].nunique()} {many}" if runs[name].nunique() > 1 else str(runs[name].iloc[0])
              for name, many in counts]  # fmt: skip
-    return f"{len(runs)} runs: {', '.join(words)}; seeds {facts['seeds']}."
+    count = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    return f"{count}: {', '.join(words)}; {'seeds' if runs['seed'].nunique() > 1 else 'seed'} {facts['seeds']}."
 
 
 def _shown(runs: pd.DataFrame) -> pd.DataFrame:
