@@ -10,10 +10,13 @@ import contextlib
 import os
 import re
 import signal
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import get_context
+from multiprocessing.synchronize import Semaphore
+from threading import Event
 from typing import Any, Final
 
 from pebble import ProcessExpired, ProcessPool
@@ -25,6 +28,7 @@ from servobench.harness.config.source import SourceFile
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
+MAX_START_TIME: Final = 10.0  # [s], that a process may take to start before it is stopped all the same
 TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
 
 
@@ -91,21 +95,37 @@ def open_workers(
         yield Workers()
     else:
         names = (tuple(plants), tuple(controllers), tuple(each.source for each in own if each.source is not None))
-        pool = ProcessPool(count, context=get_context("spawn"), initializer=_warm_up, initargs=names)
+        context = get_context("spawn")
+        ready, asked = context.Semaphore(0), Event()
+        pool = ProcessPool(count, context=context, initializer=_warm_up, initargs=(ready, *names))
 
         def submit(function: Callable[..., Any], *arguments: object) -> Any:  # noqa: ANN401 - a future
+            asked.set()
             with _interrupts_blocked():  # the first task starts the processes, which inherit the blocked signal
                 return pool.schedule(function, arguments, timeout=run_timeout)
 
         try:
             yield Workers(submit, count, (ProcessExpired,), run_timeout)
+            if asked.is_set():
+                _wait_until(ready, count)
         finally:
             pool.stop()  # type: ignore[no-untyped-call]
             pool.join()
 
 
-def _warm_up(plants: Sequence[str], controllers: Sequence[str], sources: Sequence[SourceFile]) -> None:
-    """Import what runs need; what cannot be imported is left to the run, whose row says so."""
+def _wait_until(ready: Semaphore, count: int) -> None:
+    """Wait until `count` processes have started: one that is stopped while it starts may print a traceback."""
+    deadline = time.monotonic() + MAX_START_TIME
+    for _ in range(count):
+        if not ready.acquire(timeout=max(0.0, deadline - time.monotonic())):
+            return
+
+
+def _warm_up(
+    ready: Semaphore, plants: Sequence[str], controllers: Sequence[str], sources: Sequence[SourceFile]
+) -> None:
+    """Import what runs need, and say so; what cannot be imported is left to the run, whose row says so."""
+    ready.release()
     import_module("servobench.harness.run.episode")
     for find, names in ((find_plant, plants), (find_controller, controllers)):
         for name in names:
