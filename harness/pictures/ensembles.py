@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import LONG, OVERVIEW
 from servobench.harness.run.ending import COMPLETED
-from servobench.harness.run.request import read_mismatch
 from servobench.plant.checks import FloatArray
 
 ERROR, JACOBIAN, STEP_TIME = "error_norm", "jacobian_error", "controller_time_us"
@@ -136,9 +136,8 @@ def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
 def _ensemble(runs: pd.DataFrame, tables: Sequence[pd.DataFrame], camera_moves_at: float) -> Ensemble:
     """Return the ensemble of runs and their steps; a camera moves after that share of a run."""
     longest = max(tables, key=len)
-    moves = read_mismatch(str(runs["mismatch"].iloc[0])).size("camera_move") > 0.0
-    share = camera_moves_at if moves else math.nan
-    moved_at = math.nan if math.isnan(share) else float(longest["time_s"].iloc[int(share * len(longest))])
+    known = _camera_moved(runs) and not math.isnan(camera_moves_at)
+    moved_at = float(longest["time_s"].iloc[int(camera_moves_at * len(longest))]) if known else math.nan
     block = len(longest) // OVERVIEW if len(longest) > LONG else 1
     count = -(-len(longest) // block)
     statuses = (runs["status"] == COMPLETED).tolist()
@@ -155,6 +154,12 @@ def _ensemble(runs: pd.DataFrame, tables: Sequence[pd.DataFrame], camera_moves_a
         times[times > 0.0],
         moved_at,
     )
+
+
+def _camera_moved(runs: pd.DataFrame) -> bool:
+    """Return whether a camera was moved in the middle of these runs, by the values that were drawn for them."""
+    drawn = runs.reindex(columns=["mismatch_values"])["mismatch_values"].dropna()
+    return any(json.loads(text).get("move_angle", 0.0) != 0.0 for text in drawn)
 
 
 def _padded(table: pd.DataFrame, name: str, block: int, count: int, filling: float) -> FloatArray:

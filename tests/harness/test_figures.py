@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
@@ -88,13 +89,13 @@ def test_a_move_is_shown_until_its_slowest_method_has_settled_and_then_half_as_l
     assert shown_until(never) == 59 * 0.05
 
 
-def test_a_camera_that_moves_is_marked_and_the_whole_move_is_shown(tmp_path):
-    folder = tmp_path / "out"
-    row = made_up_row("a", mismatch="moderate+camera_move=45deg", settling_time_s=0.5)
-    write_folder(folder, [row], [made_up_steps("a")])
-    manifest = results.read_manifest(folder) | {"configuration": {"run": {"camera_moves_at": 0.5}}}
-    results.write_manifest(folder, manifest)
-    ensembles = load_ensembles(folder, results.load_runs(folder))
+@pytest.mark.parametrize("mismatch", ["moderate+camera_move=45deg", "moderate+word_of_another_version=3deg"])
+def test_a_camera_that_moved_is_marked_and_the_whole_move_is_shown(tmp_path, mismatch):
+    drawn = json.dumps({"move_angle": 0.785})
+    write_folder(tmp_path, [made_up_row("a", mismatch=mismatch, mismatch_values=drawn)], [made_up_steps("a")])
+    manifest = results.read_manifest(tmp_path) | {"configuration": {"run": {"camera_moves_at": 0.5}}}
+    results.write_manifest(tmp_path, manifest)
+    ensembles = load_ensembles(tmp_path, results.load_runs(tmp_path))
     assert shown_until(ensembles["exp1"]) == 59 * 0.05
     axes = draw_moves(ensembles, STYLES).axes[0]
     assert lines_of(axes, "camera moves")[0].get_xdata()[0] == 1.5
