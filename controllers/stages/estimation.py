@@ -87,10 +87,11 @@ class Estimation:
         if aids.model == "nominal" and estimator.brings_model:
             raise ValueError(f"aids.model must be 'own' or 'map' for {type(estimator).__name__}, which brings a model")
         self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
-        self._nominal = None if estimator.brings_model else knowledge.nominal_jacobian
         self._adds = aids.model != "own" and not estimator.brings_model
         self._shortest = (max(1, whole_periods(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
         self.pairing = Pairing(aids, knowledge.spec, delays.latency) if aids.looks_back else None
+        asked = aids.model != "own" or (self.pairing is not None and self.pairing.learns)
+        self._nominal = knowledge.nominal_jacobian if asked and not estimator.brings_model else None
         self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * knowledge.spec.period
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:

@@ -95,6 +95,7 @@ class Pairing:
 
     Attributes:
         delays: the candidates, (D,), periods.
+        learns: whether delay, map or noise are identified, for which the base Jacobian predicts motions.
         gap: the longest motion, from one valid feature to the next, of which the past is remembered, periods.
     """
 
@@ -116,7 +117,7 @@ class Pairing:
         self.gap = MAX_GAP * motion
         self._rows = int(candidates[-1]) + self.gap + 2
         self._aligns = aids.model == "map"
-        self._learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
+        self.learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
         self._eye = np.eye(spec.m)
         self._walk = np.concatenate([np.zeros_like(self._eye), self._eye])  # of a bank: M stays, P grows
         self._P0 = aids.map_deviation**2 * self._eye
@@ -176,7 +177,7 @@ class Pairing:
         end = self.delays
         begin = pick(state.past, end + periods[..., None], axes=1)
         passed = state.past[..., end, :] - begin
-        if self._learns:
+        if self.learns:
             state = self._identify(state, passed[..., n:], feature_step)
         passed = pick(passed, state.candidate)
         return state, Paired(pick(begin, state.candidate)[..., :n], passed[..., :n], passed[..., n:])
@@ -194,7 +195,7 @@ class Pairing:
     def diagnostics(self, state: PairState) -> dict[str, npt.ArrayLike]:
         """Return delay (s), rotation (rad), deviation and NIS of the map, moves of the camera, noise level (m)."""
         found: dict[str, npt.ArrayLike] = {"delay": self.delay(state) * self._period}
-        if self._learns:
+        if self.learns:
             found |= {"map_surprise": state.nis, "camera_moves": state.moves, "noise_level": state.noise.deviation}
         if self._aligns:
             turned = (state.rotation - self._eye).reshape(*np.shape(state.candidate), -1)

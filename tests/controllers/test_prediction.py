@@ -1,5 +1,7 @@
 """Tests of the predict stage: the joints' response, the feature's filter, the shifted reference."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import StateSpace, cont2discrete, dlsim
@@ -254,3 +256,16 @@ def test_every_lane_has_its_own_shift():
     reference, leads = np.random.default_rng(0).normal(size=(3, 6, 2)), np.array([0.0, 1.5, 8.25])
     single = [shifted(one, lead, 4) for one, lead in zip(reference, leads, strict=True)]
     np.testing.assert_array_equal(shifted(reference, leads, 4), single)
+
+
+def test_the_nominal_model_is_asked_only_where_a_stage_predicts_with_it():
+    def count(**aids):
+        asked = []
+        knowledge = replace(KNOWLEDGE, nominal_jacobian=lambda q: asked.append(q) or A)
+        estimation = Estimation(ConstantEstimator(), knowledge, AidsConfig(**aids), NO_DELAYS)
+        state = estimation.start(seen(np.zeros(N), np.zeros(M)), A)
+        estimation.update(state, seen(np.zeros(N), np.zeros(M), k=1), np.zeros(M))
+        return len(asked)
+
+    assert count(filter=True) == count(delay="given") == count(response="identified") == 0
+    assert count(delay="identified") == count(noise="identified") == count(model="nominal") == 2
