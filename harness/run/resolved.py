@@ -145,11 +145,11 @@ def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
     Raises:
         MissingPart: such a plug-in.
     """
+    if section in TASKS:
+        return find_task(section).default
     try:
-        if section in TASKS:
-            return find_task(section).default
         return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
-    except Exception as error:
+    except Exception as error:  # whatever code of a third party raises
         raise MissingPart from error
 
 
