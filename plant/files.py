@@ -1,11 +1,13 @@
-"""Files that a reader sees whole or not at all."""
+"""Files: written whole or not at all, and TOML that is refused in one line."""
 
 from __future__ import annotations
 
 import os
 import threading
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -21,3 +23,21 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def read_toml(what: str, path: Path) -> dict[str, Any]:
+    """Return what a TOML file holds.
+
+    Args:
+        what: the file is, for error messages, such as "mapping".
+        path: the file.
+
+    Raises:
+        ValueError: it cannot be read, or is not valid TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{what} {path} cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{what} {path} is not valid TOML: {error}") from error

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from servobench.plant.files import read_toml
 from servobench.plant.settings import listed, override, suggest
 
 Config = TypeVar("Config")
@@ -89,11 +90,9 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
     sections: dict[str, Any] = {}
     if path is not None:
         try:
-            sections = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigurationError(f"configuration file {path} cannot be read: {error}") from error
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigurationError(f"configuration file {path} is not valid TOML: {error}") from error
+            sections = read_toml("configuration file", path)
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from error
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")

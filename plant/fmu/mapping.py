@@ -11,7 +11,6 @@ The keys are the fields of `FmuMapping`, its sections the fields of their own cl
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import field, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 from annotated_types import MinLen
 
 from servobench.plant.checks import FloatArray
+from servobench.plant.files import read_toml
 from servobench.plant.fmu.description import FmuDescription, total_size
 from servobench.plant.settings import File, Names, Numbers, Positive, nested, override, settings
 from servobench.plant.signals import PlantSpec
@@ -121,12 +121,7 @@ def read_mapping(path: Path) -> FmuMapping:
     Raises:
         ValueError: an unreadable or malformed file, an unknown key, or a value of the wrong kind.
     """
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"mapping {path} cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"mapping {path} is not valid TOML: {error}") from error
+    table = read_toml("mapping", path)
     for key in ("file", "inputs", "features"):
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")

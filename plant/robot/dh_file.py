@@ -16,12 +16,12 @@ may have one entry more, which leads to the flange.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.files import read_toml
 from servobench.plant.robot.arm import SerialArm, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.bodies import estimate_links
 from servobench.plant.robot.limits import JointLimits
@@ -71,12 +71,7 @@ def read_dh_robot(path: Path) -> Robot:
     Raises:
         ValueError: the file is missing, malformed, or describes no arm that can work at a table.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"robot file {path} cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"robot file {path} is not valid TOML: {error}") from error
+    values = read_toml("robot file", path)
     for key in REQUIRED:
         if key not in values:
             raise ValueError(f"robot file {path}: the key {key!r} is missing; wanted {', '.join(REQUIRED)}")
