@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import sys
@@ -121,14 +122,24 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
         raise CompilationFailed(f"{arguments[0]} failed for {target.name}: {lines[0] if lines else 'no message'}")
 
 
+def _words(command: str) -> list[str]:
+    """Return the words of a command such as "gcc -m64"; a path with spaces that is a file is one word."""
+    try:
+        return [command] if shutil.which(command) else shlex.split(command) or [command]
+    except ValueError:  # a quotation that does not end
+        return [command]
+
+
 def _compiler(target: Platform) -> list[str]:
     """Return the command that compiles for `target`: the system's compiler for this machine, zig for the others."""
     if target == this_platform():
-        named = os.environ.get("CC")
-        for command in [named] if named else COMPILERS:
+        named = os.environ.get("CC", "").strip()
+        for command, *flags in [_words(named)] if named else [[each] for each in COMPILERS]:
             path = shutil.which(command)
             if path is not None:
-                return [path]
+                return [path, *flags]
+        if named:
+            raise CompilerMissing(f"{target.name}: CC names {named!r}, which was not found; name another")
     if importlib.util.find_spec("ziglang") is not None:
         return [sys.executable, "-m", "ziglang", "cc", "-target", target.zig_target]
     wanted = "no C compiler was found" if target == this_platform() else "only zig compiles for another machine"

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-import platformdirs
 
-from servobench.fmus.compile import CompilationFailed, CompilerMissing
 from servobench.fmus.export import export_fmu, fingerprint, nominal_options
 from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.bench import Bench
+from servobench.plant.cache import cached
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
@@ -59,14 +58,12 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None) -> Path:
     Raises:
         CompilerMissing: it has to be built and there is no compiler.
         CompilationFailed: it has to be built and the compiler refused it.
+        ValueError: it has to be built and the cache folder cannot be written.
     """
     options = nominal_options(fmi_version, robot or find_robot(UR5))
-    folder = Path(platformdirs.user_cache_dir("servobench")) / "fmus"
-    path = folder / f"{options.identifier}-fmi{fmi_version}-{fingerprint(options).strip('{}')}.fmu"
-    if not path.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        export_fmu(path, options)
-    return path
+    name = f"{options.identifier}.fmu"
+    key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options).strip('{}')}"
+    return cached("fmus", key, lambda folder: export_fmu(folder / name, options)) / name
 
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
@@ -103,7 +100,7 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
     """
     try:
         path = cached_fmu(config.fmi_version, setup.nominal)
-    except (CompilerMissing, CompilationFailed, OSError) as error:
+    except ValueError as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
     lag = float(np.mean(config.joint_lags or config.lag))
     return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import tokenize
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +17,24 @@ from servobench.plant.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 2
+MAX_UNPACKED = 256_000_000  # [bytes] of all arrays; trained networks have less than a hundredth of it
+DAMAGES = (  # what numpy's reader raises at what is no .npz, or a damaged one
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 ARRAYS = ("centres", "widths", "weights")  # of either network
 
 
@@ -87,10 +108,13 @@ def _read_arrays(path: Path) -> dict[str, Any]:
     """Return all arrays of the file after its format and version have been checked."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            unpacked = sum(entry.file_size for entry in archive.zip.infolist())
+            if unpacked > MAX_UNPACKED:
+                raise ValueError(f"it unpacks to {unpacked:,} bytes, at most {MAX_UNPACKED:,} are read")
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise ValueError(f"network file {path} does not exist") from error
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile) as error:
+    except DAMAGES as error:
         raise ValueError(f"network file {path} is corrupt or not a network file: {error}") from error
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"network file {path} is not a network file of servobench")

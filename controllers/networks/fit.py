@@ -13,7 +13,7 @@ trained. The output fit therefore imitates ψ ξ ≈ q + K_p s J⁺ e + K_n s (I
 towards the region's middle q_c without moving the feature; K_n = 0 is the paper's law.
 
 Widths and regularisation are the best of a small grid on held-out samples. Nothing here is random beyond the
-configuration's own seed, and only `train_cached` touches files.
+configuration's own seed.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
-from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
+from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, hidden_features, jacobian_features
 from servobench.controllers.networks.samples import (
     ControllerSamples,
@@ -71,27 +70,6 @@ def train(
     controller, controller_error = _train_controller(config, nominal_jacobian, spec, report)
     report(1.0, "done")
     return TrainedNetworks(jacobian, controller, jacobian_error, controller_error, digest)
-
-
-def train_cached(
-    config: TrainingConfig,
-    nominal_jacobian: JacobianFunction,
-    spec: PlantSpec,
-    folder: Path,
-    progress: Progress | None = None,
-) -> TrainedNetworks:
-    """Return the networks of this configuration and model from `folder`, and train and store them where absent.
-
-    Raises:
-        ValueError: as `train`, or the stored file is corrupt or foreign.
-    """
-    digest = training_digest(config, nominal_jacobian, spec)
-    path = folder / f"networks-{digest[:16]}.npz"
-    if path.exists():
-        return load_networks(path, digest)
-    networks = train(config, nominal_jacobian, spec, progress)
-    save_networks(networks, path)
-    return networks
 
 
 def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> TrainedNetworks:

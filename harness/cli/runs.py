@@ -129,8 +129,9 @@ def train(
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.experiment import train_networks
-    from servobench.harness.run.network_cache import cache_folder
+    from servobench.harness.run.network_cache import NETWORKS
     from servobench.harness.run.resolved import check_settings
+    from servobench.plant.cache import cache_folder
 
     settings, controller = overrides.settings(), choose_controller(controller)
     check_settings(settings, [controller])
@@ -140,7 +141,7 @@ def train(
     table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
     table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
     console.print(table)
-    console.print(f"kept in {cache_folder()}", soft_wrap=True)
+    console.print(f"kept in {cache_folder(NETWORKS)}", soft_wrap=True)
 
 
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:

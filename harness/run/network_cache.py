@@ -5,23 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from platformdirs import user_cache_path
-
 from servobench.controllers.controller import JacobianFunction
 from servobench.controllers.networks.config import TrainingConfig
-from servobench.controllers.networks.file import TrainedNetworks, save_networks
-from servobench.controllers.networks.fit import Progress, train_cached, training_digest
+from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
+from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.harness.run.threads import one_thread
+from servobench.plant.cache import cache_folder, cached
 from servobench.plant.signals import PlantSpec
 
 NETWORKS = "networks"
+FILE = "networks.npz"
 NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes ten times longer to read
 _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
-
-
-def cache_folder() -> Path:
-    """Return the folder in which trained networks are kept for this user."""
-    return user_cache_path("servobench") / NETWORKS
 
 
 def network_source(
@@ -36,14 +31,19 @@ def network_source(
         progress: called with the share that is done while training.
     """
 
+    def train_cached(config: TrainingConfig, digest: str) -> TrainedNetworks:
+        def make(folder: Path) -> None:
+            save_networks(train(config, nominal_jacobian, spec, progress), folder / FILE)
+
+        return load_networks(cached(NETWORKS, digest[:16], make) / FILE, digest)
+
     def obtain(config: TrainingConfig) -> TrainedNetworks:
-        folder = cache_folder()
         with one_thread():
-            key = (folder, training_digest(config, nominal_jacobian, spec))
+            key = (cache_folder(NETWORKS), training_digest(config, nominal_jacobian, spec))
             if key not in _KEPT:
                 while len(_KEPT) >= NETWORKS_KEPT:
                     _KEPT.pop(next(iter(_KEPT)))
-                _KEPT[key] = train_cached(config, nominal_jacobian, spec, folder, progress)
+                _KEPT[key] = train_cached(config, key[1])
         networks = _KEPT[key]
         if keep is not None:
             path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"

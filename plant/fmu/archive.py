@@ -1,70 +1,120 @@
-"""Extracts an .fmu archive once: into a folder of the user's cache that is named by the archive's content.
+"""Extracts an .fmu archive once: into the user's cache, under a name that is a hash of the archive's content.
 
-All processes share the folder, nobody writes into it, and a second plant of the same FMU only looks it up.
+All processes share the folder, nobody writes into it, and a second plant of the same FMU only looks it up. An archive
+is judged by its table of contents before a byte is unpacked; Python's reader never unpacks more than that says.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
-import shutil
-import tempfile
+import lzma
 import zipfile
+import zlib
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Final
 
-from platformdirs import user_cache_dir
+from servobench.plant.cache import cached
+
+DESCRIPTION: Final = "modelDescription.xml"
+MAX_FILES: Final = 20_000  # in an archive
+MAX_UNPACKED: Final = 2_000_000_000  # [bytes] of all files together
+MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which is read into memory
+MAX_RATIO: Final = 100.0  # of the unpacked size to that of the archive; libraries reach 5, tables of numbers 20
+SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
+DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)  # not of the archive
+DAMAGES: Final = (  # what Python's reader of archives raises
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    ValueError,
+)
 
 
 def extract_fmu(path: Path) -> Path:
     """Return the folder that holds the extracted FMU at `path`.
 
     Raises:
-        ValueError: no such file, not a zip archive, an archive that is damaged or climbs out of its folder, or one
-            without a model description.
+        ValueError: no such file, not a zip archive, an archive that is damaged, climbs out of its folder, or unpacks to
+            more than the limits of this module, or one without a model description.
     """
-    if not path.is_file():
-        raise ValueError(f"fmu file {path} does not exist")
-    status = path.stat()
-    digest = _digest(path.resolve(), status.st_mtime_ns, status.st_size)
-    folder = Path(user_cache_dir("servobench")) / "extracted" / digest
-    if not folder.is_dir():
-        _extract(path, folder)
-    return folder
+    try:
+        if not path.is_file():
+            raise ValueError(f"fmu file {path} does not exist")
+        status = path.stat()
+        digest = _digest(path.resolve(), status.st_mtime_ns, status.st_size)
+    except OSError as error:
+        raise ValueError(f"fmu file {path} cannot be read: {error.strerror}") from error
+    return cached("extracted", digest, lambda folder: _extract(path, folder))
 
 
 @lru_cache(maxsize=64)
 def _digest(path: Path, _modified: int, _size: int) -> str:
     """Return the first half of the SHA-256 of a file; time and size make a changed file another key."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:32]
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
 
 
 def _extract(path: Path, folder: Path) -> None:
-    """Extract beside `folder` and move the result there, so that no process meets half an FMU."""
     with _open(path) as archive:
-        _check_names(path, archive)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(dir=folder.parent))
-        try:
-            archive.extractall(fresh)
-            fresh.rename(folder)
-        except (zipfile.BadZipFile, OSError, NotImplementedError, RuntimeError) as error:
-            shutil.rmtree(fresh, ignore_errors=True)
-            if not folder.is_dir():  # else another process was faster
-                raise ValueError(f"fmu file {path} cannot be extracted: {error}") from error
+        entries = archive.infolist()
+        _check_names(path, entries)
+        _check_sizes(path, entries)
+        for entry in entries:
+            try:
+                archive.extract(entry, folder)
+            except DAMAGES as error:
+                if isinstance(error, OSError) and error.errno in DISK:
+                    raise
+                raise ValueError(f"fmu file {path} cannot be extracted: {entry.filename!r}: {error}") from error
 
 
 def _open(path: Path) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError) as error:
+    except DAMAGES as error:
         raise ValueError(f"fmu file {path} is not a zip archive: {error}") from error
 
 
-def _check_names(path: Path, archive: zipfile.ZipFile) -> None:
-    names = [entry.orig_filename for entry in archive.infolist()]
+def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    names = [entry.orig_filename for entry in entries]
     for name in names:
         parts = PurePosixPath(name.replace("\\", "/"))
         if "\\" in name or ":" in name or parts.is_absolute() or ".." in parts.parts:
             raise ValueError(f"fmu file {path} holds {name!r}, which would climb out of the folder it is extracted to")
-    if "modelDescription.xml" not in names:
-        raise ValueError(f"fmu file {path} holds no modelDescription.xml, so it is not an FMU")
+    if DESCRIPTION not in names:
+        raise ValueError(f"fmu file {path} holds no {DESCRIPTION}, so it is not an FMU")
+
+
+def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse an archive that is built, or damaged, to fill the disk or the memory."""
+    if len(entries) > MAX_FILES:
+        raise ValueError(f"fmu file {path} holds {len(entries)} files; at most {MAX_FILES} are unpacked")
+    description = max(entry.file_size for entry in entries if entry.filename == DESCRIPTION)
+    if description > MAX_DESCRIPTION:
+        raise ValueError(
+            f"fmu file {path} has a {DESCRIPTION} of {_megabytes(description)}; at most {_megabytes(MAX_DESCRIPTION)} "
+            "are read: export the FMU with fewer variables"
+        )
+    unpacked, packed = sum(entry.file_size for entry in entries), path.stat().st_size
+    if unpacked > MAX_UNPACKED:
+        raise ValueError(
+            f"fmu file {path} unpacks to {_megabytes(unpacked)}; at most {_megabytes(MAX_UNPACKED)} are unpacked: "
+            "keep large files of its resources outside of it"
+        )
+    if unpacked > max(SMALL, MAX_RATIO * packed):
+        raise ValueError(
+            f"fmu file {path} unpacks to {_megabytes(unpacked)}, {unpacked / packed:.0f} times its own size; at most "
+            f"{MAX_RATIO:.0f} times is allowed, since archives beyond are made to fill a disk: if you trust it, "
+            "unpack it and pack it again without compression (zip -0 -r)"
+        )
+
+
+def _megabytes(size: int) -> str:
+    return f"{size / 1e6:,.0f} MB"

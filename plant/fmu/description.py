@@ -11,13 +11,18 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from math import prod
 from pathlib import Path
-from typing import Any
+from textwrap import shorten
+from typing import Any, Final
 
+from servobench.plant.fmu.archive import DESCRIPTION
 from servobench.plant.settings import suggest
 
 REAL_TYPES = ("Real", "Float64")
+MAX_NUMBERS: Final = 1_000_000  # that a variable holds
+IDENTIFIER: Final = re.compile(
+    r"(?!\.)[\w.+ -]{1,200}"
+)  # a file's name without folders; the standard wants a word of C
 
 
 @dataclass(frozen=True)
@@ -135,12 +140,12 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         path=path,
         version=int(version[0]),
         model_name=str(description.modelName),
-        identifier=str(interface.modelIdentifier),
+        identifier=_identifier(interface, path),
         token=str(description.guid if version.startswith("2") else description.instantiationToken),
         can_save=bool(interface.canGetAndSetFMUstate),
         can_serialise=bool(interface.canSerializeFMUstate),
         once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
-        variables=tuple(Variable(v.name, v.valueReference, _size(v, path), v.causality or "local") for v in reals),
+        variables=tuple(_variable(each, path) for each in reals),
         other_types={v.name: v.type for v in description.modelVariables if v.type not in REAL_TYPES},
     )
 
@@ -175,26 +180,58 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
     from fmpy import read_model_description  # noqa: PLC0415 - takes a third of a second and loads libraries
 
     try:
-        version = ET.parse(root / "modelDescription.xml").getroot().get("fmiVersion", "none")
-    except ET.ParseError as error:
-        raise ValueError(f"fmu file {path} has a broken modelDescription.xml: {error}") from error
+        version = ET.parse(root / DESCRIPTION).getroot().get("fmiVersion", "none")
+    except (ET.ParseError, LookupError, ValueError, OSError) as error:  # LookupError: an unknown encoding
+        raise ValueError(f"fmu file {path} has a broken {DESCRIPTION}: {_line(error)}") from error
     if not version.startswith(("2.", "3.")):
-        raise ValueError(f"fmu file {path} is of FMI {version}; wanted FMI 2 or 3")
+        raise ValueError(f"fmu file {path} is of FMI {_line(version)}; wanted FMI 2 or 3")
     try:
         return read_model_description(str(root), validate=False)
     except Exception as error:  # fmpy raises bare ones of every kind
+        raise ValueError(f"fmu file {path} has a broken {DESCRIPTION}: {_line(error)}") from error
+
+
+def _line(words: object) -> str:
+    """Return words of a foreign file as one line of a length that can be read."""
+    return shorten(" ".join(str(words).split()) or type(words).__name__, 300, placeholder=" ...")
+
+
+def _identifier(interface: Any, path: Path) -> str:  # noqa: ANN401 - fmpy's interfaces carry no usable types
+    """Return the name of the library, which may not lead out of its folder."""
+    identifier = str(interface.modelIdentifier)
+    if not IDENTIFIER.fullmatch(identifier):
         raise ValueError(
-            f"fmu file {path} has a broken modelDescription.xml: {' '.join(str(error).split())}"
-        ) from error
+            f"fmu file {path} has the modelIdentifier {_line(repr(identifier))}, which is no name of a library: "
+            "wanted letters, digits and '_', without folders"
+        )
+    return identifier
 
 
-def _size(variable: Any, path: Path) -> int:  # noqa: ANN401 - fmpy's variables carry no usable types
-    sizes = []
+def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's variables carry no usable types
+    name, reference = variable.name, variable.valueReference
+    if name is None or not 0 <= reference < 2**32:
+        raise ValueError(
+            f"fmu file {path} has a variable {_line(repr(name))} with the value reference {_line(reference)}; wanted a "
+            "name and 32 bits"
+        )
+    return Variable(name, reference, _size(variable, path), variable.causality or "local")
+
+
+def _size(variable: Any, path: Path) -> int:  # noqa: ANN401 - as above
+    size = 1
     for dimension in variable.dimensions or ():
-        start = dimension.start if dimension.start is not None else dimension.variable.start
+        start = dimension.start if dimension.start is not None else getattr(dimension.variable, "start", None)
         if start is None:
             raise ValueError(
                 f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value"
             )
-        sizes.append(int(start))
-    return prod(sizes)
+        try:
+            size *= int(start)
+        except (TypeError, ValueError):
+            size = -1
+        if not 0 <= size <= MAX_NUMBERS:
+            raise ValueError(
+                f"fmu file {path}: the size of {_line(repr(variable.name))} must be a whole number up to "
+                f"{MAX_NUMBERS:,}, got {_line(start)}"
+            )
+    return size

@@ -19,18 +19,25 @@ def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN40
     """
     import fmpy  # noqa: PLC0415 - see parse_description
 
+    wanted = f"{description.identifier}{fmpy.sharedLibraryExtension}"
+    binaries = root / "binaries"
     for folder in (fmpy.platform_tuple, fmpy.platform)[: 2 if description.version == 2 else 1]:
-        file = root / "binaries" / folder / f"{description.identifier}{fmpy.sharedLibraryExtension}"
-        if file.is_file():
+        file = binaries / folder / wanted
+        if file.is_file() and file.resolve().is_relative_to(root.resolve()):
             try:
                 return ctypes.CDLL(str(file)) if not description.once_per_process else _load_copy(file)
             except OSError as error:
                 raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
-    binaries = root / "binaries"
-    there = sorted(folder.name for folder in binaries.iterdir()) if binaries.is_dir() else []
+        if file.parent.is_dir():
+            there = ", ".join(sorted(each.name for each in file.parent.iterdir())) or "nothing"
+            raise ValueError(
+                f"fmu file {description.path} has no library for this machine; "
+                f"wanted binaries/{folder}/{wanted}, it has there: {there}"
+            )
+    there = ", ".join(sorted(folder.name for folder in binaries.iterdir())) if binaries.is_dir() else ""
     raise ValueError(
         f"fmu file {description.path} has no library for this machine; "
-        f"wanted {fmpy.platform_tuple}, it has: {', '.join(there) or 'none'}"
+        f"wanted {fmpy.platform_tuple}, it has: {there or 'none'}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Tests of the offline fits, of their cache and of the file that holds the networks."""
+"""Tests of the offline fits and of the file that holds the networks."""
 
 import dataclasses
 
@@ -15,7 +15,6 @@ from servobench.controllers.networks.fit import (
     obtain_networks,
     ridge_path,
     train,
-    train_cached,
     training_digest,
 )
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
@@ -170,17 +169,6 @@ def test_the_step_scales_the_gains_that_are_imitated():
     np.testing.assert_allclose(two.gain, 2.0 * one.gain, rtol=1e-12)
     np.testing.assert_allclose(two.posture_step, 2.0 * one.posture_step, rtol=1e-12)
     assert train(of_step(0.1), planar_jacobian, SPEC).controller.step == 0.1
-
-
-def test_the_cache_trains_once_for_each_configuration_and_model(tmp_path, networks):
-    first = train_cached(CONFIG, planar_jacobian, SPEC, tmp_path)
-    told = []
-    second = train_cached(CONFIG, planar_jacobian, SPEC, tmp_path, lambda share, what: told.append(what))
-    assert told == []
-    np.testing.assert_array_equal(first.controller.weights, second.controller.weights)
-    np.testing.assert_array_equal(networks.jacobian.weights, second.jacobian.weights)
-    train_cached(CONFIG, longer_jacobian, SPEC, tmp_path)
-    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_file_holds_all_of_the_networks(tmp_path, networks):

@@ -14,6 +14,7 @@ import pytest
 from kit.foreign_fmu import build_crane, describe_with
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench import Bench
+from servobench.plant.cache import cache_folder
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.fmu_plant import FmuConfig, mapped_entry
@@ -60,9 +61,8 @@ NAMES = {
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch) -> Path:
     """The folder below which FMUs are extracted, empty for each test."""
-    folder = tmp_path / "cache"
-    monkeypatch.setattr("servobench.plant.fmu.archive.user_cache_dir", lambda *_: str(folder))
-    return folder
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return cache_folder("extracted")
 
 
 def crane(tmp_path: Path, version: int, config: FmuConfig = QUIET, **changes) -> Bench:
@@ -270,7 +270,7 @@ def test_an_fmu_is_extracted_once_and_again_where_its_content_changes(tmp_path, 
     copy = tmp_path / "copy.fmu"
     copy.write_bytes(path.read_bytes())
     assert extract_fmu(path) == extract_fmu(copy) == folder
-    assert [each.parent for each in (cache / "extracted").iterdir()] == [folder.parent]
+    assert [each for each in cache.iterdir() if each.is_dir()] == [folder.parent]
     build_crane(path, 3)
     changed = extract_fmu(path)
     assert changed != folder
@@ -309,7 +309,7 @@ def test_what_cannot_be_extracted_leaves_nothing_behind(tmp_path, cache):
     path.write_bytes(content)
     with pytest.raises(ValueError, match="cannot be extracted"):
         extract_fmu(path)
-    assert list((cache / "extracted").iterdir()) == []
+    assert list(cache.iterdir()) == []
 
 
 def resident() -> int:

@@ -1,0 +1,139 @@
+"""The user's cache folder: entries that are made once, verify themselves, and are made anew where they are damaged.
+
+    <cache>/servobench/<kind>/<key>/files/...     what was made
+    <cache>/servobench/<kind>/<key>/seal.json     the SHA-256 of each of these files
+
+An entry appears whole or not at all, whoever else makes it at the same time. A process verifies it once, so that a
+flipped bit or a file cut short never reaches a run. Entries that were not used for long are removed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+from platformdirs import user_cache_path
+
+FILES: Final = "files"
+SEAL: Final = "seal.json"
+UNFINISHED: Final = ".unfinished-"
+MAX_ENTRIES: Final = 32  # of a kind that are kept where they are older than `MIN_AGE`
+MIN_AGE: Final = 24 * 3600.0  # [s] since its last use, below which an entry is never removed
+MAX_AGE: Final = 90 * 24 * 3600.0  # [s] since its last use, above which an entry is removed
+
+_verified: set[Path] = set()
+
+
+def cache_folder(kind: str) -> Path:
+    """Return the folder of all entries of a kind, such as "networks"."""
+    return user_cache_path("servobench") / kind
+
+
+def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
+    """Return the folder with the files of an entry; they are made where they are missing or damaged.
+
+    Args:
+        kind: of the entry.
+        key: a name for all that the files depend on.
+        make: writes the files into an empty folder.
+
+    Raises:
+        ValueError: the cache folder cannot be written; besides, what `make` raises.
+    """
+    entry = cache_folder(kind) / key
+    if entry not in _verified or not entry.is_dir():
+        if not is_whole(entry):
+            _make(entry, make)
+        _verified.add(entry)
+        with contextlib.suppress(OSError):  # of a cache that may only be read
+            os.utime(entry)
+    return entry / FILES
+
+
+def is_whole(entry: Path) -> bool:
+    """Return whether the files of an entry are there as they were made; others may have come beside them."""
+    try:
+        sums = json.loads((entry / SEAL).read_text(encoding="utf-8"))
+        return bool(sums) and all(_sum(entry / FILES / name) == wanted for name, wanted in sums.items())
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def _make(entry: Path, make: Callable[[Path], object]) -> None:
+    """Make an entry beside its place and move it there; nothing is left where that fails."""
+    kind = entry.parent
+    try:
+        kind.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=kind))
+        try:
+            (fresh / FILES).mkdir()
+            make(fresh / FILES)
+            _seal(fresh)
+            with _alone(kind):
+                if not is_whole(entry):  # else another process was faster
+                    _remove(entry)
+                    fresh.rename(entry)
+                _prune(kind)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    except OSError as error:
+        raise ValueError(
+            f"cache folder {kind} cannot be written: {error.strerror or error}; make room there, "
+            "or let XDG_CACHE_HOME name another place"
+        ) from error
+
+
+def _seal(entry: Path) -> None:
+    files = [path for path in sorted((entry / FILES).rglob("*")) if path.is_file()]
+    sums = {path.relative_to(entry / FILES).as_posix(): _sum(path) for path in files}
+    (entry / SEAL).write_text(json.dumps(sums, indent=1), encoding="utf-8")
+
+
+def _sum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _remove(entry: Path) -> None:
+    """Remove an entry so that no process meets a part of it under its name."""
+    if entry.exists():
+        aside = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=entry.parent))
+        with contextlib.suppress(FileNotFoundError):
+            entry.rename(aside / entry.name)
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _prune(kind: Path) -> None:
+    """Remove entries that were not used for long, and what processes left that were killed while they made one."""
+    now, ages = time.time(), dict[Path, float]()
+    for path in kind.iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            ages[path] = now - path.stat().st_mtime
+    entries = sorted((path for path in ages if path.is_dir()), key=lambda path: ages[path])
+    for place, entry in enumerate(entries):
+        unfinished = entry.name.startswith(UNFINISHED)
+        if ages[entry] > MAX_AGE or (ages[entry] > MIN_AGE and (unfinished or place >= MAX_ENTRIES)):
+            _remove(entry)
+
+
+@contextlib.contextmanager
+def _alone(kind: Path) -> Iterator[None]:
+    """Keep other processes from moving entries of a kind meanwhile, where the system can."""
+    with (kind / ".lock").open("a") as file, contextlib.ExitStack() as stack:
+        try:
+            import fcntl  # noqa: PLC0415 - not on Windows
+        except ImportError:
+            pass
+        else:
+            with contextlib.suppress(OSError):  # of a file system without locks
+                fcntl.flock(file, fcntl.LOCK_EX)
+                stack.callback(fcntl.flock, file, fcntl.LOCK_UN)
+        yield
