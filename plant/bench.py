@@ -4,8 +4,8 @@
     frame(k) = see(k) + σ N(0, 1),          the observation at k holds frame(k − l), or the last valid one if it is lost
 
 with the command delay d and the latency l; where they are no multiples of the control period, the world advances in
-sub-steps (`servobench.plant.timing`). Many runs side by side share one bench: their arrays have a leading axis, and
-each run has random streams of its own.
+sub-steps (`servobench.plant.timing`). What else may happen to a frame is in `servobench.plant.noise`. Many runs side
+by side share one bench: their arrays have a leading axis, and each run has random streams of its own.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FeatureLost, RunFault
 from servobench.plant.lanes import take, where
+from servobench.plant.noise.sensor import Sensor
 from servobench.plant.plant import ImageArray, Plant, PlantSetup, TrueModel
-from servobench.plant.seeds import Seeds, Stream
+from servobench.plant.seeds import Seeds
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.signals import BoolArray, Command, Observation, Truth, trusted_observation
 from servobench.plant.timing import Timing, common_step
@@ -34,12 +35,12 @@ class Frame(NamedTuple):
     """A frame on its way to the controller.
 
     Attributes:
-        due: number of the sub-step after which it is delivered.
+        due: number of the sub-step after which it is delivered; with jitter, (...) and no whole number.
         feature: (..., m).
         arrives: (...), whether it will arrive.
     """
 
-    due: int
+    due: int | FloatArray
     feature: FloatArray
     arrives: BoolArray
 
@@ -53,7 +54,7 @@ class BenchState:
         commands: commands under way, oldest first, one a control period.
         frames: frames under way, oldest first.
         held: (..., m), the last valid feature.
-        streams: of the noise and of the lost frames.
+        sensor: its random streams, and the outliers and occlusions that last.
         world: what the world saved.
     """
 
@@ -61,7 +62,7 @@ class BenchState:
     commands: tuple[FloatArray, ...]
     frames: tuple[Frame, ...]
     held: FloatArray
-    streams: tuple[Stream, Stream]
+    sensor: Sensor
     world: Any
 
 
@@ -84,9 +85,9 @@ class Bench(Plant):
         """
         self.world = world
         self._sensing, self._command_delay = sensing, command_delay
-        self._noise_scale = sensing.noise_factor * sensing.feature_noise
         spec = world.spec
         self._period = spec.period if period is None else period
+        self._step = spec.period
         self._timing = Timing.of(self._period, spec.period, command_delay, sensing)
         self.spec = spec if self._timing.steps == 1 else replace(spec, period=self._period)
         self._lower, self._upper = spec.command.lower, spec.command.upper
@@ -103,7 +104,7 @@ class Bench(Plant):
             mask.setflags(write=False)
 
     def reset(self, seed: Seeds) -> Observation:
-        """Return to the start; feature noise and lost frames get random streams of their own. See `Plant.reset`.
+        """Return to the start; all that the sensor draws gets random streams of its own. See `Plant.reset`.
 
         Args:
             seed: non-negative; a sequence of one for each of the runs side by side.
@@ -113,8 +114,8 @@ class Bench(Plant):
         """
         if np.shape(seed) != self.world.lead:
             raise ValueError(f"seed must have shape {self.world.lead}, got {np.shape(seed)}")
-        self._noise = Stream(seed, "feature_noise", "standard_normal", (self.spec.m,), self._noise_scale)
-        self._losses = Stream(seed, "dropped_frames", "random")
+        interval = self._timing.frames * self._step
+        self._sensor = Sensor(self._sensing, self.spec.m, interval, seed, self.world.lead)
         joints = self.world.reset(seed)
         first = self._expose()
         if first is None:
@@ -140,13 +141,15 @@ class Bench(Plant):
         for i, delay in enumerate(timing.delays, self._k * timing.steps + 1):
             joints = self.world.advance(self._commands[-1 - delay])
             if timing.exposes(i):
-                self._frames.append(self._sent(i + timing.latency))
+                self._frames.append(self._sent(i))
         self._commands.popleft()
         self._k += 1
         return self._observation(joints, *self._delivered(self._k * timing.steps))
 
     def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
         """Return the feature of the newest frame that arrived since the last control instant, and where one did."""
+        if self._sensor.jitters:
+            return self._delivered_by_lane(now)
         feature, arrived = self._held, self._none_arrives
         while self._frames and self._frames[0].due <= now:
             _, newer, arrives = self._frames.popleft()
@@ -154,6 +157,16 @@ class Bench(Plant):
                 feature, arrived = newer, arrives
             else:
                 feature, arrived = where(arrives, newer, feature), np.logical_or(arrived, arrives)
+        return feature, arrived
+
+    def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
+        """Return the same where a frame is due at another time in each lane."""
+        feature, arrived, before = self._held, self._none_arrives, now - self._timing.steps
+        for due, newer, arrives in self._frames:
+            fresh = np.logical_and(arrives, np.logical_and(before < due, due <= now))
+            feature, arrived = where(fresh, newer, feature), np.logical_or(arrived, fresh)
+        while self._frames and np.all(self._frames[0].due <= now):
+            self._frames.popleft()
         return feature, arrived
 
     def _observation(self, joints: FloatArray, feature: FloatArray, arrives: BoolArray) -> Observation:
@@ -168,18 +181,17 @@ class Bench(Plant):
         return trusted_observation(time, joints, feature, arrives, valid)
 
     def _expose(self) -> FloatArray | None:
-        """Return the feature as seen now, (..., m), with the bench's noise; None if it is not found."""
+        """Return the feature as seen now, (..., m), with what the sensor adds; None if it is not found."""
         feature = self.world.see()
-        if feature is not None and self._noise_scale > 0.0:
-            feature = feature + self._noise.next()
-        return feature
+        return None if feature is None else self._sensor.measured(feature)
 
-    def _sent(self, due: int) -> Frame:
-        """Return the frame that is exposed now, with whether it will arrive."""
-        feature, arrives, probability = self._expose(), self._all_arrive, self._sensing.drop_probability
-        if probability > 0.0:
-            lost = self._losses.next() < probability
-            arrives = np.logical_not(lost) if lost.any() else arrives
+    def _sent(self, step: int) -> Frame:
+        """Return the frame that is exposed after a sub-step, with whether it will arrive."""
+        feature, missing = self._expose(), self._sensor.missing(step * self._step)
+        arrives = self._all_arrive if missing is None else np.logical_not(missing)
+        due: int | FloatArray = step + self._timing.latency
+        if self._sensor.jitters:
+            due = self._sensor.due(step + self._timing.latency, self._step)
         return Frame(due, self._held, self._none_arrives) if feature is None else Frame(due, feature, arrives)
 
     def truth(self) -> Truth:
@@ -188,8 +200,8 @@ class Bench(Plant):
 
     def save(self) -> BenchState:
         """See `Plant.save`."""
-        streams = copy.deepcopy((self._noise, self._losses))
-        return BenchState(self._k, tuple(self._commands), tuple(self._frames), self._held, streams, self.world.save())
+        sensor = copy.deepcopy(self._sensor)
+        return BenchState(self._k, tuple(self._commands), tuple(self._frames), self._held, sensor, self.world.save())
 
     def restore(self, state: BenchState) -> None:
         """See `Plant.restore`.
@@ -202,7 +214,7 @@ class Bench(Plant):
         self.world.restore(state.world)
         self._k, self._held = state.period, state.held
         self._commands, self._frames = deque(state.commands), deque(state.frames)
-        self._noise, self._losses = copy.deepcopy(state.streams)
+        self._sensor = copy.deepcopy(state.sensor)
 
     @property
     def faults(self) -> Mapping[int, RunFault]:  # type: ignore[override]
@@ -215,8 +227,7 @@ class Bench(Plant):
             super().keep(lanes)
         self.world.keep(lanes)
         self._size_masks()
-        self._noise.keep(lanes)
-        self._losses.keep(lanes)
+        self._sensor.keep(lanes)
         commands, frames, self._held = take((tuple(self._commands), tuple(self._frames), self._held), lanes)
         self._commands, self._frames = deque(commands), deque(frames)
 

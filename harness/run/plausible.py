@@ -39,6 +39,7 @@ def check_times(resolved: ResolvedRun, duration: float) -> None:
     times = {f"{plant}.command_delay": getattr(resolved.plant, "command_delay", 0.0)}
     if isinstance(sensing, SensingConfig):
         times[f"{plant}.sensing.latency"] = sensing.latency
+        times[f"{plant}.sensing.jitter"] = sensing.jitter
         times[f"{plant}.sensing.frame_period"] = sensing.frame_period
     for name, time in times.items():
         if isinstance(time, float) and time > 0.0 and time >= duration:

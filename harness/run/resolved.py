@@ -23,7 +23,7 @@ from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.harness.run.teaching import taught
 from servobench.plant.robot.robot import Robot
-from servobench.plant.sensing import vary_sensing
+from servobench.plant.sensing import change_sensing, vary_sensing
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,14 @@ def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:
     """Return `request` with its settings out of those that `resolve_sections` returned.
 
     Raises:
-        ConfigurationError: a noise factor or latency for a plant that has no such setting, or a number that is out of
-            its bounds.
+        ConfigurationError: a noise factor, latency or axis of the sensor for a plant that has no such setting, or a
+            number that is out of its bounds.
     """
     plant, run = sections[request.plant], sections["run"]
-    if request.noise_factor != 1.0 or request.latency is not None:
+    if request.noise_factor != 1.0 or request.latency is not None or request.mismatch.sensor:
         try:
             plant = vary_sensing(plant, request.noise_factor, request.latency)
+            plant = change_sensing(plant, request.mismatch.disturbed)
         except ValueError as error:
             raise ConfigurationError(f"plant {request.plant}: {error}") from error
     if request.period is not None:

@@ -37,7 +37,7 @@ def side_by_side_key(run: ResolvedRun) -> Hashable | None:
         return None
     moved = request.mismatch.size("camera_move") > 0.0
     names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved, request.robot
-    return (*names, id(run.run), id(run.controller), id(run.task))
+    return (*names, request.mismatch.sensor, id(run.run), id(run.controller), id(run.task))
 
 
 def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Together:

@@ -3,7 +3,8 @@
 A mismatch is written as words joined by `+`: a profile (`none`, `factory`, `moderate`, `severe`), single axes with a
 magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20mm`, `gear_ratio=5%`,
 `camera_move=90deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file
-(`factory=FILE`; without a file, that of one real UR5).
+(`factory=FILE`; without a file, that of one real UR5). Words for the sensor (`outliers=40%`; see
+`servobench.plant.noise.axes`) stand among the axes; they change settings of the plant and draw no robot.
 
 Links, joint offsets, gear ratios and the three components of the tool offset are each drawn uniformly from plus or
 minus the magnitude. The camera turns about an axis drawn at random; by an angle drawn from plus or minus the
@@ -26,10 +27,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.noise.axes import SENSOR_AXES, disturbed
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.measured import measured_arm
 from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_generator
+from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import nearest, suggest
 
 MAX_TILT = radians(45.0)
@@ -45,7 +48,11 @@ AXES = {
     "tool": (LENGTH, "20mm"),
     "gear_ratio": (SHARE, "5%"),
     "camera_move": (ANGLE, "90deg"),
+    **{name: (axis.units, axis.example) for name, axis in SENSOR_AXES.items()},
 }
+RANGES = {
+    "%": "0:30:10%", "deg": "0:180:30deg", "mm": "0:60:20mm", "ms": "0:200:50ms", "": "1:2:0.5",
+}  # fmt: skip
 PROFILES: dict[str, dict[str, float]] = {
     "none": {},
     "factory": {},
@@ -138,10 +145,13 @@ class Mismatch:
             if [name for name, _ in self.axes].count(axis) > 1:
                 raise ValueError(f"mismatch {str(self)!r} has the axis {axis} twice; give it once")
             size = magnitude.size(axis)
+            if axis in SENSOR_AXES:
+                continue
             if AXES[axis][0] is SHARE:
                 check_number(axis, size, at_least=0.0, below=1.0)
             else:
                 check_number(axis, size, at_least=0.0, at_most=1.0 if AXES[axis][0] is LENGTH else math.pi)
+        self.disturbed(SensingConfig())
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -184,6 +194,19 @@ class Mismatch:
         return given[axis].size(axis) if axis in given else PROFILES.get(self.profile, {}).get(axis, 0.0)
 
     @property
+    def sensor(self) -> tuple[tuple[str, Magnitude], ...]:
+        """The axes of the sensor."""
+        return tuple((axis, magnitude) for axis, magnitude in self.axes if axis in SENSOR_AXES)
+
+    def disturbed(self, sensing: SensingConfig) -> SensingConfig:
+        """Return the settings of a sensor with the axes of the sensor put on top.
+
+        Raises:
+            ValueError: a magnitude out of the bounds of its setting, or two families of noise.
+        """
+        return disturbed(sensing, ((axis, magnitude.size(axis)) for axis, magnitude in self.sensor))
+
+    @property
     def camera_exact(self) -> bool:
         """Whether the camera turns by exactly `camera_rotation`, not by an angle drawn below it."""
         return any(axis == "camera_rotation" for axis, _ in self.axes)
@@ -201,11 +224,11 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
     """
     if axis not in AXES:
         raise ValueError(f"unknown mismatch axis {axis!r}: {suggest(axis, AXES)}")
-    example = {"%": "30:10%", "deg": "180:30deg", "mm": "60:20mm"}[re.sub("[0-9.]", "", AXES[axis][1])]
+    example = RANGES[re.sub("[0-9.]", "", AXES[axis][1])]
     number = r"[0-9]*\.?[0-9]+"
     match = re.fullmatch(rf"({number}(?::{number}:{number}|(?:/{number})*))\s*([a-z%]*)", text.strip())
     if match is None:
-        raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}=0:{example}; got {text!r}")
+        raise ValueError(f"{axis} needs begin:end:step with a unit, such as {axis}={example}; got {text!r}")
     numbers = [float(part) for part in re.split("[:/]", match[1])]
     if ":" in match[1]:
         begin, end, step = numbers

@@ -48,6 +48,16 @@ def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
     np.testing.assert_equal(rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]])
 
 
+def test_runs_with_a_disturbed_sensor_go_side_by_side_but_not_with_others():
+    words = "moderate+stable=1.3+outliers=20%+occlusions=10%+jitter=80ms"
+    together = runs("ukf_mfac:published", {"random": {"duration": 2.5}}, mismatch=words)
+    assert together[0].plant.sensing.outliers == 0.2
+    assert side_by_side_key(together[0]) != side_by_side_key(runs("ukf_mfac:published", {}, mismatch="moderate")[0])
+    alone = one_by_one(together)
+    assert len({row["valid_share"] if "valid_share" in row else row["rms_error"] for row in alone}) == len(SEEDS)
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+
+
 def test_probing_runs_go_side_by_side():
     together = runs("mfac+rls", {**ROUGH, **PROBED})
     np.testing.assert_equal(rows(carry_out_together(together)), one_by_one(together))

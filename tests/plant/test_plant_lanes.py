@@ -26,9 +26,15 @@ COMMANDS = np.random.default_rng(1).uniform(-1.5, 1.5, (PERIODS, 3, 6))
 MOVED = np.array([mismatched("camera_rotation=40deg", seed).X_BC for seed in SEEDS])
 WORST = {"command_delay": 0.15, "latency": 0.1, "drop_probability": 0.2}
 FINE = {"command_delay": 0.13, "latency": 0.07, "frame_period": 0.03, "drop_probability": 0.3}  # sub-steps of 10 ms
+DISTURBED = {
+    "noise": "stable", "latency": 0.05, "jitter": 0.09, "outliers": 0.3, "outlier_duration": 0.2, "quantum": 1e-4,
+    "occlusions": 0.2, "occlusion_duration": 0.3, "occlusion_windows": ((1.2, 1.4),),
+}  # fmt: skip
 
 
-@pytest.fixture(params=[("kinematic", WORST), ("fmu", WORST), ("kinematic", FINE), ("fmu", FINE)])
+@pytest.fixture(
+    params=[("kinematic", WORST), ("fmu", WORST), ("kinematic", FINE), ("fmu", FINE), ("kinematic", DISTURBED)]
+)
 def build(request):
     """Return a function that builds a plant for one lane or for an array of lanes, under bad sensing."""
     name, settings = request.param
@@ -82,7 +88,7 @@ def test_an_arm_has_the_same_bits_alone_and_among_others():
 
 def test_a_lane_has_the_same_bits_alone_in_another_order_and_after_others_were_dropped(build):
     alone = [walk(build(lane), lane) for lane in range(3)]
-    assert 0.1 < 1.0 - np.mean(alone[0][2]) < 0.3
+    assert 0.1 < 1.0 - np.mean(alone[0][2]) < 0.4
     order = np.array([2, 0, 1])
     for chosen in (np.arange(3), order):
         walked = walk(build(chosen), chosen)

@@ -16,6 +16,7 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.plant import Plant, PlantSetup
 from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.sensing import without_disturbance
 from servobench.plant.signals import Command
 
 OFFSET = 1e-4  # [m] of the desired feature in each axis, from which the motions begin
@@ -77,9 +78,7 @@ class SmallLoop:
 
     def _plant(self, latency: float | None) -> Plant:
         late = self.latency if latency is None else latency
-        sensing = replace(
-            self._config.sensing, feature_noise=0.0, drop_probability=0.0, latency=round(late, TIME_DIGITS)
-        )
+        sensing = replace(without_disturbance(self._config.sensing), latency=round(late, TIME_DIGITS))
         setup = PlantSetup(self._model, self._rest.joint_position, self._period)
         return build_kinematic(replace(self._config, sensing=sensing), setup)
 
