@@ -18,6 +18,7 @@ from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
+from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.own import OwnController, own_object
 from servobench.harness.config.registry import choose_controller, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
@@ -90,6 +91,8 @@ def compare(
     out: Path | str | None = None,
     workers: int = 1,
     run_timeout: float | None = None,
+    run_memory: float | None = None,
+    isolate: bool = False,
     resume: bool = False,
 ) -> pd.DataFrame:
     """Carry out every combination of plants, tasks, mismatches, controllers and seeds.
@@ -107,7 +110,9 @@ def compare(
         settings: section -> key -> value.
         out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
         workers: number of processes.
-        run_timeout: [s] time limit of a run; None for no limit.
+        run_timeout: [s] time limit of a run; None for the usual one, if any.
+        run_memory: [bytes] memory limit of a run, likewise.
+        isolate: carry out code that is not servobench's in processes of its own, with limits, also with one worker.
         resume: carry out what is missing in `out`.
 
     Returns:
@@ -125,8 +130,9 @@ def compare(
         names = tuple(_name(each) for each in controllers)
         batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen, robot)
         if not _can_travel(offered(names)):
-            workers, run_timeout = 1, None
-        how, whole = Execution(workers, None, run_timeout, resume), Settings(settings or {})
+            workers, run_timeout, run_memory, isolate = 1, None, None, False
+        how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
+        whole = Settings(settings or {})
         if out is not None:
             carry_out(comparison(batch, whole), Path(out), how)
             return results.load_runs(Path(out))

@@ -4,9 +4,10 @@ The runs of a block advance together, one control period after the other, where 
 others go one by one. A run has the same row either way, but for the times of its steps, which only a run that goes by
 itself has.
 
-A block that kills its process (an FMU may) is carried out again run by run, so that only the run that did it is lost;
-so is a block that takes longer than the time limit of a single run. As a block is never slower than its runs one by
-one, that costs at most the time of the runs once more.
+A run that kills its process, takes too long or needs too much memory is a row; the runs before it in its block are
+kept, those after it go on. Of a block that advances together, each run is carried out again by itself; so is a run that
+may have suffered from an earlier one in the same process. As a block is never slower than its runs one by one, that
+costs at most the time of the runs once more.
 """
 
 from __future__ import annotations
@@ -16,25 +17,33 @@ import math
 import pickle
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator, Mapping
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
+from servobench.controllers.networks.fit import Progress
+from servobench.harness.batch.guard import LOST, End, Task, Tell
+from servobench.harness.batch.pool import Answer
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.own import OwnController
-from servobench.harness.config.registry import offering
+from servobench.harness.config.registry import (
+    find_controller,
+    find_plant,
+    is_foreign_controller,
+    is_foreign_plant,
+    offering,
+)
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run import episode
-from servobench.harness.run.ending import CRASHED, TIMED_OUT, Ending
+from servobench.harness.run.ending import CRASHED, Ending, ends_batch
 from servobench.harness.run.episode import RunResult, failed
+from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun
 
 BLOCK: Final = 128  # [runs] that advance together: more of them leave the cache of a processor
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
-LOST: Final = "the run killed the process that carried it out"
 
 
 @dataclass(frozen=True)
@@ -55,6 +64,12 @@ class Job:
     run: ResolvedRun
     kind: Hashable | None = None  # runs of one kind may advance together; None: the run goes by itself
 
+    @property
+    def owner(self) -> str:
+        """Whose code the run carries out: the names of its plant and controller; empty for that of this package."""
+        plant, controller = self.cell.request.plant, self.cell.request.controller
+        return f"{plant} {controller}" if is_foreign_plant(plant) or is_foreign_controller(controller) else ""
+
 
 @dataclass(frozen=True)
 class Block:
@@ -63,6 +78,7 @@ class Block:
     jobs: tuple[Job, ...]
     own: tuple[OwnController, ...] = ()
     together: bool = False  # whether the runs advance together
+    fresh: bool = False  # whether they want a process in which no run has been
 
     @property
     def index(self) -> int:
@@ -73,6 +89,10 @@ class Block:
         """Return each run as a block of its own."""
         return [Block((job,), self.own) for job in self.jobs]
 
+    def part(self, begin: int, end: int | None = None, *, fresh: bool = False) -> Block:
+        """Return some of the runs as a block."""
+        return replace(self, jobs=self.jobs[begin:end], fresh=fresh)
+
 
 def even_size(count: int, workers: int, most: int = BLOCK) -> int:
     """Return how many of `count` runs to put into a block: at most `most`, and the same share for all workers."""
@@ -81,7 +101,7 @@ def even_size(count: int, workers: int, most: int = BLOCK) -> int:
 
 
 def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[OwnController, ...] = ()) -> Iterator[Block]:
-    """Yield jobs in blocks of one kind and consecutive indices.
+    """Yield jobs in blocks of one kind, one owner and consecutive indices.
 
     Args:
         jobs: the runs, in the order of their indices.
@@ -93,7 +113,8 @@ def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[OwnContro
     for job in jobs:
         most = chunk if job.kind is None else size
         last = gathered[-1] if gathered else job
-        if gathered and (len(gathered) >= most or job.index != last.index + 1 or job.kind != last.kind):
+        follows = job.index == last.index + 1 and job.kind == last.kind and job.owner == last.owner
+        if gathered and (len(gathered) >= most or not follows):
             yield Block(tuple(gathered), own, last.kind is not None)
             gathered = []
         gathered.append(job)
@@ -115,43 +136,47 @@ def carry_out_blocks(
     """
     if workers.submit is None or debug:
         for block in blocks:
-            yield block, _carry_out(block, steps, keep, debug)
+            results: list[RunResult] = []
+            _carry_out(block, results.append, steps, keep, debug)
+            yield block, results
         return
     waiting, again = iter(blocks), deque[Block]()
     finished: SimpleQueue[tuple[Block, Any]] = SimpleQueue()
     under_way = 0
     while True:
-        while under_way < workers.window and (task := again.popleft() if again else next(waiting, None)):
-            future = workers.submit(_unpack, _pack(task, steps, keep))
-            future.add_done_callback(lambda done, task=task: finished.put((task, done)))
+        while under_way < workers.window and (given := again.popleft() if again else next(waiting, None)):
+            packed = _pack(given, steps, keep)
+            future = workers.submit(Task(_carry_out_packed, packed, given.jobs[0].owner, given.fresh))
+            future.add_done_callback(lambda done, block=given: finished.put((block, done)))
             under_way += 1
         if not under_way:
             return
         block, future = finished.get()
         under_way -= 1
-        outcome = _outcome(block, future, workers)
-        if outcome is None:
-            again.extend(block.singly())
-        else:
-            yield block, outcome
+        done, rest = _outcome(block, future, workers)
+        again.extend(rest)
+        if done:
+            yield block.part(0, len(done)), done
 
 
-def _outcome(block: Block, future: Any, workers: Workers) -> list[RunResult] | None:  # noqa: ANN401 - of pebble or Dask
-    """Return the results of a block; None if it died with several runs, which are to be carried out one by one."""
+def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResult], list[Block]]:  # noqa: ANN401 - or Dask's
+    """Return the results of the first runs of a block, and in blocks the runs that are still to be carried out."""
     try:
-        answer: list[RunResult] | Ending = future.result()
+        answer: Answer = future.result()
     except workers.lost:
-        answer = Ending(CRASHED, LOST)
-    except TimeoutError:
-        answer = Ending(TIMED_OUT, f"the run took longer than {workers.run_timeout:g} s")
-    except BrokenProcessPool as error:
-        raise ConfigurationError(
-            "the worker processes cannot be started; a script that starts several must keep its calls below "
-            "`if __name__ == '__main__':`"
-        ) from error
-    if not isinstance(answer, Ending):
-        return answer
-    return [_failed(block.jobs[0].cell, answer)] if len(block.jobs) == 1 else None
+        answer = Answer([], End(Ending(CRASHED, LOST), certain=True))
+    done, end = list(answer.items), answer.end
+    if done and isinstance(done[0], Ending):
+        return [_failed(job.cell, done[0]) for job in block.jobs], []
+    if end is None:
+        return done, []
+    if not done and len(block.jobs) > 1 and block.together:
+        return [], block.singly()
+    single = replace(block, together=False)
+    if not end.certain:
+        return done, [single.part(len(done), fresh=True)]
+    done.append(_failed(block.jobs[len(done)].cell, end.ending))
+    return done, [single.part(len(done))] if len(done) < len(block.jobs) else []
 
 
 def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
@@ -163,33 +188,92 @@ def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
         raise ConfigurationError(f"{what}: {error}; use one worker") from error
 
 
-def _unpack(task: bytes) -> list[RunResult] | Ending:
-    """Carry out a task in a worker; where it cannot be read, such as without its plug-in, return why."""
+def build_block(block: Block, workers: Workers, progress: Progress) -> None:
+    """Build the run of a block in a worker and throw it away, as `build_once` does here.
+
+    Args:
+        block: one run.
+        workers: processes of this machine.
+        progress: called with the share of a training of networks that is done.
+
+    Raises:
+        ConfigurationError: a setting that cannot be used. If the worker ends instead, the run will say so.
+    """
+    refused: list[str] = []
+
+    def hear(told: tuple[float, str] | str) -> None:
+        if isinstance(told, str):
+            refused.append(told)
+        else:
+            progress(*told)
+
+    if workers.submit is None:
+        raise ValueError("workers must have processes, got none")
+    workers.submit(Task(_build, _pack(block, False, None), block.jobs[0].owner), hear).result()
+    if refused:
+        raise ConfigurationError(refused[0])
+
+
+def _build(task: bytes, tell: Tell) -> None:
+    """Build a run in a worker and tell how far its networks are trained, and what is configured wrongly."""
+    block, *_ = _unpack(task)
+    with offering(block.own):
+        _load(block)
+        tell(None)
+        try:
+            build_once(block.jobs[0].run, lambda share, what: tell((share, what)))
+        except ConfigurationError as error:
+            tell(str(error))
+
+
+def _carry_out_packed(task: bytes, tell: Tell) -> None:
+    """Carry a block out in a worker; where it cannot be read, such as without its plug-in, tell why."""
     try:
-        sources, content = pickle.loads(task)
-        for source in sources:
-            source.load()  # so that the classes of its settings are found
-        block, steps, keep = pickle.loads(content)
+        block, steps, keep = _unpack(task)
     except Exception as error:  # noqa: BLE001 - of a plug-in
-        return Ending.of(error)
-    return _carry_out(block, steps, keep)
+        tell(Ending.of(error))
+        return
+    with offering(block.own):
+        _load(block)
+    tell(None)  # the time limit begins after what is imported once
+    _carry_out(block, tell, steps, keep)
 
 
-def _carry_out(block: Block, steps: bool, keep: Path | None, debug: bool = False) -> list[RunResult]:
+def _unpack(task: bytes) -> tuple[Block, bool, Path | None]:
+    sources, content = pickle.loads(task)
+    for source in sources:
+        source.load()  # so that the classes of its settings are found
+    unpacked: tuple[Block, bool, Path | None] = pickle.loads(content)
+    return unpacked
+
+
+def _load(block: Block) -> None:
+    """Import the plant and the controller of a block; of one that cannot be imported the row tells."""
+    request = block.jobs[0].cell.request
+    with contextlib.suppress(BaseException):
+        find_plant(request.plant)
+        find_controller(request.controller)
+
+
+def _carry_out(block: Block, tell: Tell, steps: bool, keep: Path | None, debug: bool = False) -> None:
+    """Carry a block out and tell the result of each run."""
     with offering(block.own):
         if block.together:
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
             with contextlib.suppress(Exception, SystemExit):
                 together = episode.carry_out_together([job.run for job in block.jobs], keep=keep)
-                return [_with_columns(job.cell, result) for job, result in zip(block.jobs, together, strict=True)]
-        return [_carry_out_run(job, steps, keep, debug) for job in block.jobs]
+                for job, result in zip(block.jobs, together, strict=True):
+                    tell(_with_columns(job.cell, result))
+                return
+        for job in block.jobs:
+            tell(_carry_out_run(job, steps, keep, debug))
 
 
 def _carry_out_run(job: Job, steps: bool, keep: Path | None, debug: bool) -> RunResult:
     try:
         result = episode.carry_out(job.run, steps=steps, picture=job.cell.picture, keep=keep, debug=debug)
-    except (Exception, SystemExit) as error:
-        if debug:
+    except BaseException as error:
+        if debug or ends_batch(error):
             raise
         return _failed(job.cell, Ending.of(error))  # whatever a plug-in does, the others go on
     return _with_columns(job.cell, result)

@@ -16,13 +16,23 @@ from typing import Any
 
 from servobench.harness.batch import results
 from servobench.harness.batch.asked import check_effects, difference
-from servobench.harness.batch.blocks import BLOCK, CHUNK, Cell, Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.blocks import (
+    BLOCK,
+    CHUNK,
+    Block,
+    Cell,
+    Job,
+    build_block,
+    carry_out_blocks,
+    cut,
+    even_size,
+)
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.lock import check_empty, locked
 from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.survey import Survey, survey
-from servobench.harness.batch.workers import Workers, open_workers
+from servobench.harness.batch.workers import Bounds, Workers, open_workers
 from servobench.harness.config.own import OwnController
 from servobench.harness.config.registry import offered
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -75,7 +85,7 @@ class Execution:
 
     workers: int | None = None  # number of processes; None for the number of processors
     scheduler: str | None = None  # address of a Dask scheduler; None for processes of this machine
-    run_timeout: float | None = None  # [s] time limit of a run; None for no limit
+    bounds: Bounds = field(default_factory=Bounds)  # what a run may take
     resume: bool = False  # carry out what is missing in the folder
     observer: Observer = field(default_factory=Observer)  # receives the progress
     block: int = BLOCK  # [runs] that advance together at most; 1: each by itself, with the times of its steps
@@ -102,21 +112,26 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     if not how.resume:
         check_empty(folder, can_resume=len(campaign.cells) > 1)
     runs = survey(Grid(_request, campaign.cells))
-    sections = check_campaign(campaign, runs, how.observer)
+    own = offered(runs.controllers)
+    bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
+    names = {"plants": runs.plants, "controllers": runs.controllers}
+    with open_workers(how.workers, how.scheduler, bounds, **names, own=own) as place:
+        _carry_out_at(place, campaign, runs, own, folder, how)
+
+
+def _carry_out_at(
+    place: Workers, campaign: Campaign, runs: Survey, own: tuple[OwnController, ...], folder: Path, how: Execution
+) -> None:
+    """Check and carry out a campaign at a place."""
+    sections = check_campaign(campaign, runs, how.observer, place)
     jobs = _Jobs(campaign, sections, together=how.block > 1 and not how.debug)
     side_by_side = jobs.side_by_side(runs.examples)
-    own = offered(runs.controllers)
     manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
     if how.resume:
         results.read_manifest(folder)
-    with (
-        open_workers(
-            how.workers, how.scheduler, how.run_timeout, plants=runs.plants, controllers=runs.controllers, own=own
-        ) as place,
-        locked(folder, new=not how.resume),
-    ):
+    with locked(folder, new=not how.resume):
         if how.resume:
             check_same_campaign(folder, manifest, how.observer)
         else:
@@ -126,10 +141,11 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
         results.collect(folder)
 
 
-def check_campaign(campaign: Campaign, runs: Survey, observer: Observer) -> dict[str, Any]:
+def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: Workers) -> dict[str, Any]:
     """Refuse what cannot be run, before anything is written; networks that are needed are trained.
 
-    The examples among the runs are built and thrown away.
+    The examples among the runs are built and thrown away; in a worker process where code of users is built, which may
+    fail as it likes: then its runs say so.
 
     Returns:
         The typed settings of the runs by section.
@@ -141,8 +157,13 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer) -> dict
     check_settings(campaign.settings, [*runs.plants, *runs.controllers, *runs.tasks])
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
-    for request in runs.examples:
-        build_once(select(request, sections), observer.training)
+    own = offered(runs.controllers)
+    for index, request in enumerate(runs.examples):
+        job = Job(index, Cell(request), select(request, sections))
+        if job.owner and place.submit is not None and not place.cluster:
+            build_block(Block((job,), own), place, observer.training)
+        else:
+            build_once(job.run, observer.training)
     return sections
 
 
@@ -215,10 +236,10 @@ def _carry_out_missing(
     blocks = cut(
         jobs.at(chain.from_iterable(gaps)),
         even_size(missing, place.count, how.block),
-        1 if campaign.steps or how.run_timeout is not None else CHUNK,
+        1 if campaign.steps else CHUNK,
         own,
     )
-    keep = folder if campaign.steps and place.local else None
+    keep = folder if campaign.steps and not place.cluster else None
     for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):
         results.write_part(folder, block.index, outcome)
         how.observer.finished([result.row for result in outcome])

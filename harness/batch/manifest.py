@@ -27,7 +27,6 @@ PACKAGES = (
     "casadi",
     "fmpy",
     "opencv-python-headless",
-    "pebble",
 )
 
 

@@ -1,55 +1,65 @@
 """Where runs are carried out: in this process, in worker processes of this machine, or on a Dask cluster.
 
-The one module that imports pebble and Dask. A pool of pebble replaces a single process that died, or that had to be
-ended because its task took too long; the other tasks are not affected.
+The one module that imports Dask.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import pickle
 import re
-import signal
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from multiprocessing import get_context
-from multiprocessing.synchronize import Semaphore
-from threading import Event
 from typing import Any, Final
 
-from pebble import ProcessExpired, ProcessPool
-
+from servobench.harness.batch.guard import Limits, Task
+from servobench.harness.batch.pool import Answer, Pool
+from servobench.harness.batch.processes import machine_memory
 from servobench.harness.config.own import OwnController
-from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.config.registry import is_foreign_controller, is_foreign_plant, own_modules
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.config.source import SourceFile
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
-MAX_START_TIME: Final = 10.0  # [s], that a process may take to start before it is stopped all the same
 TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
+FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
+FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all runs of foreign code that go at a time
+LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] that each of them has at least
+MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
 
 
 @dataclass(frozen=True)
 class Workers:
     """A place where runs are carried out."""
 
-    submit: Callable[..., Any] | None = None  # as `submit` of an executor; None: runs stay in this process
+    submit: Callable[..., Any] | None = None  # takes a `Task` and returns a future; None: runs stay in this process
     count: int = 1  # number of tasks that are carried out at a time
+    cluster: bool = False  # whether runs happen on other machines
     lost: tuple[type[BaseException], ...] = ()  # what a future raises if the process that carried out its task died
-    run_timeout: float | None = None  # [s] time limit of a task; None for no limit
 
     @property
     def window(self) -> int:
         """How many tasks are handed out at a time."""
         return TASKS_PER_WORKER * self.count
 
-    @property
-    def local(self) -> bool:
-        """Whether all runs happen on this machine, where they can read and write its files."""
-        return self.submit is None or ProcessExpired in self.lost
+
+@dataclass(frozen=True)
+class Bounds:
+    """What the runs of a batch may take, and whether code of users is kept out of this process."""
+
+    run_timeout: float | None = None  # [s] time limit of a run, inf for none; None for the usual one
+    run_memory: float | None = None  # [bytes] memory limit of a run, inf for none; None for the usual one
+    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in processes of their own, with limits
+
+    def limits(self, count: int, *, foreign: bool) -> Limits:
+        """Return the limits of a run where `count` go at a time; foreign code has some also where none are given."""
+        time, memory = self.run_timeout, self.run_memory
+        if foreign:
+            time = FOREIGN_TIME if time is None else time
+            memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine_memory() / count) if memory is None else memory
+        return Limits(None if time in (None, math.inf) else time, None if memory in (None, math.inf) else int(memory))
 
 
 def default_workers() -> int:
@@ -58,11 +68,20 @@ def default_workers() -> int:
     return min(MAX_DEFAULT_WORKERS, available)
 
 
+def can_travel(own: Sequence[OwnController]) -> bool:
+    """Return whether a worker process can receive controllers that users gave."""
+    try:
+        pickle.dumps(own)
+    except Exception:  # noqa: BLE001 - code of users may raise anything
+        return False
+    return True
+
+
 @contextlib.contextmanager
 def open_workers(
     count: int | None = None,
     scheduler: str | None = None,
-    run_timeout: float | None = None,
+    bounds: Bounds = Bounds(),
     *,
     plants: Iterable[str] = (),
     controllers: Iterable[str] = (),
@@ -71,82 +90,39 @@ def open_workers(
     """Yield workers; their processes start with the first task and end with the context.
 
     Args:
-        count: number of processes on this machine; with 1 and no time limit runs are carried out in this process.
-            None for the number of processors.
+        count: number of processes on this machine; with 1, methods of this package on its plants are carried out in
+            this process unless a limit is given. None for the number of processors.
         scheduler: address of a Dask scheduler, such as "tcp://127.0.0.1:8786"; None for processes of this machine.
-        run_timeout: [s] time limit of a run, after which its process is ended; None for no limit.
-        plants: names of plants that a process imports before its first run, outside the time limit.
-        controllers: names of controllers, likewise.
-        own: controllers that users gave, likewise.
+        bounds: what a run may take.
+        plants: names of the plants of the runs.
+        controllers: names of the controllers.
+        own: controllers that users gave.
 
     Raises:
-        ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a time limit is
-            asked for on a cluster.
+        ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a limit is asked
+            for on a cluster.
     """
     if scheduler is not None and count is not None:
         raise ConfigurationError("--workers are processes of this machine; with --scheduler the cluster has its own")
     count = count or default_workers()
     if scheduler is not None:
-        if run_timeout is not None:
-            raise ConfigurationError("--run-timeout works with processes of this machine only, not with --scheduler")
+        for option, value in (("--run-timeout", bounds.run_timeout), ("--run-memory", bounds.run_memory)):
+            if value is not None:
+                raise ConfigurationError(f"{option} works with processes of this machine only, not with --scheduler")
         with _open_cluster(scheduler) as workers:
             yield workers
-    elif count == 1 and run_timeout is None:
-        yield Workers()
-    else:
-        names = (tuple(plants), tuple(controllers), tuple(each.source for each in own if each.source is not None))
-        context = get_context("spawn")
-        ready, asked = context.Semaphore(0), Event()
-        pool = ProcessPool(count, context=context, initializer=_warm_up, initargs=(ready, *names))
-
-        def submit(function: Callable[..., Any], *arguments: object) -> Any:  # noqa: ANN401 - a future
-            asked.set()
-            with _interrupts_blocked():  # the first task starts the processes, which inherit the blocked signal
-                return pool.schedule(function, arguments, timeout=run_timeout)
-
-        try:
-            yield Workers(submit, count, (ProcessExpired,), run_timeout)
-            if asked.is_set():
-                _wait_until(ready, count)
-        finally:
-            pool.stop()  # type: ignore[no-untyped-call]
-            pool.join()
-
-
-def _wait_until(ready: Semaphore, count: int) -> None:
-    """Wait until `count` processes have started: one that is stopped while it starts may print a traceback."""
-    deadline = time.monotonic() + MAX_START_TIME
-    for _ in range(count):
-        if not ready.acquire(timeout=max(0.0, deadline - time.monotonic())):
-            return
-
-
-def _warm_up(
-    ready: Semaphore, plants: Sequence[str], controllers: Sequence[str], sources: Sequence[SourceFile]
-) -> None:
-    """Import what runs need, and say so; what cannot be imported is left to the run, whose row says so."""
-    ready.release()
-    import_module("servobench.harness.run.episode")
-    for find, names in ((find_plant, plants), (find_controller, controllers)):
-        for name in names:
-            with contextlib.suppress(Exception):
-                find(name)
-    for source in sources:
-        with contextlib.suppress(ConfigurationError):
-            source.load()
-
-
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Hold Ctrl-C back; processes and threads that are started meanwhile never receive it."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    plants, controllers = tuple(plants), tuple(controllers)
+    foreign = any(map(is_foreign_plant, plants)) or any(map(is_foreign_controller, controllers))
+    limits = bounds.limits(count, foreign=foreign and bounds.isolate and can_travel(own))
+    if count == 1 and limits == Limits():
+        yield Workers()
+        return
+    pool = Pool(count, limits, (*MODULES, *own_modules(plants, controllers)))
     try:
-        yield
+        yield Workers(pool.submit, count)
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        pool.stop()
 
 
 @contextlib.contextmanager
@@ -169,10 +145,17 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
                 f"the scheduler {scheduler} has no workers; start some with `dask worker {scheduler} --nthreads 1`"
             ) from error
 
-        def submit(function: Callable[..., Any], *arguments: object) -> Any:  # noqa: ANN401 - a future
-            return client.submit(function, *arguments, pure=False)
+        def submit(task: Task) -> Any:  # noqa: ANN401 - a future
+            return client.submit(_gather, task.function, task.argument, pure=False)
 
         threads = sum(client.nthreads().values())
-        yield Workers(submit, threads, (KilledWorker,))
+        yield Workers(submit, threads, cluster=True, lost=(KilledWorker,))
     finally:
         client.close()
+
+
+def _gather(function: Callable[[bytes, Callable[[Any], None]], None], argument: bytes) -> Answer:
+    """Carry a task out on a cluster."""
+    items: list[Any] = []
+    function(argument, lambda item: None if item is None else items.append(item))
+    return Answer(items)

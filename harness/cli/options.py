@@ -16,6 +16,7 @@ from servobench.harness.cli import completion
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.batch.workers import Bounds
     from servobench.harness.config.settings import Settings
 
 DEFAULT_PLANT = "bullet, or kinematic where PyBullet is not installed"
@@ -29,7 +30,22 @@ SetOption = Annotated[
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")]
 SchedulerOption = Annotated[str | None, typer.Option(help="Address of a Dask scheduler that the runs are sent to.")]
 TimeoutOption = Annotated[
-    float | None, typer.Option(min=0.001, help="Time limit of a run [s]; a run that takes longer becomes a failed row.")
+    float | None,
+    typer.Option(min=0.001, help="Time limit of a run [s], or inf; default: 600 for code that is not servobench's."),
+]
+MemoryOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SIZE",
+        help="Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
+        "servobench's.",
+    ),
+]
+IsolateOption = Annotated[
+    bool,
+    typer.Option(
+        "--isolate/--no-isolate", help="Keep plug-ins and foreign FMUs in processes of their own, with limits."
+    ),
 ]
 NAMES = "Comma-separated names, or 'all'."
 PlantsOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.plants))]
@@ -60,12 +76,36 @@ ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue in a fold
 
 
 @dataclass(frozen=True)
-class Place:
+class Limited:
+    """What a command lets a run take."""
+
+    run_timeout: TimeoutOption = None
+    run_memory: MemoryOption = None
+    isolate: IsolateOption = True
+
+    def bounds(self) -> Bounds:
+        """Return it as the driver takes it.
+
+        Raises:
+            ConfigurationError: a memory limit that is no size.
+        """
+        from servobench.harness.batch.guard import read_size
+        from servobench.harness.batch.workers import Bounds
+        from servobench.harness.config.settings import ConfigurationError
+
+        try:
+            memory = None if self.run_memory is None else read_size(self.run_memory)
+        except ValueError as error:
+            raise ConfigurationError(f"--run-memory: {error}") from error
+        return Bounds(self.run_timeout, memory, self.isolate)
+
+
+@dataclass(frozen=True)
+class Place(Limited):
     """Where a command carries runs out."""
 
     workers: WorkersOption = None
     scheduler: SchedulerOption = None
-    run_timeout: TimeoutOption = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +118,7 @@ class Running(Place):
         """Return it as the driver takes it."""
         from servobench.harness.batch.campaign import Execution, Observer
 
-        return Execution(self.workers, self.scheduler, self.run_timeout, self.resume, observer or Observer())
+        return Execution(self.workers, self.scheduler, self.bounds(), self.resume, observer or Observer())
 
 
 @dataclass(frozen=True)
@@ -102,7 +142,8 @@ class Judging:
         given = {
             "--workers": how.workers not in (None, 1),
             "--scheduler": how.scheduler,
-            "--run-timeout": how.run_timeout,
+            "--run-timeout": how.bounds.run_timeout,
+            "--run-memory": how.bounds.run_memory,
         }
         for option, value in given.items():
             if value:
@@ -124,7 +165,13 @@ class Overrides:
         return read_settings(self.config, [*(self.set_ or []), *further])
 
 
-PLACE, RUNNING, JUDGING, OVERRIDES = Place(), Running(), Judging(), Overrides()  # defaults of parameters
+LIMITED, PLACE, RUNNING, JUDGING, OVERRIDES = (
+    Limited(),
+    Place(),
+    Running(),
+    Judging(),
+    Overrides(),
+)  # defaults of parameters
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:

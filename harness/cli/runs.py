@@ -58,6 +58,7 @@ def run(
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
+    limited: options.Limited = options.LIMITED,
     debug: options.DebugOption = False,
 ) -> None:
     """Carry out one run and show what came of it.
@@ -78,7 +79,9 @@ def run(
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"), options.known_robot(robot))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
-    folder = _carry_out(campaign, out, Execution(workers=1, debug=debug), with_report=with_report)
+    folder = _carry_out(
+        campaign, out, Execution(workers=1, bounds=limited.bounds(), debug=debug), with_report=with_report
+    )
     judge(folder, strict=True)
 
 
@@ -152,6 +155,18 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
     console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
 
 
+def _say_interrupted(folder: Path, wanted: int) -> None:
+    """End with the exit code of Ctrl-C, and say how to go on if runs were finished; nothing is drawn any more."""
+    from servobench.harness.batch import results
+
+    count = sum(map(len, results.finished_runs(folder))) if folder.exists() else 0
+    if count:
+        line = f"interrupted: {count} of {wanted} runs were finished and kept in {folder}; "
+        line += "the same call with --resume and this --out continues"
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+        sys.exit(options.INTERRUPTED)
+
+
 def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> Path:
     """Check everything, run everything, leave tables, figures and a report behind, and return the folder."""
     from servobench.harness.analysis.summary import summary_legend, summary_tables
@@ -163,14 +178,13 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
     from servobench.harness.pictures.draw import draw_figures
 
     folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    interrupted = False
     with contextlib.closing(ConsoleObserver(console, bar=not how.debug)) as observer:
         try:
             carry_out(campaign, folder, replace(how, observer=observer))
         except KeyboardInterrupt:
-            if not folder.exists() or not results.finished_runs(folder):
-                raise
-            interrupted = True
+            observer.close()
+            _say_interrupted(folder, len(campaign.cells))
+            raise
     results.collect(folder)
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
@@ -180,9 +194,6 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
     if out is None:
         results.point_latest(folder)
     console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
-    if interrupted:
-        console.print(f"interrupted: {len(runs)} of {len(campaign.cells)} runs were finished and kept")
-        sys.exit(options.INTERRUPTED)
     if with_report:
         try:
             make_report(folder)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -118,7 +117,7 @@ def tune(
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     check_study_folder(out)
-    opening = open_workers(*astuple(place), plants=plan.runs.plants, controllers=names)
+    opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):
         if check:
             _check(out, names, runs.second(), opened)

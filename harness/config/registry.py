@@ -158,6 +158,23 @@ def find_controller(name: str) -> ControllerEntry:
     return _load_controller(name)
 
 
+def is_foreign_plant(name: str) -> bool:
+    """Return whether a plant runs code that is not of this package."""
+    return name not in PLANTS
+
+
+def is_foreign_controller(name: str) -> bool:
+    """Return whether a controller runs code that is not of this package; pairs of its laws and estimators do not."""
+    law, plus, estimator = FORMER_NAMES.get(name, name).partition("+")
+    return not (law in LAWS and estimator in ESTIMATORS if plus else law in CONTROLLERS)
+
+
+def own_modules(plants: Iterable[str], controllers: Iterable[str]) -> tuple[str, ...]:
+    """Return the modules of this package in which plants and controllers are, as far as they have one of their own."""
+    values = [PLANTS.get(name) for name in plants] + [NOT_COMPOSED.get(name) for name in controllers]
+    return tuple(value.partition(":")[0] for value in values if value is not None)
+
+
 def _rename(own: OwnController) -> str:
     if own.given:
         return "give yours another name, as a class of that name or in a ControllerEntry"

@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing import parent_process
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, NamedTuple
@@ -24,8 +25,9 @@ from servobench.plant.faults import RunFault
 COMPLETED = "completed"
 NUMERICAL_ERROR = "numerical_error"
 CRASHED = "crashed"
-TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the time limit
-STATUSES = (COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT)  # beside those of the kinds of `RunFault`
+TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
+OUT_OF_MEMORY = "out_of_memory"
+STATUSES = (COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT, OUT_OF_MEMORY)  # beside those of the kinds of `RunFault`
 
 TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
 PACKAGE, HARNESS = __name__.partition(".")[0], str(Path(__file__).parents[1])
@@ -58,17 +60,23 @@ class Ending:
             return cls(error.status, f"{_one_line(error)}{where}", trace)
         if isinstance(error, FloatingPointError):
             return cls(NUMERICAL_ERROR, f"{_one_line(error)}{where}", trace)
-        return cls(CRASHED, f"{describe_error(error)}{where}", trace)
+        status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
+        return cls(status, f"{describe_error(error)}{where}", trace)
 
 
 def describe_error(error: BaseException) -> str:
     """Return the kind and the message of an error as one line."""
-    return f"{type(error).__name__}: {_one_line(error)}"
+    return f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
 
 
 def is_defect(error: BaseException) -> bool:
     """Return whether an error is a defect of somebody's code, and no fault that a run may end with."""
     return not isinstance(error, RunFault)
+
+
+def ends_batch(error: BaseException) -> bool:
+    """Return whether an error is Ctrl-C; no Ctrl-C reaches a worker process, where code of users raised it itself."""
+    return isinstance(error, KeyboardInterrupt) and parent_process() is None
 
 
 def log_entry(row: Mapping[str, Any], trace: str) -> str:
@@ -149,4 +157,7 @@ def _trace(error: BaseException) -> str:
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+    try:
+        return " ".join(str(error).split())
+    except BaseException as second:  # noqa: BLE001 - code of users
+        return f"its text cannot be had, which raises {type(second).__name__}"

@@ -15,7 +15,7 @@ import pandas as pd
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
-from servobench.harness.run.ending import COMPLETED, Ending, is_defect
+from servobench.harness.run.ending import COMPLETED, Ending, ends_batch, is_defect
 from servobench.harness.run.experiment import Drawn, build, draw
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import run_loop
@@ -89,8 +89,8 @@ def carry_out(
             desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview_rows)
             pair = held_to_contract(plant, experiment.controller)
             run_loop(*pair, desired, experiment.loop, resolved.request.seed, log)
-    except (Exception, SystemExit) as error:
-        if debug and is_defect(error):
+    except BaseException as error:
+        if ends_batch(error) or (debug and is_defect(error)):
             raise
         ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row says what
     finally:

@@ -15,6 +15,7 @@ from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.ending import ends_batch
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.plausible import check_joints, check_reach, check_times
@@ -165,8 +166,10 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
         experiment.plant.close()
     except ConfigurationError:
         raise
-    except (Exception, SystemExit):  # noqa: BLE001 - of a plug-in; its run will fail in the same way
-        return
+    except BaseException as error:
+        if ends_batch(error):
+            raise
+        return  # of a plug-in; its run will fail in the same way
     if experiment.drawn.true is not None:
         check_joints(run, experiment.scenario, experiment.plant.spec)
         check_reach(run, experiment.scenario, find_robot(run.request.robot), experiment.plant.spec)

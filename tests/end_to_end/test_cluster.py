@@ -13,7 +13,7 @@ import pytest
 
 from kit.command import PACKAGE, finish, judged, part_count, start, wait_for
 from servobench.harness.batch import results
-from servobench.harness.batch.workers import open_workers
+from servobench.harness.batch.workers import Bounds, open_workers
 from servobench.harness.config.settings import ConfigurationError
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
@@ -68,12 +68,13 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("limit", "message"),
+    ("limits", "message"),
     [
-        (None, r"scheduler tcp://127\.0\.0\.1:9 does not answer; start one with"),
-        (5.0, "--run-timeout works with processes of this machine only"),
+        (Bounds(), r"scheduler tcp://127\.0\.0\.1:9 does not answer; start one with"),
+        (Bounds(5.0), "--run-timeout works with processes of this machine only"),
+        (Bounds(run_memory=1e9), "--run-memory works with processes of this machine only"),
     ],
 )
-def test_a_cluster_that_cannot_be_used_is_refused(limit, message):
+def test_a_cluster_that_cannot_be_used_is_refused(limits, message):
     with pytest.raises(ConfigurationError, match=message):
-        open_workers(None, "tcp://127.0.0.1:9", limit).__enter__()
+        open_workers(None, "tcp://127.0.0.1:9", limits).__enter__()

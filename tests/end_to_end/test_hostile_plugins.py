@@ -56,7 +56,7 @@ def place(words: str, function: str) -> str:
 
 
 REASONS = {
-    "exit": ("crashed", "the run killed the process that carried it out"),
+    "exit": ("crashed", "the run killed the process that carried it out: exit code 9"),
     "build": ("crashed", f"RuntimeError: no licence {place('no licence', 'build')}"),
     "close": ("crashed", f"RuntimeError: the window is gone {place('the window is gone', 'fail')}"),
     "hang": ("timed_out", "the run took longer than 8 s"),
@@ -82,7 +82,14 @@ def plugin(tmp_path) -> Path:
 
 @pytest.mark.parametrize(
     ("command", "how", "workers"),
-    [*((command, how, "2") for command in COMMANDS for how in REASONS), ("sweep", "hang", "1")],
+    [
+        ("compare", "exit", "1"),
+        ("sweep", "build", "2"),
+        ("sweep", "close", "1"),
+        ("sweep", "hang", "1"),
+        ("tune", "exit", "2"),
+        ("tune", "hang", "1"),
+    ],
 )
 def test_a_run_that_fails_is_a_row_and_takes_no_other_run_with_it(plugin, tmp_path, command, how, workers):
     out = tmp_path / "out"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 from concurrent.futures import Future
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,10 +17,13 @@ from servobench.harness.batch.blocks import Cell, Job, carry_out_blocks, cut, ev
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
+from servobench.harness.batch.guard import End
+from servobench.harness.batch.pool import Answer
 from servobench.harness.batch.survey import survey
 from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.ending import Ending
 from servobench.harness.run.episode import RunResult
 from servobench.harness.run.request import RunRequest
 
@@ -81,30 +85,50 @@ def test_where_runs_cannot_advance_together_each_is_carried_out_by_itself(alone,
 
 
 class ProcessDied(Exception):
-    """What a future raises."""
+    """What the future of a cluster raises."""
 
 
-def dying_workers(how: Exception, sizes: list[int]) -> Workers:
-    """Return workers that lose each task which holds the run of one seed, and note how many runs tasks have."""
+class Struck(Exception):
+    """Ends a task in the middle of a run."""
 
-    def submit(function, task):
-        block = blocks.pickle.loads(blocks.pickle.loads(task)[1])[0]
+
+def dying_workers(how: Exception | End, sizes: list[int]) -> Workers:
+    """Return workers that lose each task at the run of one seed, and note how many runs tasks have."""
+
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
         sizes.append(len(block.jobs))
-        future = Future()
-        if any(job.cell.request.seed == SEED_OF_A_CRASH for job in block.jobs):
+        items, future = [], Future()
+        strikes = [job.cell.request.seed == SEED_OF_A_CRASH for job in block.jobs]
+
+        def tell(item):
+            if item is not None:
+                items.append(item)
+            if strikes[len(items)]:
+                raise Struck
+
+        if not any(strikes):
+            task.function(task.argument, lambda item: item is None or items.append(item))
+            future.set_result(Answer(items))
+        elif isinstance(how, Exception):
             future.set_exception(how)
         else:
-            future.set_result(function(task))
+            if not block.together:
+                with contextlib.suppress(Struck):
+                    task.function(task.argument, tell)
+            end = replace(how, certain=how.certain or (task.fresh and not items))
+            future.set_result(Answer(items, end))
         return future
 
-    return Workers(submit, 2, (ProcessDied,), 8.0)
+    return Workers(submit, 2, lost=(ProcessDied,))
 
 
 @pytest.mark.parametrize(
     ("how", "end"),
     [
         (ProcessDied(), ("crashed", "the run killed the process that carried it out")),
-        (TimeoutError(), ("timed_out", "the run took longer than 8 s")),
+        (End(Ending("timed_out", "it took long"), certain=True), ("timed_out", "it took long")),
+        (End(Ending("out_of_memory", "it held much"), certain=False), ("out_of_memory", "it held much")),
     ],
 )
 def test_a_block_that_is_lost_costs_only_the_run_that_did_it(alone, tmp_path, monkeypatch, how, end):
@@ -115,10 +139,26 @@ def test_a_block_that_is_lost_costs_only_the_run_that_did_it(alone, tmp_path, mo
     runs = results.load_runs(tmp_path / "out")
     lost = runs["seed"] == SEED_OF_A_CRASH
     assert sizes.count(6) == 4
-    assert sizes.count(1) == 24
+    assert sizes.count(1) == (24 if not isinstance(how, End) or how.certain else 28)
     assert set(zip(runs["status"][lost], runs["reason"][lost], strict=True)) == {end}
     pd.testing.assert_frame_equal(judged(runs)[~lost], alone[~lost], check_exact=True)
     assert times(runs)[~lost].notna().all(axis=None)
+
+
+@pytest.mark.parametrize("certain", [True, False])
+def test_of_runs_that_go_one_by_one_those_before_and_after_a_death_are_carried_out_once(
+    alone, tmp_path, monkeypatch, certain
+):
+    sizes: list[int] = []
+    workers = contextlib.nullcontext(dying_workers(End(Ending("crashed", "it died"), certain), sizes))
+    monkeypatch.setattr("servobench.harness.batch.campaign.open_workers", lambda *_, **__: workers)
+    carry_out(CAMPAIGN, tmp_path / "out", Execution(2, block=1))
+    runs = results.load_runs(tmp_path / "out")
+    lost = runs["seed"] == SEED_OF_A_CRASH
+    assert lost.sum() == 4
+    assert set(runs["reason"][lost]) == {"it died"}
+    pd.testing.assert_frame_equal(judged(runs)[~lost], alone[~lost], check_exact=True)
+    assert sum(sizes) <= len(runs) + 8 * (4 if certain else 8)
 
 
 def job(index: int, kind: object) -> Job:
@@ -150,9 +190,9 @@ def test_blocks_are_made_when_a_worker_is_about_to_need_them():
             made.append(index)
             yield job(index, None)
 
-    def submit(_function, _task):
+    def submit(_task):
         done = Future()
-        done.set_result([RunResult({}, None)])
+        done.set_result(Answer([RunResult({}, None)]))
         return done
 
     workers = Workers(submit, 3)

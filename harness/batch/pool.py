@@ -1,0 +1,191 @@
+"""Guards and the threads that talk to them: tasks are handed out, answers come back as a future.
+
+A guard that was ended, be it by a plug-in, is started anew; what it was at ends as a row, not the batch.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from queue import SimpleQueue
+from typing import Any, Final
+
+from servobench.harness.batch.guard import ALIVE, DONE, ENDED, LOST, START_TIME, End, Limits, Task, keep_guard
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.ending import CRASHED, TIMED_OUT, Ending
+
+GUARD_START: Final = 120.0  # [s] until a guard has imported servobench
+GRACE: Final = 30.0  # [s] more than the time limit, after which a guard that says nothing is ended, too
+STOP_TIME: Final = 4.0  # [s] that guards have to end what is below them
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back from a task: one item after the other, and how it ended if it did not come to its end."""
+
+    items: list[Any] = field(default_factory=list)
+    end: End | None = None
+
+
+class Pool:
+    """Worker processes, each behind a guard, which start with the first task.
+
+    Args:
+        count: of guards.
+        limits: of each run.
+        modules: that guards import once.
+    """
+
+    def __init__(self, count: int, limits: Limits, modules: Sequence[str]) -> None:
+        self._count, self._limits, self._modules = count, limits, modules
+        self._waiting: SimpleQueue[tuple[Future[Answer], Task, Callable[[Any], None] | None] | None] = SimpleQueue()
+        self._guards: list[_Guarded] = []
+        self._threads: list[threading.Thread] = []
+        self._stopped = False
+
+    def submit(self, task: Task, hear: Callable[[Any], None] | None = None) -> Future[Answer]:
+        """Hand a task out.
+
+        Args:
+            task: what to carry out.
+            hear: receives the items instead of the answer, in another thread.
+        """
+        if len(self._threads) < self._count:
+            self._guards.append(_Guarded(self._limits, self._modules))
+            self._threads.append(threading.Thread(target=self._serve, args=(self._guards[-1],), daemon=True))
+            self._threads[-1].start()
+        future: Future[Answer] = Future()
+        self._waiting.put((future, task, hear))
+        return future
+
+    def stop(self) -> None:
+        """End everything; tasks that were not carried out have no answer."""
+        self._stopped = True
+        for _ in self._threads:
+            self._waiting.put(None)
+        for guard in self._guards:
+            guard.ask_to_end()
+        for guard in self._guards:
+            guard.end()
+
+    def _serve(self, guard: _Guarded) -> None:
+        while (taken := self._waiting.get()) is not None and not self._stopped:
+            future, task, hear = taken
+            try:
+                answer = guard.carry_out(task, hear)
+            except BaseException as error:  # noqa: BLE001 - told where the result is asked for
+                if not self._stopped:
+                    future.set_exception(error)
+            else:
+                future.set_result(answer)
+
+
+class _Guarded:
+    """A guard as seen from here."""
+
+    def __init__(self, limits: Limits, modules: Sequence[str]) -> None:
+        self._limits, self._modules = limits, modules
+        self._lock, self._ended = threading.Lock(), False
+        self._process: SpawnProcess | None = None
+        self._link: Connection | None = None
+
+    def carry_out(self, task: Task, hear: Callable[[Any], None] | None) -> Answer:
+        """Carry one task out.
+
+        Raises:
+            ConfigurationError: no process can be started.
+        """
+        answer = Answer()
+        link = self._start()
+        silence = None if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
+        try:
+            link.send_bytes(pickle.dumps(task))
+            while True:
+                if not link.poll(silence):
+                    return Answer(answer.items, self._give_up(TIMED_OUT, f"the run took longer than {silence:g} s"))
+                message = link.recv_bytes()
+                kind, content = message[:1], message[1:]
+                if kind == DONE:
+                    return answer
+                if kind == ENDED:
+                    return Answer(answer.items, pickle.loads(content))
+                if kind != ALIVE:
+                    (hear or answer.items.append)(pickle.loads(content))
+        except (EOFError, OSError):
+            return Answer(answer.items, self._give_up(CRASHED, LOST))
+        except (pickle.UnpicklingError, AttributeError, ImportError, IndexError, TypeError, ValueError) as error:
+            return Answer(answer.items, self._give_up(CRASHED, f"what the run gave back cannot be read: {error}"))
+
+    def ask_to_end(self) -> None:
+        """Ask the guard to end what is below it, and itself."""
+        with self._lock:
+            self._ended = True
+            if self._process is not None:
+                self._process.terminate()
+
+    def end(self) -> None:
+        """Wait until the guard has ended."""
+        with self._lock:
+            if self._process is not None:
+                self._process.join(STOP_TIME)
+                self._process.kill()
+                self._process.join()
+
+    def _give_up(self, status: str, reason: str) -> End:
+        """End a guard that is gone or that says nothing any more."""
+        with self._lock:
+            if self._process is not None:
+                self._process.kill()
+                self._process.join()
+            self._process = self._link = None
+        return End(Ending(status, reason), certain=True)
+
+    def _start(self) -> Connection:
+        """Return the link to a guard that runs."""
+        if self._link is not None:
+            return self._link
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=keep_guard, args=(theirs, self._limits, tuple(self._modules)))
+        with self._lock:
+            if self._ended:
+                raise EOFError
+            with _interrupts_blocked():  # a process inherits this
+                process.start()
+            self._process = process
+        theirs.close()
+        if not _has_started(ours):
+            raise ConfigurationError(
+                "the worker processes cannot be started; a script that starts some must keep its calls below "
+                "`if __name__ == '__main__':`"
+            )
+        self._link = ours
+        return ours
+
+
+def _has_started(link: Connection) -> bool:
+    try:
+        return link.poll(GUARD_START) and link.recv_bytes() == ALIVE
+    except (EOFError, OSError):
+        return False
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Hold Ctrl-C back in this thread and in processes that are started meanwhile."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
