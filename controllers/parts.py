@@ -11,10 +11,15 @@ from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEsti
 from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.estimators.fixed import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.gmckf import GmckfConfig, gmckf_estimator
+from servobench.controllers.estimators.imcckf import ImcckfConfig, imcckf_estimator
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from servobench.controllers.estimators.mckf import MckfConfig, mckf_estimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
+from servobench.controllers.estimators.rmckf import RmckfConfig, rmckf_estimator
+from servobench.controllers.estimators.robust import RobustConfig, RobustEstimator
 from servobench.controllers.estimators.ukf import UkfConfig, ukf_estimator
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
@@ -47,6 +52,11 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
     "ukf": Part(UkfConfig, ukf_estimator),
     "kalman": Part(KalmanConfig, KalmanEstimator),
+    "mckf": Part(MckfConfig, mckf_estimator),
+    "imcckf": Part(ImcckfConfig, imcckf_estimator),
+    "gmckf": Part(GmckfConfig, gmckf_estimator),
+    "rmckf": Part(RmckfConfig, rmckf_estimator),
+    "robust": Part(RobustConfig, RobustEstimator),
     "broyden": Part(BroydenConfig, BroydenEstimator),
     "rls": Part(RlsConfig, RlsEstimator),
     "rbf": Part(RbfConfig, RbfEstimator, trained=True),

@@ -7,10 +7,15 @@ import pytest
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.estimators.broyden import BroydenConfig
 from servobench.controllers.estimators.cfdl import CfdlConfig
+from servobench.controllers.estimators.gmckf import GmckfConfig
+from servobench.controllers.estimators.imcckf import ImcckfConfig
 from servobench.controllers.estimators.kalman import KalmanConfig
+from servobench.controllers.estimators.mckf import MckfConfig
 from servobench.controllers.estimators.rbf import RbfConfig
 from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig
 from servobench.controllers.estimators.rls import RlsConfig
+from servobench.controllers.estimators.rmckf import RmckfConfig
+from servobench.controllers.estimators.robust import RobustConfig
 from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.laws.mfac import MfacConfig
@@ -27,6 +32,7 @@ def bad(config, **values):
 
 
 FILTER = {"initial_deviation": 0.0, "walk": -1.0, "feature_noise": 0.0, "min_joint_step": -0.1, "form": ""}
+WALK = {name: value for name, value in FILTER.items() if name != "form"}
 REFUSED = [
     *bad(InitialConfig, source="guess", probe_step=0.0, probe_periods=0, settle_periods=-1, average_periods=0),
     *bad(InitialConfig, given=((1.0, math.inf),)),
@@ -35,6 +41,11 @@ REFUSED = [
     *bad(RlsConfig, memory=0.0, initial_covariance=0.0, min_joint_step=math.nan),
     *bad(KalmanConfig, **FILTER),
     *bad(UkfConfig, **FILTER, alpha=0.0, beta=-1.0, kappa=-1.0),
+    *bad(MckfConfig, **WALK, bandwidth=0.0, tolerance=0.0, iterations=0),
+    *bad(GmckfConfig, **WALK, shape=0.0, bandwidth=0.0, tolerance=0.0, iterations=0),
+    *bad(ImcckfConfig, **WALK, bandwidth=0.0),
+    *bad(RmckfConfig, **WALK, bandwidth=0.0, regularisation=0.0),
+    *bad(RobustConfig, **WALK, motion_error=-0.1),
     *bad(RbfConfig, k2=0.0, window=0, epsilon=-1e-9),
     *bad(RbfConfig, k2=2.0),
     *bad(RbfLyapunovConfig, n2=0.0, n3=-1.0),
