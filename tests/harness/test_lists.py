@@ -43,7 +43,7 @@ def test_all_names_and_summaries_are_there_as_json(monkeypatch, capsys):
 
 def test_settings_are_explained_to_readers_and_programs(monkeypatch, capsys):
     found = json.loads(shown(monkeypatch, capsys, "plants", "kinematic", "--json"))
-    wanted = {f"kinematic.{key}": value for key, value in flatten(ENTRY.config()).items()}
+    wanted = json.loads(json.dumps({f"kinematic.{key}": value for key, value in flatten(ENTRY.config()).items()}))
     assert {each["setting"]: each["default"] for each in found} == wanted
     lag = next(each for each in found if each["setting"] == "kinematic.lag")
     assert (lag["unit"], lag["allowed"]) == ("s", "≥ 0")
