@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,8 @@ class Abilities(ABC):
 
     spec: PlantSpec
     """Sizes, names, limits and period; set on construction."""
+    own_robot: ClassVar[bool] = False
+    """Whether it brings a robot and a start of its own, of a class that is given without a `PlantEntry`."""
     faults: Mapping[int, RunFault] = MappingProxyType({})
     """Of runs side by side: the lanes that failed, which `keep` has to drop. A single run raises instead."""
 

@@ -17,15 +17,23 @@ if TYPE_CHECKING:
     from servobench.harness.batch.api import Results, compare, load, run
     from servobench.harness.check.controllers import check_controller
     from servobench.harness.check.plants import check_plant
-    from servobench.plant.signals import Command, Observation
+    from servobench.plant.plant import Plant, PlantEntry, PlantSetup
+    from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+    from servobench.plant.world import World
 
 __all__ = [
     "Command",
     "Controller",
     "ControllerEntry",
     "Observation",
+    "Plant",
+    "PlantEntry",
+    "PlantSetup",
+    "PlantSpec",
     "Results",
     "RobotKnowledge",
+    "Truth",
+    "World",
     "check_controller",
     "check_plant",
     "compare",
@@ -38,7 +46,9 @@ _HOMES = {
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.check.controllers": ("check_controller",),
     "servobench.harness.check.plants": ("check_plant",),
-    "servobench.plant.signals": ("Command", "Observation"),
+    "servobench.plant.plant": ("Plant", "PlantEntry", "PlantSetup"),
+    "servobench.plant.signals": ("Command", "Observation", "PlantSpec", "Truth"),
+    "servobench.plant.world": ("World",),
 }
 
 

@@ -19,15 +19,19 @@ from servobench.harness.batch.campaign import Campaign, Execution, carry_out, co
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.workers import Bounds
-from servobench.harness.config.own import OwnController, own_object
-from servobench.harness.config.registry import choose_controller, offer, offered, offering
+from servobench.harness.config.entries import CONTROLLER, PLANT
+from servobench.harness.config.own import own_object
+from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import check_settings
+from servobench.plant.plant import Plant, PlantEntry
+from servobench.plant.world import World
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry
+AnyPlant: TypeAlias = str | type[Plant] | type[World] | PlantEntry
 Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
 
 
@@ -44,7 +48,7 @@ class Results(NamedTuple):
 
 def run(
     controller: AnyController,
-    plant: str = "kinematic",
+    plant: AnyPlant = "kinematic",
     *,
     task: str = "exp1",
     mismatch: str = "moderate",
@@ -59,7 +63,9 @@ def run(
             subclass of `Controller`, which is constructed as `cls(knowledge)` with a `RobotKnowledge`, or as
             `cls(config, knowledge)` where `config` is annotated with a dataclass of settings; an object of such a
             class, of which each run gets a copy; or a `ControllerEntry`.
-        plant: name of the plant.
+        plant: a name such as "bullet"; a place such as "./cell.py" or "./cell.py:Cell"; a subclass of `Plant` or
+            `World`, which is constructed as `cls(setup)` with a `PlantSetup`, or as `cls(config, setup)`; or a
+            `PlantEntry`.
         task: name of the task.
         mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
         robot: name such as "ur10e" or "panda", or the path of a file: a factory calibration, a DH table or a URDF.
@@ -73,7 +79,7 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        request = RunRequest(plant, _name(controller), task, read_mismatch(mismatch), seed, robot=robot)
+        request = RunRequest(_plant_name(plant), _name(controller), task, read_mismatch(mismatch), seed, robot=robot)
         given = Settings(settings or {})
         check_settings(given, [request.plant, request.controller, request.task])
         return run_experiment(request, given)
@@ -81,7 +87,7 @@ def run(
 
 def compare(
     controllers: Sequence[AnyController],
-    plants: Sequence[str] = ("kinematic",),
+    plants: Sequence[AnyPlant] = ("kinematic",),
     tasks: Sequence[str] = ("exp1",),
     *,
     mismatches: Sequence[str] = ("moderate",),
@@ -98,11 +104,11 @@ def compare(
     """Carry out every combination of plants, tasks, mismatches, controllers and seeds.
 
     With several workers, a script must keep its calls below `if __name__ == "__main__":`, as with multiprocessing.
-    Controllers that cannot be pickled, or that are defined in a notebook, are carried out in this process.
+    Controllers and plants that cannot be pickled, or that are defined in a notebook, are carried out in this process.
 
     Args:
         controllers: names, places, classes, objects or entries; see `run`.
-        plants: names of plants.
+        plants: names, places, classes or entries; see `run`.
         tasks: names of tasks.
         mismatches: such as "moderate".
         seeds: a number of seeds from 0 on, or the seeds.
@@ -128,8 +134,9 @@ def compare(
             raise ConfigurationError(f"{what} must name at least one, got none")
     with offering():
         names = tuple(_name(each) for each in controllers)
-        batch = Batch(tuple(plants), names, tuple(tasks), tuple(mismatches), chosen, robot)
-        if not _can_travel(offered(names)):
+        worlds = tuple(_plant_name(each) for each in plants)
+        batch = Batch(worlds, names, tuple(tasks), tuple(mismatches), chosen, robot)
+        if not _can_travel(offered([*worlds, *names])):
             workers, run_timeout, run_memory, isolate = 1, None, None, False
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
         whole = Settings(settings or {})
@@ -156,11 +163,16 @@ def load(folder: Path | str) -> Results:
 
 def _name(given: AnyController) -> str:
     """Return the name by which a controller is found, one given as an object from now on."""
-    return choose_controller(given) if isinstance(given, str) else offer(own_object(given))
+    return choose_controller(given) if isinstance(given, str) else offer(own_object(CONTROLLER, given))
 
 
-def _can_travel(own: tuple[OwnController, ...]) -> bool:
-    """Return whether a worker process can receive these controllers."""
+def _plant_name(given: AnyPlant) -> str:
+    """Return the name by which a plant is found, one given as an object from now on."""
+    return choose_plant(given) if isinstance(given, str) else offer(own_object(PLANT, given))
+
+
+def _can_travel(own: tuple[Offer, ...]) -> bool:
+    """Return whether a worker process can receive these controllers and plants."""
     try:
         text = pickle.dumps(own)
     except (pickle.PicklingError, AttributeError, TypeError):

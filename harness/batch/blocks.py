@@ -26,8 +26,8 @@ from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.guard import LOST, End, Task, Tell
 from servobench.harness.batch.pool import Answer
 from servobench.harness.batch.workers import Workers
-from servobench.harness.config.own import OwnController
 from servobench.harness.config.registry import (
+    Offer,
     find_controller,
     find_plant,
     is_foreign_controller,
@@ -73,10 +73,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive runs, and controllers that users gave."""
+    """Consecutive runs, and controllers and plants that users gave."""
 
     jobs: tuple[Job, ...]
-    own: tuple[OwnController, ...] = ()
+    own: tuple[Offer, ...] = ()
     together: bool = False  # whether the runs advance together
     fresh: bool = False  # whether they want a process in which no run has been
 
@@ -100,14 +100,14 @@ def even_size(count: int, workers: int, most: int = BLOCK) -> int:
     return math.ceil(count / (workers * max(rounds, 1)))
 
 
-def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[OwnController, ...] = ()) -> Iterator[Block]:
+def cut(jobs: Iterable[Job], size: int, chunk: int = CHUNK, own: tuple[Offer, ...] = ()) -> Iterator[Block]:
     """Yield jobs in blocks of one kind, one owner and consecutive indices.
 
     Args:
         jobs: the runs, in the order of their indices.
         size: at most so many runs advance together.
         chunk: at most so many runs that go one by one are in a block.
-        own: controllers that users gave.
+        own: controllers and plants that users gave.
     """
     gathered: list[Job] = []
     for job in jobs:

@@ -33,8 +33,7 @@ from servobench.harness.batch.lock import check_empty, locked
 from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Bounds, Workers, open_workers
-from servobench.harness.config.own import OwnController
-from servobench.harness.config.registry import offered
+from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
@@ -112,7 +111,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     if not how.resume:
         check_empty(folder, can_resume=len(campaign.cells) > 1)
     runs = survey(Grid(_request, campaign.cells))
-    own = offered(runs.controllers)
+    own = offered([*runs.plants, *runs.controllers])
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
     with open_workers(how.workers, how.scheduler, bounds, **names, own=own) as place:
@@ -120,7 +119,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
 
 
 def _carry_out_at(
-    place: Workers, campaign: Campaign, runs: Survey, own: tuple[OwnController, ...], folder: Path, how: Execution
+    place: Workers, campaign: Campaign, runs: Survey, own: tuple[Offer, ...], folder: Path, how: Execution
 ) -> None:
     """Check and carry out a campaign at a place."""
     sections = check_campaign(campaign, runs, how.observer, place)
@@ -157,7 +156,7 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     check_settings(campaign.settings, [*runs.plants, *runs.controllers, *runs.tasks])
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
-    own = offered(runs.controllers)
+    own = offered([*runs.plants, *runs.controllers])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
@@ -179,11 +178,12 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
             f"{folder} holds results of other runs or settings: {difference(there, manifest)}; "
             "name another folder with --out"
         )
-    for name, record in manifest[OWN].items():
-        if record["sha256"] != there.get(OWN, {}).get(name, record)["sha256"]:
-            raise ConfigurationError(
-                f"{folder} was begun with another text of {record['place']}; name another folder with --out"
-            )
+    for key in OWN.values():
+        for name, record in manifest[key].items():
+            if record["sha256"] != there.get(key, {}).get(name, record)["sha256"]:
+                raise ConfigurationError(
+                    f"{folder} was begun with another text of {record['place']}; name another folder with --out"
+                )
     for key, what in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
             observer.note(f"note: {folder} was begun with other {what}; later runs may differ")
@@ -225,7 +225,7 @@ class _Jobs:
 
 
 def _carry_out_missing(
-    campaign: Campaign, jobs: _Jobs, own: tuple[OwnController, ...], folder: Path, place: Workers, how: Execution
+    campaign: Campaign, jobs: _Jobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
 ) -> None:
     """Carry out the runs whose part is not in the folder."""
     total = len(campaign.cells)

@@ -10,8 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from servobench.harness.batch.survey import Survey
-from servobench.harness.config.own import OwnController
-from servobench.harness.config.registry import find_plant
+from servobench.harness.config.registry import Offer, find_plant
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
@@ -30,14 +29,17 @@ PACKAGES = (
 )
 
 
-OWN = "own_controllers"  # key of the place and the hash of each controller that users gave as a file or an object
+OWN = {  # keys of the place and the hash of what users gave as a file or an object, by what it is
+    "controller": "own_controllers",
+    "plant": "own_plants",
+}
 
 
 def describe_batch(
     runs: Survey,
     sections: Mapping[str, Any],
     side_by_side: Mapping[str, list[str]],
-    own: Sequence[OwnController] = (),
+    own: Sequence[Offer] = (),
     *,
     steps: bool = False,
 ) -> dict[str, Any]:
@@ -47,7 +49,7 @@ def describe_batch(
         runs: what was asked for.
         sections: their typed settings by section, as `servobench.harness.run.resolved.resolve_sections` returns them.
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
-        own: controllers that users gave.
+        own: controllers and plants that users gave.
         steps: the table of steps is kept, too.
     """
     configuration = {name: flatten(config) for name, config in sections.items()}
@@ -56,7 +58,7 @@ def describe_batch(
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
-        OWN: {each.name: each.record() for each in own},
+        **{key: {each.name: each.record() for each in own if each.word == word} for word, key in OWN.items()},
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "robots": [describe_robot(name) for name in runs.robots],

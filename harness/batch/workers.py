@@ -17,8 +17,7 @@ from typing import Any, Final
 from servobench.harness.batch.guard import Limits, Task
 from servobench.harness.batch.pool import Answer, Pool
 from servobench.harness.batch.processes import machine_memory
-from servobench.harness.config.own import OwnController
-from servobench.harness.config.registry import is_foreign_controller, is_foreign_plant, own_modules
+from servobench.harness.config.registry import Offer, is_foreign_controller, is_foreign_plant, own_modules
 from servobench.harness.config.settings import ConfigurationError
 
 MAX_DEFAULT_WORKERS: Final = 8
@@ -68,7 +67,7 @@ def default_workers() -> int:
     return min(MAX_DEFAULT_WORKERS, available)
 
 
-def can_travel(own: Sequence[OwnController]) -> bool:
+def can_travel(own: Sequence[Offer]) -> bool:
     """Return whether a worker process can receive controllers that users gave."""
     try:
         pickle.dumps(own)
@@ -85,7 +84,7 @@ def open_workers(
     *,
     plants: Iterable[str] = (),
     controllers: Iterable[str] = (),
-    own: Sequence[OwnController] = (),
+    own: Sequence[Offer] = (),
 ) -> Iterator[Workers]:
     """Yield workers; their processes start with the first task and end with the context.
 
@@ -96,7 +95,7 @@ def open_workers(
         bounds: what a run may take.
         plants: names of the plants of the runs.
         controllers: names of the controllers.
-        own: controllers that users gave.
+        own: controllers and plants that users gave.
 
     Raises:
         ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a limit is asked

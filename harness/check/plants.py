@@ -9,13 +9,16 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
-from servobench.harness.config.entries import folder_of
-from servobench.harness.config.registry import find_plant
+from servobench.harness.config.builds import Build, folder_of
+from servobench.harness.config.entries import PLANT
+from servobench.harness.config.own import own_object
+from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
 from servobench.plant.signals import Command, Observation
+from servobench.plant.world import World
 
 PERIOD: Final = 0.05  # [s]
 MISMATCH: Final = "moderate+gear_ratio=5%"
@@ -27,7 +30,7 @@ MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which nothing c
 
 
 def check_plant(
-    plant: str | PlantEntry,
+    plant: str | type[Plant] | type[World] | PlantEntry,
     begin: Callable[[str], None] = lambda _name: None,
     found: Callable[[Finding], None] = lambda _finding: None,
 ) -> Report:
@@ -36,7 +39,7 @@ def check_plant(
     In a test: `report = servobench.check_plant(ENTRY); assert report.ok, report`.
 
     Args:
-        plant: a name or an entry.
+        plant: a name, a place such as "./cell.py:Cell", a class or an entry; see `servobench.run`.
         begin: called with the name of each check before it is carried out.
         found: called with each finding.
 
@@ -46,11 +49,12 @@ def check_plant(
     Raises:
         ConfigurationError: there is no such plant, or it cannot be loaded; it is a ValueError.
     """
-    entry = find_plant(plant) if isinstance(plant, str) else plant
-    findings = []
-    for finding in PlantChecks(entry).carry_out(begin):
-        findings.append(finding)
-        found(finding)
+    with offering():
+        entry = find_plant(choose_plant(plant)) if isinstance(plant, str) else own_object(PLANT, plant).entry
+        findings = []
+        for finding in PlantChecks(entry).carry_out(begin):
+            findings.append(finding)
+            found(finding)
     return Report(entry.name, tuple(findings))
 
 
@@ -64,7 +68,8 @@ class PlantChecks:
     def carry_out(self, begin: Callable[[str], None] = lambda _name: None) -> Iterator[Finding]:
         """Yield what each check finds; the plant is closed at the end."""
         try:
-            yield from findings_of(self.checks(), folder_of(self.entry.build), begin)
+            build = self.entry.build
+            yield from findings_of(self.checks(), folder_of(build.make if isinstance(build, Build) else build), begin)
         finally:
             for plant in self._plant:
                 with contextlib.suppress(Exception):  # the check of `close` has told of it
@@ -182,8 +187,10 @@ class PlantChecks:
     def _build(self) -> Plant:
         if self.entry.own_robot:
             return self.entry.build(self.entry.config(), PlantSetup(None, None, PERIOD))
-        model, _ = sample_mismatch(Mismatch.parse(MISMATCH), find_robot("ur5"), 1)
-        return self.entry.build(self.entry.config(), PlantSetup(model, np.array(HOME), PERIOD))
+        robot = find_robot("ur5")
+        model, _ = sample_mismatch(Mismatch.parse(MISMATCH), robot, 1)
+        config = self.entry.config() if self.entry.config_for is None else self.entry.config_for(robot)
+        return self.entry.build(config, PlantSetup(model, np.array(HOME), PERIOD, robot))
 
     def _commands(self, plant: Plant) -> list[Command]:
         drawn = np.random.default_rng(2).uniform(-SHARE, SHARE, (STEPS, plant.spec.n))

@@ -19,9 +19,10 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.config.registry import find_plant, installed_plant, plant_names
+    from servobench.harness.config.registry import choose_plant, find_plant, installed_plant, plant_names
 
     if name:
+        name = choose_plant(name)
         _show_settings(name, find_plant(name).config(), as_json=as_json)
     else:
         _show_names(plant_names(), installed_plant, as_json=as_json)

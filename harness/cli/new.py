@@ -1,4 +1,4 @@
-"""The command `servobench new`: a controller to begin with."""
+"""The command `servobench new`: a controller or a plant to begin with."""
 
 from __future__ import annotations
 
@@ -14,25 +14,28 @@ from servobench.harness.cli.terminal import console
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
-
-KINDS: Final = ("controller",)
+NEXT: Final = {  # what to do with a new file, by what it is
+    "controller": ("check {}", "run --controller {} --plant kinematic"),
+    "plant": ("check plant {}", "run --plant {}"),
+}
 
 
 def new(
-    kind: Annotated[str, typer.Argument(help="What to begin: controller.")],
+    kind: Annotated[str, typer.Argument(help="What to begin: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
     folder: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
 ) -> None:
-    """Write a commented controller that runs, and its test beside it."""
+    """Write a commented controller or plant, and its test."""
     from servobench.harness.config.settings import ConfigurationError
 
-    if kind not in KINDS:
-        raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is servobench new controller NAME")
+    if kind not in NEXT:
+        commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
+        raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is {commands}")
     module = name.removesuffix(".py")
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", module) or keyword.iskeyword(module) or module.startswith(PREFIX):
         raise ConfigurationError(f"the name must be one of a Python module, such as my_law, got {name!r}")
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
-    wanted = {folder / f"{module}.py": "controller", folder / f"{PREFIX}{module}.py": f"{PREFIX}controller"}
+    wanted = {folder / f"{module}.py": kind, folder / f"{PREFIX}{module}.py": f"{PREFIX}{kind}"}
     for path in wanted:
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
@@ -42,9 +45,5 @@ def new(
         path.write_text(text.replace("{{module}}", module).replace("{{Class}}", class_name), encoding="utf-8")
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
-    console.print(
-        f"wrote {file} and {test}; next:\n"
-        f"    servobench check {place}\n"
-        f"    servobench run --controller {place} --plant kinematic",
-        soft_wrap=True, markup=False, highlight=False,
-    )  # fmt: skip
+    lines = [f"wrote {file} and {test}; next:", *(f"    servobench {command.format(place)}" for command in NEXT[kind])]
+    console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)

@@ -48,8 +48,9 @@ IsolateOption = Annotated[
     ),
 ]
 NAMES = "Comma-separated names, or 'all'."
-PlantsOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.plants))]
-ControllersOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.controllers))]
+PLACES = "Comma-separated names or files, or 'all'."
+PlantsOption = Annotated[str, typer.Option(help=PLACES, autocompletion=completion.listed(completion.plants))]
+ControllersOption = Annotated[str, typer.Option(help=PLACES, autocompletion=completion.listed(completion.controllers))]
 TasksOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.tasks))]
 TaskOption = Annotated[str, typer.Option(help="Name of the task.", autocompletion=completion.tasks)]
 MismatchOption = Annotated[
@@ -283,10 +284,13 @@ def _usable(names: Sequence[str], find: Callable[[str], Any], text: str) -> list
 
 
 def split_plants(text: str, option: str = "plants") -> tuple[str, ...]:
-    """Return the plants that a user named."""
-    from servobench.harness.config.registry import find_plant, plant_names
+    """Return the names of the plants that a user named, or whose place was given, such as ./cell.py:Cell."""
+    from servobench.harness.config.registry import choose_plant, find_plant, plant_names
 
-    return split_names(option, text, _usable(plant_names(), find_plant, text), find_plant)
+    known, names = plant_names(), list[str]()
+    for word in split_words(text):
+        names += _usable(known, find_plant, word) if word == "all" else [choose_plant(word)]
+    return split_names(option, ",".join(names), known, find_plant)
 
 
 def split_controllers(text: str) -> tuple[str, ...]:

@@ -110,7 +110,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.config.registry import choose_controller
+    from servobench.harness.config.registry import choose_controller, choose_plant
     from servobench.harness.config.settings import ConfigurationError, flatten
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
@@ -118,7 +118,11 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.bullet.bullet_plant import BulletConfig
 
-    chosen = {"mismatch": read_mismatch(asked["mismatch"]), "controller": choose_controller(asked["controller"])}
+    chosen = {
+        "plant": choose_plant(asked["plant"]),
+        "mismatch": read_mismatch(asked["mismatch"]),
+        "controller": choose_controller(asked["controller"]),
+    }
     request = RunRequest(**asked | chosen)
     if request.seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {request.seed}")

@@ -37,7 +37,9 @@ def run(
     ] = None,
     plant: Annotated[
         str | None,
-        typer.Option(help=f"Name of the plant; default {options.DEFAULT_PLANT}.", autocompletion=completion.plants),
+        typer.Option(
+            help=f"Name or file of the plant; default {options.DEFAULT_PLANT}.", autocompletion=completion.plants
+        ),
     ] = None,
     controller: Annotated[
         str | None,
@@ -67,13 +69,13 @@ def run(
     """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.registry import choose_controller
+    from servobench.harness.config.registry import choose_controller, choose_plant
     from servobench.harness.config.settings import ConfigurationError
 
     if method and controller and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     controller = method or controller or DEFAULT_CONTROLLER
-    plant = plant or options.default_plant()
+    plant = choose_plant(plant) if plant else options.default_plant()
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)

@@ -28,7 +28,7 @@ EXIT_DIFFERENT = 1
 
 def robustness(
     out: options.FolderOption,
-    plant: Annotated[str, typer.Option(help="Name of the plant.")] = "fmu",
+    plant: Annotated[str, typer.Option(help="Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     running: options.Running = options.RUNNING,

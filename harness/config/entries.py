@@ -1,7 +1,8 @@
-"""What users give as a controller, made into an entry and checked as far as that goes without a robot.
+"""What users give as a controller or a plant, made into an entry and checked as far as that goes without a robot.
 
 A class needs no entry: it is constructed as `Mine(knowledge)`, or as `Mine(config, knowledge)` where `config` is
-annotated with a dataclass that has a default for every field.
+annotated with a dataclass that has a default for every field. Plants and worlds get a `PlantSetup` in place of the
+knowledge; a world is put on a bench.
 """
 
 from __future__ import annotations
@@ -9,66 +10,80 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Final, get_type_hints
+from typing import Any, Final, Generic, TypeVar, get_type_hints
 
-from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.controllers.controller import Controller, ControllerEntry
+from servobench.harness.config.builds import BenchSettings, Build, Copy, Guarded, NoSettings, OnBench, folder_of
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at, show
-from servobench.plant.faults import RunFault
-from servobench.plant.settings import settings
+from servobench.plant.plant import Plant, PlantEntry
+from servobench.plant.world import World
 
 NAME: Final = re.compile(r"\w+(?:[:-]\w+)*")
-WANTED: Final = "wanted a subclass of servobench.Controller or a servobench.ControllerEntry"
+
+Entry = TypeVar("Entry", ControllerEntry, PlantEntry)
 
 
-@settings
-class NoSettings:
-    """The settings of a controller that is given as a class: none."""
+@dataclass(frozen=True)
+class Kind(Generic[Entry]):
+    """What users may give: controllers, or plants.
+
+    Attributes:
+        word: for messages.
+        entry: its class of entries.
+        bases: classes below which it may be given.
+        argument: what a constructor takes beside settings.
+        wanted: what may be given, in words.
+        of_class: makes an entry of a class and that of its settings, None if it takes none.
+    """
+
+    word: str
+    entry: type[Entry]
+    bases: tuple[type, ...]
+    argument: str
+    wanted: str
+    of_class: Callable[[type[Any], type[Any] | None], Entry]
 
 
-@dataclass(frozen=True, eq=False)
-class Build:
-    """Builds a controller by code of a user, whose errors are one line."""
-
-    make: Callable[..., Any]
-    with_config: bool = True
-
-    def __call__(self, config: object, knowledge: RobotKnowledge) -> Controller:
-        """Return the controller.
-
-        Raises:
-            ConfigurationError: the code raises anything but a `RunFault`, or returns no controller.
-        """
-        arguments = (config, knowledge) if self.with_config else (knowledge,)
-        try:
-            controller = self.make(*arguments)
-        except RunFault:
-            raise
-        except (Exception, SystemExit) as error:
-            raise ConfigurationError(describe_at(error, folder_of(self.make))) from error
-        if not isinstance(controller, Controller):
-            raise ConfigurationError(f"it is built as {type(controller).__name__}, wanted a servobench.Controller")
-        return controller
+def _controller_of(kind: type[Any], config: type[Any] | None) -> ControllerEntry:
+    build = Build(kind, with_config=config is not None)
+    return ControllerEntry(kind.__name__, _summary(kind), config or NoSettings, build)
 
 
-@dataclass(frozen=True, eq=False)
-class Copy:
-    """Builds a controller from one that is there."""
-
-    original: Controller
-
-    def __call__(self, _knowledge: RobotKnowledge) -> Controller:
-        """Return a copy, so that no run sees what another left behind."""
-        return deepcopy(self.original)
+def _plant_of(kind: type[Any], config: type[Any] | None) -> PlantEntry:
+    if issubclass(kind, World):
+        default: type[Any] = BenchSettings
+        build = Build(OnBench(kind, config is not None), Plant)
+    else:
+        default, build = NoSettings, Build(kind, Plant, with_config=config is not None)
+    return PlantEntry(kind.__name__, _summary(kind), config or default, build, own_robot=bool(kind.own_robot))
 
 
-def make_entry(given: object, place: str, name: str | None = None) -> ControllerEntry:
+CONTROLLER: Final = Kind(
+    "controller",
+    ControllerEntry,
+    (Controller,),
+    "knowledge",
+    "wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
+    _controller_of,
+)
+PLANT: Final = Kind(
+    "plant",
+    PlantEntry,
+    (Plant, World),
+    "setup",
+    "wanted a subclass of servobench.Plant or servobench.World, or a servobench.PlantEntry",
+    _plant_of,
+)
+
+
+def make_entry(kind: Kind[Entry], given: object, place: str, name: str | None = None) -> Entry:
     """Return the entry of a class, an object or an entry, checked as far as it can be without a robot.
 
     Args:
+        kind: `CONTROLLER` or `PLANT`.
         given: what a user gives.
         place: where it stands, for messages.
         name: what it is to be called; None for the name of the entry or of the class.
@@ -76,29 +91,42 @@ def make_entry(given: object, place: str, name: str | None = None) -> Controller
     Raises:
         ConfigurationError: it cannot be used; says what to change.
     """
-    if isinstance(given, ControllerEntry):
-        entry = given
-        if isinstance(given.build, type) and issubclass(given.build, Controller):
+    if isinstance(given, kind.entry):
+        if isinstance(given.build, type) and issubclass(given.build, kind.bases):
             check_class(given.build)
-        if not isinstance(given.build, Build):
-            entry = replace(given, build=Build(given.build))
-    elif isinstance(given, type) and issubclass(given, Controller):
+        entry = _guard(given)
+    elif isinstance(given, type) and issubclass(given, kind.bases):
         check_class(given)
-        config = _config_class(given)
-        entry = ControllerEntry(
-            given.__name__, _summary(given), config or NoSettings, Build(given, with_config=config is not None)
+        entry = kind.of_class(given, _config_class(given, kind.argument))
+    elif isinstance(given, Controller) and kind.entry is ControllerEntry:
+        own = type(given)
+        build = Build(Copy(given), with_config=False)
+        entry = kind.entry(own.__name__, _summary(own), NoSettings, build)
+    elif isinstance(given, kind.bases):
+        raise ConfigurationError(
+            f"{place} is a {kind.word} that is built already; give its class, as each run needs one"
         )
-    elif isinstance(given, Controller):
-        kind = type(given)
-        entry = ControllerEntry(kind.__name__, _summary(kind), NoSettings, Build(Copy(given), with_config=False))
     else:
-        raise ConfigurationError(f"{place} is {_describe(given)}, {WANTED}")
+        raise ConfigurationError(f"{place} is {_describe(given)}, {kind.wanted}")
     entry = replace(entry, name=name or entry.name)
     _check_entry(entry, place)
     return entry
 
 
-def check_class(kind: type[Controller]) -> None:
+def _guard(entry: Entry) -> Entry:
+    """Return an entry whose functions, which are a user's, tell their errors as one line."""
+    if isinstance(entry.build, Build):
+        return entry
+    if isinstance(entry, ControllerEntry):
+        return replace(entry, build=Build(entry.build))
+    code: Any = entry.build
+    is_world = isinstance(code, type) and issubclass(code, World)
+    build = Build(OnBench(code, with_config=True) if is_world else code, Plant)
+    engine, config_for = (None if code is None else Guarded(code) for code in (entry.engine, entry.config_for))
+    return replace(entry, build=build, engine=engine, config_for=config_for)
+
+
+def check_class(kind: type[Any]) -> None:
     """Refuse a class that lacks methods.
 
     Raises:
@@ -110,16 +138,7 @@ def check_class(kind: type[Controller]) -> None:
         raise ConfigurationError(f"{_class_place(kind)}: class {kind.__name__} lacks {lacking}, which it must define")
 
 
-def folder_of(code: object) -> Path:
-    """Return the folder of the file that holds a class, a function or an object's class; that of none is the root."""
-    code = getattr(code, "original", code)
-    try:
-        return Path(inspect.getfile(code if isinstance(code, type) or inspect.isroutine(code) else type(code))).parent
-    except (TypeError, OSError):
-        return Path.cwd()
-
-
-def _check_entry(entry: ControllerEntry, place: str) -> None:
+def _check_entry(entry: ControllerEntry | PlantEntry, place: str) -> None:
     if not (isinstance(entry.name, str) and NAME.fullmatch(entry.name)):
         raise ConfigurationError(f"{place}: the name must be letters, digits and _, got {entry.name!r}")
     if not callable(entry.config):
@@ -153,9 +172,12 @@ def _without_default(config: object) -> list[str]:
             if each.init and each.default is MISSING and each.default_factory is MISSING]  # fmt: skip
 
 
-def _config_class(kind: type[Controller]) -> type[Any] | None:
-    """Return the class of the settings that the constructor of a controller takes first; None if it takes none."""
-    parameters = list(inspect.signature(kind).parameters.values())
+def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
+    """Return the class of the settings that a constructor takes before `argument`; None if it takes none."""
+    try:
+        parameters = list(inspect.signature(kind).parameters.values())
+    except (TypeError, ValueError):  # of compiled code
+        return None
     positional = [each for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
     needed = [each for each in positional if each.default is each.empty]
     only_by_name = [each for each in parameters if each.kind is each.KEYWORD_ONLY and each.default is each.empty]
@@ -163,13 +185,13 @@ def _config_class(kind: type[Controller]) -> type[Any] | None:
     if len(needed) > 2 or only_by_name or not parameters:
         got = ", ".join(["self", *(each.name for each in parameters)])
         raise ConfigurationError(
-            f"{where}.__init__ must take (self, knowledge) or (self, config, knowledge), got ({got})"
+            f"{where}.__init__ must take (self, {argument}) or (self, config, {argument}), got ({got})"
         )
     if len(needed) < 2:
         return None
     try:
         config = get_type_hints(kind.__init__).get(needed[0].name)
-    except (NameError, TypeError):
+    except Exception:  # noqa: BLE001 - annotations are code of the user
         config = None
     if not isinstance(config, type):
         raise ConfigurationError(
@@ -178,8 +200,9 @@ def _config_class(kind: type[Controller]) -> type[Any] | None:
     return config
 
 
-def _summary(kind: type[Controller]) -> str:
-    return (kind.__doc__ or kind.__name__).strip().splitlines()[0]
+def _summary(kind: type[Any]) -> str:
+    lines = (kind.__doc__ or "").strip().splitlines()
+    return lines[0] if lines else kind.__name__
 
 
 def _class_place(kind: type[Any]) -> str:

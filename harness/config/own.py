@@ -1,7 +1,8 @@
-"""Controllers of users: classes, objects and entries, given in Python or by the place of their code.
+"""Controllers and plants of users: classes, objects and entries, given in Python or by the place of their code.
 
 A place is a file, `./mine.py`, with `:NAME` if it defines several, or a module and a name, `package.module:NAME`. What
-stands there is a `ControllerEntry`, a subclass of `Controller`, or an object of one.
+stands there is a `ControllerEntry`, a subclass of `Controller`, or an object of one; or a `PlantEntry`, or a subclass
+of `Plant` or `World`.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Final
+from typing import Any, Final, Generic
 
-from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.harness.config.entries import make_entry
+from servobench.controllers.controller import ControllerEntry
+from servobench.harness.config.entries import Entry, Kind, make_entry
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import SourceFile, describe_at, make_importable
+from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
 
 PLACE: Final = re.compile(
@@ -29,10 +31,11 @@ PLACE: Final = re.compile(
 
 
 @dataclass(frozen=True)
-class OwnController:
-    """A controller that is no part of servobench and no entry point.
+class Own(Generic[Entry]):
+    """A controller or plant that is no part of servobench and no entry point.
 
     Attributes:
+        word: "controller" or "plant".
         entry: what it is built by.
         place: where it stands, for messages.
         source: its file; None where other processes import its module.
@@ -41,7 +44,8 @@ class OwnController:
         given: whether it was given as an object in Python.
     """
 
-    entry: ControllerEntry
+    word: str
+    entry: Entry
     place: str
     source: SourceFile | None = None
     file: str = ""
@@ -66,75 +70,73 @@ def is_place(text: str) -> bool:
     return found["file"] is not None or _can_import(found["module"])
 
 
-def read_own(text: str) -> OwnController:
-    """Return the controller at a place, `[NAME=]FILE.py[:NAME]` or `[NAME=]MODULE:NAME`.
+def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
+    """Return the controller or plant at a place, `[NAME=]FILE.py[:NAME]` or `[NAME=]MODULE:NAME`.
 
     Raises:
         ConfigurationError: whatever is wrong with it, as one line with file and line number.
     """
     found = PLACE.fullmatch(text)
     if found is None:
-        raise ConfigurationError(f"{text!r} is no place of a controller, such as ./mine.py or ./mine.py:Mine")
+        raise ConfigurationError(f"{text!r} is no place of a {kind.word}, such as ./mine.py or ./mine.py:Mine")
     place = text.partition("=")[2] if found["alias"] else text
     if found["file"]:
         source = SourceFile.read(found["file"])
-        given = _pick(source.load(), found["file"], found["name"])
+        given = _pick(kind, source.load(), found["file"], found["name"])
         file, digest = source.path, source.digest
     else:
         source, module = None, _import(found["module"])
-        given = _pick(module, found["module"], found["attribute"])
+        given = _pick(kind, module, found["module"], found["attribute"])
         file = Path(module.__file__ or found["module"])
         digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-    entry = make_entry(given, place, found["alias"])
-    return OwnController(entry, place, source, str(file), digest)
+    entry = make_entry(kind, given, place, found["alias"])
+    return Own(kind.word, entry, place, source, str(file), digest)
 
 
-def own_object(given: object) -> OwnController:
-    """Return a controller that is given in Python: a class, an object or an entry.
+def own_object(kind: Kind[Entry], given: object) -> Own[Entry]:
+    """Return a controller or plant that is given in Python: a class, an object or an entry.
 
     Raises:
         ConfigurationError: it is none of these, or cannot be used.
     """
-    code = given.build if isinstance(given, ControllerEntry) else given
-    kind = code if isinstance(code, type) else type(code)
-    entry = make_entry(given, "controller")
+    code = given.build if isinstance(given, kind.entry) else given
+    built = code if isinstance(code, type) else type(code)
+    entry = make_entry(kind, given, kind.word)
     try:
-        file, text = inspect.getfile(kind), inspect.getsource(kind)
+        file, text = inspect.getfile(built), inspect.getsource(built)
     except (OSError, TypeError):  # typed into an interpreter
-        return OwnController(entry, kind.__qualname__, given=True)
+        return Own(kind.word, entry, built.__qualname__, given=True)
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return OwnController(entry, kind.__qualname__, None, file, digest, given=True)
+    return Own(kind.word, entry, built.__qualname__, None, file, digest, given=True)
 
 
-def _pick(module: ModuleType, where: str, name: str | None) -> object:
-    """Return what a module calls `name`, or without a name its only controller."""
+def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> object:
+    """Return what a module calls `name`, or without a name its only controller or plant."""
+    found = _members(kind, module)
     if name is not None:
         if not hasattr(module, name):
-            raise ConfigurationError(f"{where} has no {name!r}: {_choice(module, name)}")
+            hint = suggest(name, found) if found else f"it defines no {kind.word}"
+            raise ConfigurationError(f"{where} has no {name!r}: {hint}")
         return getattr(module, name)
-    if hasattr(module, "ENTRY"):
-        return module.ENTRY
-    found = _controllers(module)
+    entry = getattr(module, "ENTRY", None)
+    if isinstance(entry, kind.entry) or not isinstance(entry, ControllerEntry | PlantEntry | None):
+        return entry
     if len(found) == 1:
         return next(iter(found.values()))
     if not found:
-        raise ConfigurationError(f"{where} defines no controller: no subclass of servobench.Controller and no ENTRY")
+        bases = " or ".join(f"servobench.{each.__name__}" for each in kind.bases)
+        raise ConfigurationError(f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY")
     first, *_ = found
     raise ConfigurationError(f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}")
 
 
-def _choice(module: ModuleType, name: str) -> str:
-    found = _controllers(module)
-    return suggest(name, found) if found else "it defines no controller"
-
-
-def _controllers(module: ModuleType) -> dict[str, object]:
-    """Return the controllers that a module defines itself; classes that lack methods only if there are no others."""
+def _members(kind: Kind[Any], module: ModuleType) -> dict[str, object]:
+    """Return what a module defines of a kind itself; classes that lack methods only if there are no others."""
     found: dict[str, object] = {
         name: value
         for name, value in vars(module).items()
-        if isinstance(value, ControllerEntry)
-        or (isinstance(value, type) and issubclass(value, Controller) and value.__module__ == module.__name__)
+        if isinstance(value, kind.entry)
+        or (isinstance(value, type) and issubclass(value, kind.bases) and value.__module__ == module.__name__)
     }
     whole = {name: value for name, value in found.items() if not inspect.isabstract(value)}
     return whole or found

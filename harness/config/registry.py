@@ -1,8 +1,8 @@
 """Plants, controllers and tasks by name: those of this package and those that other distributions publish.
 
-A third party publishes a `PlantEntry` or `ControllerEntry`, or a subclass of `Controller`, under the entry-point group
-`servobench.plants` or `servobench.controllers`; a name of this package cannot be taken over. Controllers that a user
-gives as files or objects are offered under a name for as long as a command or call takes.
+A third party publishes a `PlantEntry`, a `ControllerEntry`, or a subclass of `Plant`, `World` or `Controller` under the
+entry-point group `servobench.plants` or `servobench.controllers`; a name of this package cannot be taken over. Those
+that a user gives as files or objects are offered under a name for as long as a command or call takes.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
 from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.config.entries import make_entry
+from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
 from servobench.harness.config.extras import check_installed
-from servobench.harness.config.own import OwnController, describe_import, is_place, read_own
+from servobench.harness.config.own import Own, describe_import, is_place, read_own
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
@@ -34,19 +35,22 @@ PLANTS = {
 }
 DEFAULT_PLANTS = ("bullet", "kinematic")  # the first one that is installed
 MAPPED = "fmu:"
+RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
 FORMER_NAMES = {"rbfnn_mfac_plus": "map_mfac"}  # understood until 0.3.0
 
 
-_OFFERED: dict[str, OwnController] = {}
+Offer: TypeAlias = Own[ControllerEntry] | Own[PlantEntry]
+
+_OFFERED: dict[str, Offer] = {}
 
 
 @contextlib.contextmanager
-def offering(controllers: Iterable[OwnController] = ()) -> Iterator[None]:
-    """Let `find_controller` find further controllers, these and those that are offered within the context."""
+def offering(given: Iterable[Offer] = ()) -> Iterator[None]:
+    """Let controllers and plants be found by name, these and those that are offered within the context."""
     before = dict(_OFFERED)
-    _OFFERED.update((each.name, each) for each in controllers)
+    _OFFERED.update((each.name, each) for each in given)
     try:
         yield
     finally:
@@ -54,23 +58,27 @@ def offering(controllers: Iterable[OwnController] = ()) -> Iterator[None]:
         _OFFERED.update(before)
 
 
-def offer(own: OwnController) -> str:
-    """Let `find_controller` find a controller of a user, and return its name.
+def offer(own: Offer) -> str:
+    """Let a controller or plant of a user be found by its name, and return this name.
+
+    Settings stand in sections of these names, so a controller and a plant cannot share one.
 
     Raises:
-        ConfigurationError: another controller has this name.
+        ConfigurationError: another controller or plant has this name.
     """
     name, other = own.name, _OFFERED.get(own.name)
-    if name in controller_names() or name in FORMER_NAMES:
-        raise ConfigurationError(f"a controller called {name!r} exists already; {_rename(own)}")
+    taken = {RUN: "a section of settings", **dict.fromkeys(plant_names(), "a plant")}
+    taken |= dict.fromkeys([*controller_names(), *FORMER_NAMES], "a controller")
+    if name in taken:
+        raise ConfigurationError(f"{taken[name]} called {name!r} exists already; {_rename(own)}")
     if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
         raise ConfigurationError(f"{other.place} and {own.place} are both called {name!r}; {_rename(own)}")
     _OFFERED[name] = own
     return name
 
 
-def offered(names: Iterable[str]) -> tuple[OwnController, ...]:
-    """Return those of the controllers `names` that users gave."""
+def offered(names: Iterable[str]) -> tuple[Offer, ...]:
+    """Return those of the controllers and plants `names` that users gave."""
     return tuple(_OFFERED[name] for name in names if name in _OFFERED)
 
 
@@ -81,8 +89,20 @@ def choose_controller(text: str) -> str:
         ConfigurationError: there is no such controller, or it cannot be used; one line with file and line number.
     """
     if text not in (*_OFFERED, *controller_names()) and is_place(text):
-        return offer(read_own(text))
+        return offer(read_own(CONTROLLER, text))
     find_controller(text)
+    return text
+
+
+def choose_plant(text: str) -> str:
+    """Return the name of the plant that a user names, or whose place is given, such as ./cell.py:Cell.
+
+    Raises:
+        ConfigurationError: there is no such plant, or it cannot be used; one line with file and line number.
+    """
+    if not (text in (*_OFFERED, *plant_names()) or text.startswith(MAPPED)) and is_place(text):
+        return offer(read_own(PLANT, text))
+    find_plant(text)
     return text
 
 
@@ -109,12 +129,8 @@ def find_plant(name: str) -> PlantEntry:
             return mapped_entry(Path(name.removeprefix(MAPPED)).expanduser())
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
-    entry = _load(PLANT_GROUP, "plant", name)
-    if not isinstance(entry, PlantEntry):
-        raise ConfigurationError(
-            f"plant {name!r} is published as {type(entry).__name__}, wanted a servobench.plant.plant.PlantEntry"
-        )
-    return entry
+    own = _OFFERED.get(name)
+    return own.entry if own is not None and isinstance(own.entry, PlantEntry) else _load_plant(name)
 
 
 def installed_plant(name: str) -> PlantEntry:
@@ -151,8 +167,9 @@ def find_controller(name: str) -> ControllerEntry:
             return compose(law, estimator)
         except ValueError as error:
             raise ConfigurationError(f"controller {name!r}: {error}") from error
-    if name in _OFFERED:
-        return _OFFERED[name].entry
+    own = _OFFERED.get(name)
+    if own is not None and isinstance(own.entry, ControllerEntry):
+        return own.entry
     if name in METHODS:
         return METHODS[name]
     return _load_controller(name)
@@ -175,22 +192,35 @@ def own_modules(plants: Iterable[str], controllers: Iterable[str]) -> tuple[str,
     return tuple(value.partition(":")[0] for value in values if value is not None)
 
 
-def _rename(own: OwnController) -> str:
+def _rename(own: Offer) -> str:
     if own.given:
-        return "give yours another name, as a class of that name or in a ControllerEntry"
+        return f"give yours another name, as a class of that name or in a {type(own.entry).__name__}"
     return f"give yours another name, such as my_{own.name.replace(':', '_')}={own.place}"
 
 
 @cache
+def _load_plant(name: str) -> PlantEntry:
+    given = _load(PLANT_GROUP, PLANT.word, name)
+    if name in PLANTS and isinstance(given, PlantEntry):
+        return given
+    return _published(PLANT_GROUP, PLANT, name, given)
+
+
+@cache
 def _load_controller(name: str) -> ControllerEntry:
-    given = _load(CONTROLLER_GROUP, "controller", name)
+    given = _load(CONTROLLER_GROUP, CONTROLLER.word, name)
     if name in NOT_COMPOSED and isinstance(given, ControllerEntry):
         return given
-    value = _points(CONTROLLER_GROUP)[name].value
+    return _published(CONTROLLER_GROUP, CONTROLLER, name, given)
+
+
+def _published(group: str, kind: Kind[Entry], name: str, given: object) -> Entry:
+    """Return the entry of what a third party publishes."""
+    value = _points(group)[name].value
     try:
-        return make_entry(given, value, name)
+        return make_entry(kind, given, value, name)
     except ConfigurationError as error:
-        raise ConfigurationError(f"controller {name!r} ({value}) cannot be used: {error}") from error
+        raise ConfigurationError(f"{kind.word} {name!r} ({value}) cannot be used: {error}") from error
 
 
 @cache
@@ -225,8 +255,8 @@ def _load(group: str, kind: str, name: str) -> object:
     points = _points(group)
     if name not in points:
         known = plant_names() if group == PLANT_GROUP else controller_names()
-        if group == CONTROLLER_GROUP and Path(f"{name}.py").is_file():
-            raise ConfigurationError(f"unknown controller {name!r}: did you mean your file './{name}.py'?")
+        if Path(f"{name}.py").is_file():
+            raise ConfigurationError(f"unknown {kind} {name!r}: did you mean your file './{name}.py'?")
         raise ConfigurationError(f"unknown {kind} {name!r}: {_part(kind, name) or suggest(name, known)}")
     point = points[name]
     try:

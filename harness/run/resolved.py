@@ -54,6 +54,10 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict
     """
     defaults: dict[str, Any] = {"run": RunSettings()}
     requests = list(requests)
+    for request in requests:
+        for name, what in ((request.plant, "plant"), (request.controller, "controller")):
+            if name in TASKS:
+                raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
     robot = _common_robot(requests)
     defaults |= {name: _plant_default(name, robot) for name in dict.fromkeys(each.plant for each in requests)}
     defaults |= {

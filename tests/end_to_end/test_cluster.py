@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from kit.command import PACKAGE, finish, judged, part_count, start, wait_for
+from kit.own import CONFIGURED, CONFIGURED_CELL, write
 from servobench.harness.batch import results
 from servobench.harness.batch.workers import Bounds, open_workers
 from servobench.harness.config.settings import ConfigurationError
@@ -65,6 +66,33 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
     assert 0 < finished_before < RUNS
     tables = [judged(results.load_runs(tmp_path / name)) for name in ("remote", "local")]
     pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
+def test_a_cluster_carries_out_a_controller_and_a_plant_from_files(cluster, tmp_path):
+    cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/mine.py")
+    asked = [
+        "compare",
+        "--plants",
+        f"{cell}:Cell",
+        "--controllers",
+        f"{mine},constant",
+        "--tasks",
+        "exp1",
+        "--seeds",
+        "2",
+    ]
+    asked += ["--no-report", "--set", "exp1.duration=1", "--set", "Mine.gain=3", "--set", "Cell.speed=0.5"]
+    places = {"local": ("--workers", "1"), "remote": ("--scheduler", cluster[0])}
+    started = [start(*asked, "--out", str(tmp_path / name), *where) for name, where in places.items()]
+    for process in started:
+        code, output = finish(process)
+        assert code == 0, output
+    tables = [judged(results.load_runs(tmp_path / name)) for name in places]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+    assert len(tables[0]) == 4
+    assert set(tables[0]["plant"]) == {"Cell"}
+    assert set(tables[0]["controller"]) == {"Mine", "constant"}
+    assert not set(tables[0]["outcome"]) & {"crashed"}, tables[1]["reason"].tolist()
 
 
 @pytest.mark.parametrize(

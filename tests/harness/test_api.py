@@ -11,7 +11,7 @@ import pytest
 
 import servobench
 from kit.command import PACKAGE
-from servobench.harness.config.entries import NoSettings
+from servobench.harness.config.builds import NoSettings
 
 SHORT = {"exp1": {"duration": 0.5}}
 

@@ -15,7 +15,8 @@ import pytest
 from kit.command import PACKAGE, servobench
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
-from servobench.harness.config.entries import NoSettings
+from servobench.harness.config.builds import NoSettings
+from servobench.harness.config.entries import CONTROLLER
 from servobench.harness.config.own import own_object
 from servobench.harness.config.registry import offering
 from servobench.plant.signals import Command
@@ -55,7 +56,7 @@ def call(monkeypatch, tmp_path):
     """Return a function that runs a command in an empty folder and returns its exit code; it draws nothing."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("servobench.harness.pictures.draw.draw_figures", lambda _: [])
-    with offering(map(own_object, ENTRIES)):
+    with offering([own_object(CONTROLLER, each) for each in ENTRIES]):
         yield partial(servobench, monkeypatch)
 
 

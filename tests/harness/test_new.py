@@ -1,4 +1,4 @@
-"""`servobench new controller`: what it writes runs, keeps the contract, and overwrites nothing."""
+"""`servobench new`: what it writes runs, keeps the contract, and overwrites nothing."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ def _own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def test_a_new_controller_passes_its_own_test(monkeypatch, capsys, tmp_path):
-    assert servobench(monkeypatch, "new", "controller", "my_law", "--folder", "laws") == 0
-    assert "servobench check ./laws/my_law.py" in capsys.readouterr().out
+@pytest.mark.parametrize(("kind", "check"), [("controller", "check"), ("plant", "check plant")])
+def test_a_new_file_passes_its_own_test(monkeypatch, capsys, tmp_path, kind, check):
+    assert servobench(monkeypatch, "new", kind, "my_law", "--folder", "laws") == 0
+    assert f"servobench {check} ./laws/my_law.py" in capsys.readouterr().out
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_law.py"],
         cwd=tmp_path / "laws", env={**os.environ, "PYTHONPATH": str(PACKAGE)},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from servobench.controllers.controller import ControllerEntry, Delays
+from servobench.harness.config.entries import CONTROLLER
 from servobench.harness.config.own import own_object
 from servobench.harness.config.registry import find_controller, offering
 from servobench.harness.config.settings import Settings
@@ -22,7 +23,7 @@ def knowledge_of(plant, needs_truth, settings, **request):
         seen.append(knowledge)
         return constant.build(config, knowledge)
 
-    with offering([own_object(ControllerEntry("spy", "", constant.config, build, needs_truth))]):
+    with offering([own_object(CONTROLLER, ControllerEntry("spy", "", constant.config, build, needs_truth))]):
         run = RunRequest(plant, "spy", "exp1", "moderate", 0, **request)
         build_experiment(run, Settings({plant: settings})).plant.close()
     return seen[0]

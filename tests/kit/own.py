@@ -61,3 +61,86 @@ def install(folder: Path, module: str, text: str, points: str) -> Path:
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(points)
     return folder
+
+
+CELL = '''
+import numpy as np
+import servobench
+
+
+class Cell(servobench.World):
+    """Joints that follow at once."""
+
+    def __init__(self, setup):
+        self.model, self.start = setup.robot()
+        names = [f"q{i}" for i in range(len(self.start))]
+        limits = setup.limits
+        self.spec = servobench.PlantSpec.of_joints(
+            tuple(names), ("x", "y", "z"), limits.speed, limits.lower, limits.upper, setup.period
+        )
+
+    def reset(self, seed):
+        self.q = self.start
+        return self.q
+
+    def advance(self, joint_velocity):
+        self.q = np.clip(self.q + self.spec.period * joint_velocity, self.spec.joint_lower, self.spec.joint_upper)
+        return self.q
+
+    def see(self):
+        return self.model.feature(self.q)
+
+    def truth(self):
+        return servobench.Truth(self.model.feature(self.q), self.model.jacobian(self.q))
+
+    def close(self):
+        pass
+'''
+CELL_CONFIG = """
+
+@dataclass(frozen=True)
+class CellConfig:
+    speed: float = 1.0
+
+"""
+CONFIGURED_CELL = (
+    CELL.replace("import numpy", "from dataclasses import dataclass\n\nimport numpy")
+    .replace("\n\nclass Cell(", f"{CELL_CONFIG}\nclass Cell(")
+    .replace("self, setup", "self, config: CellConfig, setup")
+    .replace("limits.speed", "limits.speed.clip(max=config.speed)")
+)
+PLAIN_CELL = '''
+import numpy as np
+import servobench
+
+
+class Plain(servobench.Plant):
+    """Two joints whose positions are the feature: a robot of its own, without a bench."""
+
+    own_robot = True
+
+    def __init__(self, setup):
+        limit, stop = np.ones(2), np.full(2, 3.0)
+        self.spec = servobench.PlantSpec.of_joints(("a", "b"), ("x", "y"), limit, -stop, stop, setup.period)
+
+    def reset(self, seed):
+        if seed < 0:
+            raise ValueError("seed must not be negative")
+        self.k, self.q = 0, np.array([0.3, 0.2])
+        return self.seen()
+
+    def step(self, command):
+        limit = self.spec.joint_velocity_limit
+        self.q = self.q + self.spec.period * np.clip(command.joint_velocity, -limit, limit)
+        self.k += 1
+        return self.seen()
+
+    def seen(self):
+        return servobench.Observation(self.k * self.spec.period, self.q, self.q)
+
+    def truth(self):
+        return servobench.Truth(self.q, np.eye(2))
+
+    def close(self):
+        pass
+'''

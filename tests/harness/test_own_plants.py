@@ -1,0 +1,213 @@
+"""Plants of users, given by the place of their code or as classes: found, run, checked, and refused in one line."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import pandas as pd
+import pytest
+
+import servobench
+from kit.command import judged
+from kit.command import servobench as command
+from kit.own import CELL, CONFIGURED_CELL, PLAIN_CELL, WHOLE, write
+from servobench.harness.config.registry import choose_controller, choose_plant, find_plant, offered, offering
+from servobench.harness.config.settings import ConfigurationError
+
+SHORT = {"exp1": {"duration": 0.5}}
+ENTRY = '\n\nENTRY = servobench.PlantEntry("cell", "one line", CellConfig, Cell)\n'
+TWO = CELL + "\n\nclass Other(Cell):\n    pass\n"
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(tmp_path, monkeypatch):
+    """Each test has a folder, a path of imports and offers of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    with offering():
+        yield
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "name"),
+    [
+        (CELL, "./cell.py", "Cell"),
+        (CELL, "cell.py:Cell", "Cell"),
+        (CELL, "first=./cell.py", "first"),
+        (TWO, "./cell.py:Other", "Other"),
+        (CONFIGURED_CELL, "./cell.py", "Cell"),
+        (CONFIGURED_CELL + ENTRY, "./cell.py", "cell"),
+        (PLAIN_CELL, "./cell.py", "Plain"),
+        (CELL + WHOLE, "./cell.py", "Cell"),  # a file may hold a controller, too
+    ],
+)
+def test_a_plant_is_found_by_the_place_of_its_code(tmp_path, text, place, name):
+    path = write(tmp_path, text, "cell.py")
+    assert choose_plant(place) == name
+    assert choose_plant(place) == name  # asked for again, it is the same one
+    entry = find_plant(name)
+    assert entry.name == name
+    assert entry.own_robot == (text is PLAIN_CELL)
+    record = offered([name])[0].record()
+    assert (record["place"], record["file"]) == (place.partition("=")[2] or place, str(path))
+    assert re.fullmatch("[0-9a-f]{64}", record["sha256"])
+
+
+@pytest.mark.parametrize("text", [CELL, CONFIGURED_CELL, CONFIGURED_CELL + ENTRY, PLAIN_CELL])
+def test_a_whole_plant_passes_every_check(tmp_path, text):
+    write(tmp_path, text, "cell.py")
+    report = servobench.check_plant("./cell.py")
+    assert {each.verdict for each in report.findings} == {"ok"}, report
+    assert len(report.findings) == 9
+
+
+def test_a_world_has_the_settings_of_a_bench_and_the_noise_that_they_ask_for(tmp_path):
+    write(tmp_path, CELL, "cell.py")
+    last = {}
+    for noise in (0.0, 0.01):
+        settings = SHORT | {"Cell": {"sensing": {"feature_noise": noise}}}
+        steps = servobench.run("constant", "./cell.py", settings=settings).steps
+        last[noise] = (steps["feature_x_m"] - steps["true_feature_x_m"]).std()
+    assert last[0.0] == 0.0
+    assert 0.003 < last[0.01] < 0.03
+
+
+def test_settings_of_a_plant_reach_it(tmp_path):
+    write(tmp_path, CONFIGURED_CELL, "cell.py")
+    speeds = {}
+    for speed in (0.5, 1.0):
+        run = servobench.run("constant", "./cell.py", settings={"Cell": {"speed": speed}, **SHORT})
+        speeds[speed] = run.steps.filter(regex="^joint_position").diff().abs().max().max() / 0.05
+    assert speeds[0.5] == pytest.approx(0.5)
+    assert speeds[1.0] == pytest.approx(1.0)
+
+
+def test_worker_processes_carry_out_the_same_runs_as_this_one(tmp_path):
+    write(tmp_path, CELL, "a/cell.py")
+    write(tmp_path, WHOLE, "b/mine.py")
+    tables = [
+        servobench.compare(
+            ["b/mine.py", "constant"], ["a/cell.py", "kinematic"], seeds=2, settings=SHORT, workers=workers, out=out
+        )
+        for workers, out in ((1, "one"), (2, "two"))
+    ]
+    pd.testing.assert_frame_equal(*map(judged, tables), check_exact=True)
+    assert tables[0]["outcome"].tolist() != ["crashed"] * 8
+    record = json.loads((tmp_path / "two" / "manifest.json").read_text())
+    assert record["own_plants"]["Cell"]["place"] == "a/cell.py"
+    assert list(record["own_controllers"]) == ["Mine"]
+
+
+def test_a_class_is_taken_in_python_and_its_robot_may_be_its_own():
+    from kit.toy_plants import Plain
+
+    run = servobench.run(
+        "constant", Plain, task="target", mismatch="none",
+        settings={"target": {"target": [0.0, 0.0], "duration": 6.0}, "constant": {"initial": {"source": "probe"}}},
+    )  # fmt: skip
+    assert run.row["outcome"] == "settled", run.row["reason"]
+
+
+def test_another_text_of_a_plant_is_refused_when_a_folder_is_resumed(tmp_path):
+    path = write(tmp_path, CELL, "cell.py")
+    asked = {"plants": ["./cell.py"], "settings": SHORT, "out": "folder"}
+    servobench.compare(["constant"], **asked)
+    path.write_text(CELL + "\n# changed\n")
+    with offering(), pytest.raises(ConfigurationError, match=r"begun with another text of \./cell\.py"):
+        servobench.compare(["constant"], resume=True, **asked)
+
+
+def test_a_plant_and_a_controller_cannot_share_a_name(tmp_path):
+    write(tmp_path, CELL, "cell.py")
+    write(tmp_path, WHOLE)
+    assert choose_plant("Same=./cell.py") == "Same"
+    with pytest.raises(ConfigurationError, match=r"\./cell\.py and \./mine\.py are both called 'Same'"):
+        choose_controller("Same=./mine.py")
+    for name, what in (("kinematic", "a plant"), ("ukf_mfac", "a controller"), ("run", "a section of settings")):
+        with pytest.raises(ConfigurationError, match=f"{what} called '{name}' exists already"):
+            choose_plant(f"{name}=./cell.py")
+    with pytest.raises(ConfigurationError, match="a task is called 'circle', too; give the plant another name"):
+        servobench.run("constant", "circle=./cell.py", task="circle")
+
+
+BROKEN = {
+    "syntax": (CELL.replace("setup.robot()", "setup.robot("), "cell.py:10: SyntaxError: '(' was never closed"),
+    "no such module": ("import torhc\n" + CELL, "cell.py:1: ModuleNotFoundError: No module named 'torhc'"),
+    "no advance": (CELL.replace("def advance", "def go"), "cell.py:6: class Cell lacks advance, which it must define"),
+    "nothing in it": (WHOLE, "./cell.py defines no plant: no subclass of servobench.Plant or servobench.World"),
+    "two of them": (TWO, "./cell.py defines Cell, Other; name one of them, such as ./cell.py:Cell"),
+    "no setup": (
+        CELL.replace("self, setup", "self"),
+        "cell.py:6: Cell.__init__ must take (self, setup) or (self, config, setup), got (self)",
+    ),
+    "an object": (
+        PLAIN_CELL + "from types import SimpleNamespace\nENTRY = Plain(SimpleNamespace(period=0.05))\n",
+        "./cell.py is a plant that is built already; give its class",
+    ),
+    "a dictionary": (CELL + "ENTRY = {}\n", "./cell.py is of type dict, wanted a subclass of servobench.Plant or"),
+    "settings without a default": (
+        CONFIGURED_CELL.replace(" = 1.0", ""), "cell.py:8: every field of CellConfig needs a default; speed has none",
+    ),
+    "exception in the constructor": (
+        CELL.replace("setup.limits", "setup.limit"),
+        "plant Cell: cell.py:12: AttributeError: 'PlantSetup' object has no attribute 'limit'",
+    ),
+    "exit in the constructor": (
+        CELL.replace("limits = setup.limits", "raise SystemExit(3)"), "plant Cell: cell.py:12: SystemExit: 3",
+    ),
+    "no spec": (
+        CELL.replace("self.spec = servobench", "spec = servobench"),
+        "plant Cell: Cell.__init__ must set self.spec to a servobench.PlantSpec, got nothing",
+    ),
+    "an entry that builds something else": (
+        CONFIGURED_CELL + ENTRY.replace("Cell)", "lambda config, setup: 3)"),
+        "plant cell: it is built as int, wanted a servobench.Plant",
+    ),
+    "an entry whose engine fails": (
+        CONFIGURED_CELL + ENTRY.replace("Cell)", "Cell, engine=lambda: 1 / 0)"),
+        "cell.py:42: ZeroDivisionError: division by zero",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_a_broken_file_is_one_line_with_its_place_and_exit_code_2(tmp_path, monkeypatch, capsys, what):
+    text, message = BROKEN[what]
+    write(tmp_path, text, "cell.py")
+    assert command(monkeypatch, "run", "--plant", "./cell.py", "constant") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"servobench: {message}")
+    assert error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["cell.py"]
+
+
+SEEN, MOVED = "return self.model.feature(self.q)\n", "return self.q\n\n    def see"
+FAILING = [
+    (SEEN, "1 / 0", r"ZeroDivisionError: .*cell\.py:26 in Cell\.see"),
+    (SEEN, "return 'here'\n", "Cell.see must return 3 features, or None, got 'here'"),
+    (MOVED, MOVED.replace("self.q", "self.q[:5]"), r"Cell\.advance must return 6 joint positions, got shape \(5,\)"),
+    (MOVED, MOVED.replace("self.q", "self.q * np.nan"), r"Cell\.advance returned \[nan, .* not finite"),
+]
+
+
+@pytest.mark.parametrize(("line", "with_", "reason"), FAILING)
+def test_what_fails_in_a_run_is_a_row_that_says_where(tmp_path, line, with_, reason):
+    write(tmp_path, CELL.replace(line, with_, 1), "cell.py")
+    table = servobench.compare(["constant"], ["./cell.py", "kinematic"], settings=SHORT)
+    assert table["outcome"].tolist()[0] != table["outcome"].tolist()[1]
+    assert re.search(reason, table["reason"].iloc[0]), table["reason"].iloc[0]
+
+
+def test_a_plant_is_named_on_every_command_that_takes_one(tmp_path, monkeypatch, capsys):
+    write(tmp_path, CONFIGURED_CELL, "cell.py")
+    assert command(monkeypatch, "plants", "./cell.py", "--json") == 0
+    assert json.loads(capsys.readouterr().out)[0]["setting"] == "Cell.speed"
+    assert command(monkeypatch, "check", "plant", "./cell.py") == 0
+    assert "./cell.py: keeps its contract" in capsys.readouterr().out
+    assert command(monkeypatch, "init", "--plants", "./cell.py", "cell.toml") == 0
+    assert "[Cell]" in (tmp_path / "cell.toml").read_text()
+    asked = ["--plants", "./cell.py", "--controllers", "constant", "--tasks", "exp1", "--no-report", "--workers", "1"]
+    assert command(monkeypatch, "compare", *asked, "--config", "cell.toml", "--out", "out") == 0
+    assert "exp1 on Cell, moderate" in capsys.readouterr().out
