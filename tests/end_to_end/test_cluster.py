@@ -70,18 +70,8 @@ def test_a_worker_that_is_killed_in_mid_sweep_loses_no_run(cluster, tmp_path):
 
 def test_a_cluster_carries_out_a_controller_and_a_plant_from_files(cluster, tmp_path):
     cell, mine = write(tmp_path, CONFIGURED_CELL, "a/cell.py"), write(tmp_path, CONFIGURED, "b/mine.py")
-    asked = [
-        "compare",
-        "--plants",
-        f"{cell}:Cell",
-        "--controllers",
-        f"{mine},constant",
-        "--tasks",
-        "exp1",
-        "--seeds",
-        "2",
-    ]
-    asked += ["--no-report", "--set", "exp1.duration=1", "--set", "Mine.gain=3", "--set", "Cell.speed=0.5"]
+    named = f"--plants {cell}:Cell --controllers {mine},constant --tasks exp1 --seeds 2 --no-report"
+    asked = ["compare", *named.split(), "--set", "exp1.duration=1", "--set", "Mine.gain=3", "--set", "Cell.speed=0.5"]
     places = {"local": ("--workers", "1"), "remote": ("--scheduler", cluster[0])}
     started = [start(*asked, "--out", str(tmp_path / name), *where) for name, where in places.items()]
     for process in started:
