@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -19,13 +19,15 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.config.registry import choose_plant, find_plant, installed_plant, plant_names
+    from servobench.harness.config.registry import choose_plant, find_plant, plant_names, unused_points
+    from servobench.harness.run.trial import usable_plant
+    from servobench.plant.plant import PlantEntry
 
     if name:
         name = choose_plant(name)
         _show_settings(name, find_plant(name).config(), as_json=as_json)
     else:
-        _show_names(plant_names(), installed_plant, as_json=as_json)
+        _show_names(plant_names(), usable_plant, unused_points(PlantEntry), as_json=as_json)
 
 
 def controllers(
@@ -33,15 +35,22 @@ def controllers(
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
+    from servobench.controllers.controller import ControllerEntry
     from servobench.controllers.parts import ESTIMATORS, LAWS
     from servobench.harness.config.defaults import default_config
-    from servobench.harness.config.registry import choose_controller, controller_names, find_controller
+    from servobench.harness.config.registry import (
+        choose_controller,
+        controller_names,
+        find_controller,
+        unused_points,
+    )
+    from servobench.harness.run.trial import usable_controller
 
     if name:
         name = choose_controller(name)
         _show_settings(name, default_config(find_controller(name)), as_json=as_json)
         return
-    _show_names(controller_names(), find_controller, as_json=as_json)
+    _show_names(controller_names(), usable_controller, unused_points(ControllerEntry), as_json=as_json)
     if not as_json:
         console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
         console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
@@ -57,10 +66,12 @@ def tasks(
     if name:
         _show_settings(name, find_task(name).default, as_json=as_json)
     else:
-        _show_names(list(TASKS), find_task, as_json=as_json)
+        _show_names(list(TASKS), find_task, [], as_json=as_json)
 
 
-def _show_names(names: Sequence[str], find: Callable[[str], Any], *, as_json: bool) -> None:
+def _show_names(
+    names: Sequence[str], find: Callable[[str], Any], unused: Iterable[tuple[str, str]], *, as_json: bool
+) -> None:
     """Print names with their summaries, and what is wrong with those that cannot be used."""
     from rich.table import Table
     from rich.text import Text
@@ -73,13 +84,14 @@ def _show_names(names: Sequence[str], find: Callable[[str], Any], *, as_json: bo
             found.append({"name": name, "summary": find(name).summary})
         except ConfigurationError as error:  # an extra is missing, or a plug-in is broken; the others are usable
             found.append({"name": name, "error": str(error)})
+    found += [{"name": name, "error": line} for name, line in unused]
     if as_json:
         print_json(found)
         return
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     table.add_column(no_wrap=True, style="bold")
     table.add_column()
-    summaries = {each["name"]: each.get("summary", "") for each in found}
+    summaries = {each["name"]: each["summary"] for each in found if "summary" in each}
     for each in found:
         base = summaries.get(each["name"].partition(":")[0], "")
         words = each.get("summary", "")

@@ -15,9 +15,11 @@ import typer
 from servobench.harness.cli import completion
 
 if TYPE_CHECKING:
+    from servobench.controllers.controller import ControllerEntry
     from servobench.harness.batch.campaign import Execution, Observer
     from servobench.harness.batch.workers import Bounds
     from servobench.harness.config.settings import Settings
+    from servobench.plant.plant import PlantEntry
 
 DEFAULT_PLANT = "bullet, or kinematic where PyBullet is not installed"
 FAILED = 1  # exit code where a run failed, or a check was not passed
@@ -267,15 +269,23 @@ def default_plant() -> str:
     return name
 
 
-def _usable(names: Sequence[str], find: Callable[[str], Any], text: str) -> list[str]:
-    """Return `names`; where `text` asks for all of them only those that can be used, with a line for each other."""
+def tell_unused(entry: type[ControllerEntry | PlantEntry], named: Sequence[str]) -> None:
+    """Print a line for each entry point that is not used though a user named it, or all."""
+    from servobench.harness.config.registry import ALL, unused_points
+
+    for name, line in unused_points(entry):
+        if name in named or ALL in named:
+            sys.stderr.write(f"servobench: note: {line}\n")
+
+
+def _usable(names: Sequence[str], find: Callable[[str], Any]) -> list[str]:
+    """Return those of all names that can be used, with a line for each other."""
     from servobench.harness.config.settings import ConfigurationError
 
     usable = []
     for name in names:
         try:
-            if text.strip() == "all":
-                find(name)
+            find(name)
         except ConfigurationError as error:
             sys.stderr.write(f"servobench: left out: {error}\n")
         else:
@@ -283,23 +293,30 @@ def _usable(names: Sequence[str], find: Callable[[str], Any], text: str) -> list
     return usable
 
 
-def split_plants(text: str, option: str = "plants") -> tuple[str, ...]:
+def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of the plants that a user named, or whose place was given, such as ./cell.py:Cell."""
-    from servobench.harness.config.registry import choose_plant, find_plant, plant_names
+    from servobench.harness.config.registry import ALL, choose_plant, find_plant, plant_names
+    from servobench.harness.run.trial import usable_plant
+    from servobench.plant.plant import PlantEntry
 
     known, names = plant_names(), list[str]()
     for word in split_words(text):
-        names += _usable(known, find_plant, word) if word == "all" else [choose_plant(word)]
+        names += _usable(known, lambda name: usable_plant(name, robot)) if word == ALL else [choose_plant(word)]
+    tell_unused(PlantEntry, split_words(text))
     return split_names(option, ",".join(names), known, find_plant)
 
 
-def split_controllers(text: str) -> tuple[str, ...]:
+def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of the controllers that a user named, or whose place was given, such as ./mine.py:Mine."""
-    from servobench.harness.config.registry import choose_controller, controller_names, find_controller
+    from servobench.controllers.controller import ControllerEntry
+    from servobench.harness.config.registry import ALL, choose_controller, controller_names, find_controller
+    from servobench.harness.run.trial import usable_controller
 
     known, names = controller_names(), list[str]()
     for word in split_words(text):
-        names += _usable(known, find_controller, word) if word == "all" else [choose_controller(word)]
+        is_all = word == ALL
+        names += _usable(known, lambda name: usable_controller(name, robot)) if is_all else [choose_controller(word)]
+    tell_unused(ControllerEntry, split_words(text))
     return split_names("controllers", ",".join(names), known, find_controller)
 
 

@@ -67,10 +67,12 @@ def run(
 
     The exit code is 1 if the run failed.
     """
+    from servobench.controllers.controller import ControllerEntry
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.config.registry import choose_controller, choose_plant
     from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.plant import PlantEntry
 
     if method and controller and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
@@ -79,6 +81,8 @@ def run(
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
+    options.tell_unused(ControllerEntry, [name])
+    options.tell_unused(PlantEntry, [plant])
     batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"), options.known_robot(robot))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     folder = _carry_out(
@@ -106,8 +110,8 @@ def compare(
     from servobench.harness.config.settings import ConfigurationError
 
     batch = Batch(
-        options.split_plants(plants),
-        options.split_controllers(controllers),
+        options.split_plants(plants, robot=robot),
+        options.split_controllers(controllers, robot),
         options.split_tasks(tasks),
         options.split_mismatches(mismatch),
         parse_seeds(seeds),

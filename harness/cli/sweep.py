@@ -44,8 +44,8 @@ def sweep(
 
     plan = SweepPlan(
         Batch(
-            options.split_plants(plants),
-            options.split_controllers(controllers),
+            options.split_plants(plants, robot=robot),
+            options.split_controllers(controllers, robot),
             options.split_tasks(tasks),
             options.split_mismatches(mismatch),
             parse_seeds(seeds),

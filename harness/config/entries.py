@@ -144,6 +144,9 @@ def _check_entry(entry: ControllerEntry | PlantEntry, place: str) -> None:
     if not callable(entry.config):
         raise ConfigurationError(f"{place}: config must be a dataclass or a function, got {entry.config!r}")
     check_settings(entry.config, place)
+    needs: object = entry.needs if isinstance(entry, PlantEntry) else ()
+    if not isinstance(needs, tuple):
+        raise ConfigurationError(f"{place}: needs must be a tuple of names of modules, got {needs!r}")
 
 
 def check_settings(config: Callable[[], Any], place: str) -> None:

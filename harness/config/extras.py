@@ -46,7 +46,7 @@ def check_installed(modules: tuple[str, ...], what: str) -> None:
 
 
 def _line(module: str, what: str) -> str:
-    line = f"{what} needs {module}: pip install 'servobench[{EXTRAS[module]}]'"
+    line = f"{what} needs {module}: pip install " + (f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module)
     if module == "pybullet" and sys.version_info >= NO_WHEELS:
         version = ".".join(map(str, sys.version_info[:2]))
         line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"

@@ -35,6 +35,7 @@ PLANTS = {
 }
 DEFAULT_PLANTS = ("bullet", "kinematic")  # the first one that is installed
 MAPPED = "fmu:"
+ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
@@ -133,6 +134,31 @@ def find_plant(name: str) -> PlantEntry:
     return own.entry if own is not None and isinstance(own.entry, PlantEntry) else _load_plant(name)
 
 
+def is_published(entry: type[ControllerEntry | PlantEntry], name: str) -> bool:
+    """Return whether a controller or plant of this name is that of another distribution."""
+    group = PLANT_GROUP if entry is PlantEntry else CONTROLLER_GROUP
+    return name not in {*PLANTS, *CONTROLLERS, *_OFFERED} and name in _points(group)
+
+
+def unused_points(entry: type[ControllerEntry | PlantEntry]) -> list[tuple[str, str]]:
+    """Return the names of entry points that are not used, each with a line that says why: others have the name."""
+    group, kind = (PLANT_GROUP, PLANT) if entry is PlantEntry else (CONTROLLER_GROUP, CONTROLLER)
+    own = PLANTS if entry is PlantEntry else (*CONTROLLERS, *FORMER_NAMES)
+    found = dict[tuple[str, str], str]()
+    for point in entry_points(group=group):
+        used = _points(group).get(point.name)
+        if point.name in own:
+            why = f"servobench has a {kind.word} of this name, which cannot be taken over"
+        elif point.name in (RUN, ALL):
+            why = "the command line has another meaning for this name"
+        elif used is not None and used.value != point.value:
+            why = f"another distribution publishes {used.value} under this name"
+        else:
+            continue
+        found[point.name, point.value] = f"{kind.word} {point.name!r} ({point.value}) is not used: {why}"
+    return [(name, line) for (name, _), line in found.items()]
+
+
 def installed_plant(name: str) -> PlantEntry:
     """Return the plant called `name` if all that it needs is installed.
 
@@ -228,7 +254,8 @@ def _points(group: str) -> dict[str, EntryPoint]:
     own = PLANTS if group == PLANT_GROUP else NOT_COMPOSED
     points = {name: EntryPoint(name, value, group) for name, value in own.items()}
     for point in entry_points(group=group):
-        points.setdefault(point.name, point)
+        if point.name not in (RUN, ALL):
+            points.setdefault(point.name, point)
     return points
 
 

@@ -58,6 +58,8 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict
         for name, what in ((request.plant, "plant"), (request.controller, "controller")):
             if name in TASKS:
                 raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
+        if request.plant == request.controller:
+            raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
     robot = _common_robot(requests)
     defaults |= {name: _plant_default(name, robot) for name in dict.fromkeys(each.plant for each in requests)}
     defaults |= {

@@ -1,0 +1,214 @@
+"""Broken plug-ins, installed as entry points: one right line each, in the lists, in a run and beside all others."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from kit.command import PACKAGE
+from kit.own import CELL, CONFIGURED, install, write
+
+POINTS = """[servobench.controllers]
+whole = some_law:Mine
+import-error = some_crash:ENTRY
+syntax-error = some_syntax:ENTRY
+dependency = some_need:ENTRY
+number = some_law:NUMBER
+function = some_law:make
+half = some_law:Half
+crash = some_law:Crash
+exit = some_law:Exit
+signature = some_law:Signature
+settings = some_law:UNSETTLED
+gone = some_law:Nothing
+a/b = some_law:Mine
+circle = some_law:Mine
+ukf_mfac = some_law:Mine
+all = some_law:Mine
+[servobench.plants]
+cell = some_cell:Cell
+crashing = some_cell:Crash
+needy = some_cell:NEEDY
+bullet = some_cell:Cell
+"""
+LAWS = (
+    CONFIGURED
+    + """
+
+NUMBER = 3
+UNSETTLED = servobench.ControllerEntry("unsettled", "", lambda: {}, Mine)
+
+
+def make(config, knowledge):
+    return Mine(config, knowledge)
+
+
+class Half(servobench.Controller):
+    pass
+
+
+class Crash(Mine):
+    def __init__(self, knowledge):
+        self.n = knowledge.size
+
+
+class Exit(Mine):
+    def __init__(self, knowledge):
+        raise SystemExit(3)
+
+
+class Signature(Mine):
+    def __init__(self):
+        pass
+"""
+)
+CELLS = (
+    CELL
+    + """
+
+class Crash(Cell):
+    def __init__(self, setup):
+        1 / 0
+
+
+NEEDY = servobench.PlantEntry("needy", "", dict, Cell, needs=("a_package_that_is_not_there",))
+NEEDY = servobench.PlantEntry("needy", "", type(NEEDY), Cell)
+"""
+)
+CONTROLLERS = {
+    "import-error": "controller 'import-error' (some_crash:ENTRY) cannot be loaded: site/some_crash.py:1: "
+    "ZeroDivisionError: division by zero",
+    "syntax-error": "controller 'syntax-error' (some_syntax:ENTRY) cannot be loaded: site/some_syntax.py:1: "
+    "SyntaxError: expected ':'",
+    "dependency": "controller 'dependency' (some_need:ENTRY) cannot be loaded: site/some_need.py:1: "
+    "ModuleNotFoundError: No module named 'torhc'",
+    "number": "controller 'number' (some_law:NUMBER) cannot be used: some_law:NUMBER is of type int, wanted a subclass "
+    "of servobench.Controller or a servobench.ControllerEntry",
+    "function": "controller 'function' (some_law:make) cannot be used: some_law:make is the function make, wanted a "
+    "subclass of servobench.Controller or a servobench.ControllerEntry",
+    "half": "controller 'half' (some_law:Half) cannot be used: site/some_law.py:37: class Half lacks reset and step, "
+    "which it must define",
+    "crash": "controller crash: site/some_law.py:43: AttributeError: 'RobotKnowledge' object has no attribute 'size'",
+    "exit": "controller exit: site/some_law.py:48: SystemExit: 3",
+    "signature": "controller 'signature' (some_law:Signature) cannot be used: site/some_law.py:51: Signature.__init__ "
+    "must take (self, knowledge) or (self, config, knowledge), got (self)",
+    "settings": "controller 'settings' (some_law:UNSETTLED) cannot be used: some_law:UNSETTLED: the settings config "
+    "are no dataclass; return a dataclass",
+    "gone": "controller 'gone' (some_law:Nothing) cannot be loaded: AttributeError: module 'some_law' has no attribute "
+    "'Nothing'",
+    "a/b": "controller 'a/b' (some_law:Mine) cannot be used: some_law:Mine: the name must be letters, digits and _, "
+    "got 'a/b'",
+    "circle": "a task is called 'circle', too; give the controller another name",
+}
+PLANTS = {
+    "crashing": "plant crashing: site/some_cell.py:37: ZeroDivisionError: division by zero",
+    "needy": "plant 'needy' (some_cell:NEEDY) cannot be used: ",
+}
+UNUSED = {
+    "ukf_mfac": "controller 'ukf_mfac' (some_law:Mine) is not used: servobench has a controller of this name, which "
+    "cannot be taken over",
+    "all": "controller 'all' (some_law:Mine) is not used: the command line has another meaning for this name",
+}
+UNUSED_PLANT = (
+    "plant 'bullet' (some_cell:Cell) is not used: servobench has a plant of this name, which cannot be taken over"
+)
+DRIVER = """
+import contextlib, io, json, sys
+from servobench.controllers import methods
+from servobench.harness.cli.main import main
+from servobench.harness.config import registry
+
+registry.METHODS = {name: registry.METHODS[name] for name in ("ukf_mfac", "constant")}
+told = []
+for arguments in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    sys.argv = ["servobench", *arguments]
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as stop:
+            told.append((stop.code or 0, out.getvalue(), err.getvalue()))
+print(json.dumps(told))
+"""
+SHORT = ("--set", "exp1.duration=0.3", "--task", "exp1")
+RUNS = {name: ["run", name, "--plant", "kinematic", *SHORT] for name in [*CONTROLLERS, "whole", "ukf_mfac"]}
+COMMANDS = {
+    "controllers": ["controllers", "--json"],
+    "plants": ["plants", "--json"],
+    "compare": ["compare", "--controllers", "all", "--plants", "kinematic,cell", "--tasks", "exp1", "--out", "out",
+                "--set", "exp1.duration=0.3", "--no-report", "--workers", "1"],
+    **RUNS,
+    "run crashing": ["run", "constant", "--plant", "crashing", *SHORT],
+    "run cell": ["run", "constant", "--plant", "cell", *SHORT],
+    "show all plants": ["init", "--plants", "all", "--controllers", "constant", "-"],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What each command answers in an environment with the plug-ins: exit code, output and errors."""
+    folder = tmp_path_factory.mktemp("plugins")
+    site = install(folder / "site", "some_law", LAWS, POINTS)
+    write(site, CELLS, "some_cell.py")
+    for name, text in {"crash": "1 / 0\n", "syntax": "class Mine\n", "need": "import torhc\n"}.items():
+        write(site, text, f"some_{name}.py")
+    done = subprocess.run(
+        [sys.executable, "-c", DRIVER, json.dumps(list(COMMANDS.values()))], cwd=folder, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"}, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return dict(zip(COMMANDS, json.loads(done.stdout.splitlines()[-1]), strict=True))
+
+
+def test_the_list_marks_each_and_shows_the_others(told):
+    code, out, _ = told["controllers"]
+    listed = [(each["name"], each.get("error")) for each in json.loads(out)]
+    assert code == 0
+    assert {name: error for name, error in listed if error and name in CONTROLLERS} == CONTROLLERS
+    assert [error for _, error in listed if error and error not in CONTROLLERS.values()] == list(UNUSED.values())
+    assert [name for name, error in listed if error is None] == ["ukf_mfac", "constant", "nmpc_calibrated", "whole"]
+
+
+def test_the_list_of_plants_marks_each_and_shows_the_others(told):
+    code, out, _ = told["plants"]
+    listed = [(each["name"], each.get("error")) for each in json.loads(out)]
+    errors = [error for _, error in listed if error]
+    assert code == 0
+    assert errors[0] == PLANTS["crashing"]
+    assert errors[1].startswith(PLANTS["needy"])
+    assert errors[2:] == [UNUSED_PLANT]
+    assert {"kinematic", "cell"} < {name for name, error in listed if error is None}
+
+
+def test_all_others_are_compared_and_each_broken_one_is_a_line(told):
+    code, out, errors = told["compare"]
+    assert code == 0, errors
+    left_out = [f"servobench: left out: {line}" for line in CONTROLLERS.values()]
+    notes = [f"servobench: note: {line}" for line in UNUSED.values()]
+    lines = [line for line in errors.splitlines() if line.startswith("servobench: ")]
+    assert sorted(lines) == sorted(left_out + notes)
+    for name in ("whole", "ukf_mfac", "constant"):
+        assert out.count(f" {name} ") == 2, out
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_run_of_it_is_refused_with_the_same_line(told, name):
+    code, _, errors = told[name]
+    assert code == 2, told[name]
+    assert errors == f"servobench: {CONTROLLERS[name]}\n"
+
+
+def test_what_is_whole_runs_beside_them(told):
+    for name in ("whole", "run cell", "ukf_mfac"):
+        assert told[name][0] == 0, told[name]
+    assert UNUSED["ukf_mfac"] in told["ukf_mfac"][2]
+    assert "not used" not in told["whole"][2]
+    assert told["run crashing"][::2] == [2, f"servobench: {PLANTS['crashing']}\n"]
+    code, out, errors = told["show all plants"]
+    assert (code, "[cell.sensing]" in out) == (0, True), errors
+    assert f"servobench: left out: {PLANTS['crashing']}" in errors
+    assert f"servobench: note: {UNUSED_PLANT}" in errors
