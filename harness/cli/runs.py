@@ -17,6 +17,8 @@ from servobench.harness.cli.terminal import console, print_tables
 from servobench.harness.cli.verdict import judge, print_faults
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from servobench.harness.batch.campaign import Campaign, Execution
 
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
@@ -161,12 +163,18 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
     console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
 
 
-def _say_interrupted(folder: Path, wanted: int) -> None:
-    """End with the exit code of Ctrl-C, and say how to go on if runs were finished; nothing is drawn any more."""
+@contextlib.contextmanager
+def _ending_at_once(folder: Path, wanted: int) -> Iterator[None]:
+    """End at Ctrl-C, also while something is drawn, with a line that says how to go on if runs were finished."""
     from servobench.harness.batch import results
 
-    count = sum(map(len, results.finished_runs(folder))) if folder.exists() else 0
-    if count:
+    try:
+        yield
+    except KeyboardInterrupt:
+        whole = (folder / results.RUNS).is_file()
+        count = wanted if whole else sum(map(len, results.finished_runs(folder))) if folder.exists() else 0
+        if not count:
+            raise
         line = f"interrupted: {count} of {wanted} runs were finished and kept in {folder}; "
         line += "the same call with --resume and this --out continues"
         console.print(line, soft_wrap=True, markup=False, highlight=False)
@@ -175,30 +183,32 @@ def _say_interrupted(folder: Path, wanted: int) -> None:
 
 def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> Path:
     """Check everything, run everything, leave tables, figures and a report behind, and return the folder."""
-    from servobench.harness.analysis.summary import summary_legend, summary_tables
-    from servobench.harness.batch import results
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.cli.progress import ConsoleObserver
+
+    folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    with _ending_at_once(folder, len(campaign.cells)):
+        with contextlib.closing(ConsoleObserver(console, bar=not how.debug)) as observer:
+            carry_out(campaign, folder, replace(how, observer=observer))
+        _show(folder, latest=out is None, with_report=with_report)
+    return folder
+
+
+def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
+    """Print the tables of a folder whose runs are finished, and draw its figures and its report."""
+    from servobench.harness.analysis.summary import summary_legend, summary_tables
+    from servobench.harness.batch import results
     from servobench.harness.config.extras import missing_extra
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.draw import draw_figures
 
-    folder = out or Path("results") / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    with contextlib.closing(ConsoleObserver(console, bar=not how.debug)) as observer:
-        try:
-            carry_out(campaign, folder, replace(how, observer=observer))
-        except KeyboardInterrupt:
-            observer.close()
-            _say_interrupted(folder, len(campaign.cells))
-            raise
-    results.collect(folder)
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
     print_faults(runs)
+    if latest:
+        results.point_latest(folder)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
-    if out is None:
-        results.point_latest(folder)
     console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
     if with_report:
         try:
@@ -206,4 +216,3 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
         except (ConfigurationError, ImportError) as error:  # the runs are safe; `servobench report` can be called again
             missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
             console.print(f"no report: {missing or error}", soft_wrap=True, markup=False)
-    return folder
