@@ -26,6 +26,8 @@ results: $(VENV)/ready
 
 # Too long for every change: whether the stored figures of these studies come out again; writes nothing into the pages.
 nightly: $(VENV)/ready
+	$(BIN)/python tests/fuzz/campaign.py --inputs 1000000
+	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 

@@ -81,7 +81,10 @@ def read_table(text: str) -> tuple[list[str], FloatArray]:
     Raises:
         ValueError: the text has no rows.
     """
-    rows = list(csv.reader(io.StringIO(text)))
+    try:
+        rows = list(csv.reader(io.StringIO(text)))
+    except csv.Error as error:
+        raise ValueError(f"a reference table must be CSV: {error}") from error
     if len(rows) < 2:
         raise ValueError("a reference table needs a header and at least one row")
     return rows[0], np.array([[float(cell) for cell in row] for row in rows[1:]])

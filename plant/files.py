@@ -39,5 +39,17 @@ def read_toml(what: str, path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{what} {path} cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
         raise ValueError(f"{what} {path} is not valid TOML: {error}") from error
+
+
+def user_path(text: str) -> Path:
+    """Return the path that a user wrote, with ~ for a home folder.
+
+    Raises:
+        ValueError: there is no such home folder.
+    """
+    try:
+        return Path(text).expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"path {text!r} names a home folder that is not known") from error

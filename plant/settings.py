@@ -56,7 +56,10 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
     entries = value if isinstance(value, list | tuple) else [value]
     if not all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries):
         raise PydanticCustomError("numbers", "a number or a list of numbers")
-    return np.array(value, dtype=np.float64)
+    try:
+        return np.array(value, dtype=np.float64)
+    except OverflowError as error:  # a whole number of hundreds of digits
+        raise PydanticCustomError("numbers", "numbers below 1e308") from error
 
 
 Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(lambda name: (name,) if isinstance(name, str) else name)]

@@ -6,9 +6,11 @@ others, so that no method is judged by a robot on which it was tuned.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from textwrap import shorten
 from typing import Any, Final
 
 from servobench.harness.batch.grid import Grid
@@ -17,6 +19,9 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.plant.robot.mismatch import Mismatch
 
+MAX_SEEDS: Final = 1_000_000  # of a batch
+MAX_SEED: Final = 2**63 - 1  # which the tables hold
+MAX_SHOWN: Final = 200  # [characters] of what was given, in a message
 TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
 
 
@@ -52,23 +57,30 @@ def parse_seeds(text: str) -> Sequence[int]:
     Raises:
         ConfigurationError: none of these, or empty.
     """
+    came = f"got {shorten(repr(text), MAX_SHOWN, placeholder=' ...')}"
     try:
         if ":" in text:
             begin, end = (int(part) for part in text.split(":"))
-            seeds: Sequence[int] = range(begin, end)
+            seeds: Sequence[int] = range(begin, max(begin, end))
         elif "," in text:
             seeds = tuple(int(part) for part in text.split(",") if part.strip())
         else:
-            seeds = range(int(text))
+            seeds = range(max(0, int(text)))
     except ValueError as error:
-        raise ConfigurationError(
-            f"seeds must be a count (5), a list (3,1,4) or a range (100:120), got {text!r}"
-        ) from error
-    if not seeds or min(seeds) < 0:
-        raise ConfigurationError(f"seeds must name at least one seed, none of them negative; got {text!r}")
-    twice = [seed for seed in seeds if seeds.count(seed) > 1] if isinstance(seeds, tuple) else []
-    if twice:
-        raise ConfigurationError(f"seeds name {twice[0]} twice, got {text!r}")
+        raise ConfigurationError(f"seeds must be a count (5), a list (3,1,4) or a range (100:120), {came}") from error
+    if isinstance(seeds, range):
+        first, last = seeds.start, seeds.stop - 1
+    else:
+        first, last = min(seeds, default=-1), max(seeds, default=-1)
+    if first < 0 or last < first:
+        raise ConfigurationError(f"seeds must name at least one seed, none of them negative; {came}")
+    if last > MAX_SEED:
+        raise ConfigurationError(f"seeds must be at most {MAX_SEED}, {came}")
+    if len(seeds) > MAX_SEEDS:
+        raise ConfigurationError(f"seeds must name at most {MAX_SEEDS:,}, {came}; use several folders for more")
+    for seed, count in Counter(seeds).items() if isinstance(seeds, tuple) else ():
+        if count > 1:
+            raise ConfigurationError(f"seeds name {seed} twice, {came}")
     return seeds
 
 

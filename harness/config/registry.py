@@ -22,6 +22,7 @@ from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, ma
 from servobench.harness.config.extras import check_installed
 from servobench.harness.config.own import Own, describe_import, is_place, read_own
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.files import user_path
 from servobench.plant.plant import PlantEntry
 from servobench.plant.settings import suggest
 
@@ -127,7 +128,7 @@ def find_plant(name: str) -> PlantEntry:
         from servobench.plant.fmu.fmu_plant import mapped_entry  # noqa: PLC0415 - only the extra fmu brings its needs
 
         try:
-            return mapped_entry(Path(name.removeprefix(MAPPED)).expanduser())
+            return mapped_entry(user_path(name.removeprefix(MAPPED)))
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
     own = _OFFERED.get(name)

@@ -29,7 +29,12 @@ class Assignment(NamedTuple):
 
 
 class ConfigurationError(ValueError):
-    """A setting or name that cannot be used; the message is one line for the user."""
+    """A setting or name that cannot be used; the message is one line for the user, whatever was given."""
+
+    def __init__(self, message: str) -> None:
+        """Keep the message without line ends and without characters that would control a terminal."""
+        words = " ".join(message.split())
+        super().__init__("".join(each if each.isprintable() else repr(each)[1:-1] for each in words))
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,7 @@ def _assign(sections: dict[str, Any], assignment: str) -> Assignment:
         raise ConfigurationError(f"--set needs section.key=value, such as kinematic.lag=0.1; got {assignment!r}")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         value = text.strip()  # a bare word is a string
     target = sections
     for name in path[:-1]:

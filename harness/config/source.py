@@ -11,6 +11,7 @@ from pathlib import Path
 from types import ModuleType
 
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.files import user_path
 from servobench.plant.settings import suggest
 
 PACKAGES = "site-packages"  # folder of installed packages, which may lie below that of a user's file
@@ -35,8 +36,8 @@ class SourceFile:
         Raises:
             ConfigurationError: it cannot be read; names the nearest file beside it.
         """
-        path = Path(given).expanduser().resolve()
         try:
+            path = user_path(given).resolve()
             return cls(path, path.read_text(encoding="utf-8"))
         except FileNotFoundError as error:
             beside = [each.name for each in path.parent.glob("*.py")] if path.parent.is_dir() else []

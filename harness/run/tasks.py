@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -19,6 +18,7 @@ import numpy as np
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskKind, line, read_waypoints
 from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.files import user_path
 from servobench.plant.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
@@ -265,7 +265,7 @@ def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
 def _build_waypoints(config: WaypointTask, setting: TaskSetting) -> Scenario:
     if not config.file:
         raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
-    reference = read_waypoints(Path(config.file).expanduser(), setting.feature)
+    reference = read_waypoints(user_path(config.file), setting.feature)
     duration = float(reference.times[-1]) + config.settle
     check_number("last waypoint's time plus settle", duration, above=0.0)
     return Scenario(setting.start(config.start), reference, duration, 0.5 * duration)

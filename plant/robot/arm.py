@@ -237,7 +237,7 @@ def arm_from_calibration(path: Path, tool: npt.ArrayLike, joint_names: tuple[str
             f"calibration file {path} lacks {error}; wanted 'kinematics' with the blocks "
             f"{', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"
         ) from error
-    except (TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(
             f"calibration file {path} holds something that is not a number where one is wanted: 'kinematics' has the "
             f"blocks {', '.join(CALIBRATION_BLOCKS)}, each with x, y, z, roll, pitch, yaw"

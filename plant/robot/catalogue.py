@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache, partial
-from pathlib import Path
 from typing import Final
 
+from servobench.plant.files import user_path
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot
 from servobench.plant.settings import suggest
@@ -29,7 +29,7 @@ def find_robot(text: str) -> Robot:
     """
     if text in ROBOTS:
         return _known(text)
-    path = Path(text.partition("#")[0]).expanduser()
+    path = user_path(text.partition("#")[0])
     if path.suffix.lower() not in {".yaml", ".yml", ".toml", ".urdf"}:
         raise ValueError(
             f"unknown robot {text!r}: {suggest(text, ROBOTS)}; or a file: a factory calibration (.yaml), a DH table "

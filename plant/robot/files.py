@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from servobench.plant.files import user_path
 from servobench.plant.robot.dh_file import read_dh_robot
 from servobench.plant.robot.makers import universal_robot
 from servobench.plant.robot.measured import MAX_DEVIATION, nearest_title, read_calibration
@@ -22,7 +23,7 @@ def read_robot(text: str) -> Robot:
         ValueError: a file that cannot be used.
     """
     name, _, tip = text.partition("#")
-    path = Path(name).expanduser()
+    path = user_path(name)
     kind = path.suffix.lower()
     if kind == ".urdf":
         from servobench.plant.robot.urdf_file import read_urdf_robot  # noqa: PLC0415 - an extra brings its reader

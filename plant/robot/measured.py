@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from servobench.plant.checks import FloatArray
+from servobench.plant.files import user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm, arm_from_calibration
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
@@ -38,7 +39,7 @@ def measured_arm(robot: Robot, file: str | None) -> SerialArm:
             f"mismatch 'factory' without a file is the calibration of one real UR5, and the robot is a {robot.title}; "
             "use factory=FILE with its own"
         )
-    arm = read_calibration(None if file is None else Path(file).expanduser(), robot.arm.tool)
+    arm = read_calibration(None if file is None else user_path(file), robot.arm.tool)
     title, deviation = nearest_title(arm)
     if title != robot.title and deviation_from(arm, robot.title) > MAX_DEVIATION:
         raise ValueError(

@@ -36,6 +36,7 @@ from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import nearest, suggest
 
 MAX_TILT = radians(45.0)
+MAX_MAGNITUDES = 10_000  # of a range
 MAX_MOVE_TILT = radians(30.0)
 
 ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
@@ -232,7 +233,12 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
     numbers = [float(part) for part in re.split("[:/]", match[1])]
     if ":" in match[1]:
         begin, end, step = numbers
-        count = math.floor((end - begin) / step + 1e-9) + 1 if step > 0.0 else 0
+        steps = (end - begin) / step + 1e-9 if step > 0.0 else -1.0
+        if not steps < MAX_MAGNITUDES:
+            raise ValueError(
+                f"the range {text!r} of {axis} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps"
+            )
+        count = math.floor(steps) + 1
         numbers = [round(begin + i * step, 9) for i in range(count)]
     if not numbers:
         raise ValueError(f"the range {text!r} of {axis} is empty")

@@ -1,0 +1,109 @@
+"""Whatever stands in a file or behind an option is read, or refused in one line, in little time and memory.
+
+The long campaign is tests/fuzz/campaign.py; what it found stands below in FOUND.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kit.fuzzing import Broken, check, inputs
+from kit.parsers import FILES, PARSERS, WORDS, Parser
+from servobench.harness.config.settings import ConfigurationError
+
+LONG = "9" * 400
+FOUND: tuple[tuple[str, str | bytes], ...] = (  # what once was a traceback, a hang or gigabytes
+    ("--seeds", "91092500"),
+    ("--seeds", "910079250"),
+    ("--seeds", "9" * 31),
+    ("--seeds", f"0:{LONG}"),
+    ("--seeds", f"{LONG},1"),
+    ("--seeds", ","),
+    ("--vary", "camera_rotation=0:1000000000000000000000000000000:30deg"),
+    ("--vary", f"camera_rotation=0:{LONG}:{LONG}deg"),
+    ("--set", f"kinematic.lag={LONG}"),
+    ("--set", f"target.target=[{LONG},0,0]"),
+    ("--set", "kinematic.lag=" + "9" * 5000),
+    ("--set", "kinematic.lag=" + "[" * 3000),
+    ("--robot", "~nobody_of_this_name/arm.toml"),
+    ("--robot", "p\x1eq.urdf"),
+    ("--plants", "fmu:a\nb\x9a.toml"),
+    ("--plants", "fmu:~nobody_of_this_name/a.toml"),
+    ("--controllers", "~nobody_of_this_name/a.py:Mine"),
+    ("configuration", f"[kinematic]\nlag = {LONG}\n"),
+    ("configuration", "[kinematic]\nlag = " + "9" * 5000),
+    ("configuration", "a = " + "[" * 3000),
+    ("mapping", f'file = "a.fmu"\ninputs = "a"\nfeatures = "b"\nstart = [{LONG}]\n'),
+    ("mapping", f'file = "a.fmu"\ninputs = "a"\nfeatures = "b"\nparameters = {{mass = {LONG}}}\n'),
+    ("calibration", f"kinematics: {{shoulder: {{x: {LONG}}}}}"),
+    ("calibration", "[" * 3000),
+    ("reference run", "time,a\n0,1\r7\n"),
+    ("modelDescription", '<?xml version="1.0" encoding="klingon"?><fmiModelDescription/>'),
+    ("modelDescription", "<a>" * 200_000),
+)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_every_example_is_taken(name, tmp_path):
+    for example in PARSERS[name].examples:
+        assert check(PARSERS[name], example, tmp_path)
+
+
+@pytest.mark.parametrize(("name", "given_"), FOUND, ids=[f"{i}-{name}" for i, (name, _) in enumerate(FOUND)])
+def test_what_once_broke_is_refused_in_one_line(name, given_, tmp_path):
+    assert not check(PARSERS[name], given_, tmp_path)
+
+
+@pytest.mark.parametrize("name", [*WORDS, *FILES])
+def test_changed_inputs_are_read_or_refused(name, tmp_path):
+    slow = PARSERS[name].share < 0.1
+
+    @settings(max_examples=4 if slow else 30, suppress_health_check=list(HealthCheck))
+    @given(inputs(PARSERS[name]))
+    def once(value: str | bytes) -> None:
+        with np.errstate(all="warn"):
+            check(PARSERS[name], value, tmp_path)
+
+    once()
+
+
+BREAKS = {
+    "KeyError": lambda *_: {}["a"],
+    "not one line": lambda *_: (_ for _ in ()).throw(ConfigurationError("")),
+    "MemoryError": lambda *_: bytearray(700_000_000),
+    "UnicodeDecodeError": lambda *_: b"\xff".decode(),
+}
+
+
+@pytest.mark.parametrize("message", BREAKS)
+def test_a_broken_promise_is_seen(message, tmp_path):
+    with pytest.raises(Broken, match=message):
+        check(Parser(BREAKS[message], ("a",)), "a", tmp_path)
+
+
+def test_a_parser_that_hangs_is_seen(tmp_path, monkeypatch):
+    monkeypatch.setattr("kit.fuzzing.MAX_SECONDS", 0.1)
+
+    def hang(_text: str, _folder: Path) -> None:
+        while True:
+            os.getpid()
+
+    with pytest.raises(Broken, match=r"took more than 0\.1 s"):
+        check(Parser(hang, ("a",)), "a", tmp_path)
+
+
+@given(st.text())
+def test_a_message_is_one_line_without_control_characters_whatever_it_repeats(text):
+    message = str(ConfigurationError(f"got {text}"))
+    assert message.isprintable()

@@ -1,0 +1,278 @@
+"""Everything in servobench that reads what others wrote, with valid examples of it, for fuzzing.
+
+A reader gets its input as text or bytes, and a folder for its files. It returns, or raises a `ConfigurationError` or a
+plain `ValueError` of one line.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from kit.foreign_fmu import describe, describe_exchange
+from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
+from kit.toy import plant_spec
+from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
+from servobench.controllers.networks.file import load_networks, save_networks
+from servobench.controllers.networks.fit import train
+from servobench.fmus.compile import parse_platforms
+from servobench.fmus.information import read_information
+from servobench.fmus.reference import read_table
+from servobench.harness.batch.compare import parse_seeds, refuse_tuning_seeds
+from servobench.harness.batch.sweep import parse_variation
+from servobench.harness.cli.options import split_controllers, split_plants, split_tasks
+from servobench.harness.cli.sweep import _numbers, _times
+from servobench.harness.config.robots import find_robot
+from servobench.harness.config.settings import ConfigurationError, read_settings
+from servobench.harness.run.references import read_waypoints
+from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.resolved import check_settings, resolve
+from servobench.plant.fmu import archive
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.description import read_description, read_exchange
+from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping
+from servobench.plant.robot.hand_eye import FEATURE
+from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
+from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
+
+RUN = RunRequest("kinematic", "rbfnn_mfac", "target", Mismatch(), 0)
+
+
+@dataclass(frozen=True)
+class Parser:
+    """A reader of foreign input.
+
+    Attributes:
+        read: takes an input and a folder for its files.
+        examples: valid inputs, all text or all bytes.
+        words: what may stand in an input.
+        share: of the inputs of a long campaign, relative to the others; slow readers get less.
+        error: what it raises.
+    """
+
+    read: Callable[..., object]
+    examples: tuple[str, ...] | tuple[bytes, ...]
+    words: tuple[str, ...] = ()
+    share: float = 1.0
+    error: type[ValueError] = ConfigurationError
+
+
+def _seeds(text: str, _: Path) -> None:
+    refuse_tuning_seeds(parse_seeds(text))
+
+
+def _set(text: str, _: Path) -> None:
+    settings = read_settings(None, [text])
+    check_settings(settings, [RUN.plant, RUN.controller, RUN.task])
+    resolve(RUN, settings)
+
+
+def _config(text: str, folder: Path) -> None:
+    settings = read_settings(_written(folder / "config.toml", text), [])
+    check_settings(settings, [RUN.plant, RUN.controller, RUN.task])
+    resolve(RUN, settings)
+
+
+def _mismatch(text: str, _: Path) -> None:
+    assert read_mismatch(str(read_mismatch(text))) == read_mismatch(text)
+
+
+def _mapping(text: str, folder: Path) -> None:
+    read_mapping(_written(folder / "mapping.toml", text))
+
+
+def _robot(ending: str) -> Callable[[str, Path], object]:
+    def read(text: str, folder: Path) -> None:
+        _forget(find_robot.__globals__["catalogue"]._read)
+        find_robot(str(_written(folder / f"robot{ending}", text)))
+
+    return read
+
+
+def _waypoints(text: str, folder: Path) -> None:
+    read_waypoints(_written(folder / "waypoints.csv", text), FEATURE).sampled(0.05, 100)
+
+
+def _networks(content: bytes, folder: Path) -> None:
+    load_networks(_written(folder / "networks.npz", content))
+
+
+def _description(text: str, folder: Path) -> None:
+    path = folder / "described.fmu"
+    with zipfile.ZipFile(path, "w") as packed:
+        packed.writestr("modelDescription.xml", text.encode(errors="surrogatepass"))
+    _fmu(path.read_bytes(), folder)
+
+
+def _fmu(content: bytes, folder: Path) -> None:
+    path = _written(folder / "foreign.fmu", content)
+    _forget(archive._digest, read_description)
+    try:
+        root = extract_fmu(path)
+        refusals = []
+        for read in (read_exchange, _mapped, lambda path, _: read_information(path)):
+            try:
+                read(path, root)
+            except ValueError as error:
+                refusals.append(error)
+        if len(refusals) > 1:  # not every FMU offers model exchange
+            raise refusals[-1]
+    finally:
+        shutil.rmtree(archive.cached.__globals__["cache_folder"]("extracted"), ignore_errors=True)
+        archive.cached.__globals__["_verified"].clear()
+
+
+def _mapped(path: Path, root: Path) -> None:
+    description = read_description(path, root)
+    parts = [""] if description.version == 3 else [".slew", ".luff"]
+    inputs, features, joints = (tuple(name + part for part in parts) for name in ("push", "place", "wheel"))
+    mapping_spec(FmuMapping(path, inputs, features, joints=joints), description, 0.05)
+
+
+def _reference(text: str, _: Path) -> None:
+    read_table(text)
+
+
+def _written(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content if isinstance(content, bytes) else content.encode(errors="surrogatepass"))
+    return path
+
+
+def _forget(*functions) -> None:
+    for function in functions:
+        function.cache_clear()
+
+
+@cache
+def _npz() -> bytes:
+    samples = {
+        "jacobian": JacobianTraining(centres=8, samples=60),
+        "controller": ControllerTraining(hidden=4, samples=60),
+    }
+    config = TrainingConfig((0.5, 0.5), (1.5, 1.5), **samples)
+    networks = train(config, lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))
+    with tempfile.TemporaryDirectory() as folder:
+        save_networks(networks, Path(folder) / "networks.npz")
+        return (Path(folder) / "networks.npz").read_bytes()
+
+
+def _packed(version: int, method: int) -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", method) as packed:
+        packed.writestr("modelDescription.xml", describe(version))
+        packed.writestr("binaries/linux64/crane.so", b"\x7fELF" + bytes(64))
+        packed.writestr("resources/numbers.csv", "1,2,3\n" * 20)
+    return content.getvalue()
+
+
+CONFIG = """
+[run]
+period = 0.05
+[kinematic]
+lag = 0.05
+sensing = {feature_noise = 0.001, latency = 0.05}
+[rbfnn_mfac.aids]
+feedforward = true
+[target]
+target = [0.2, 0.7, 1.1]
+"""
+MAPPING = """
+file = "crane.fmu"
+inputs = ["v[1]", "v[2]"]
+features = ["hook"]
+joints = "q"
+home = "home"
+start = [0.1, 0.2]
+camera = ["position", "rpy"]
+parameters = {mass = 12.5, gains = [1.0, 2.0]}
+period = 0.01
+limits.max_joint_speed = 2.0
+limits.joint_lower = [-1, -2]
+[truth]
+jacobian = "J"
+[names]
+features = ["x"]
+"""
+CSV = "time_s,x_m,y_m,z_m\n0,0.1,0.2,1.2\n1.5,0.2,0.2,1.2\n"
+ASSIGNMENTS = (
+    "kinematic.lag=0.1",
+    "target.target=[0.2,0.7,1.1]",
+    "run.period=0.02",
+    "rbfnn_mfac.training.seed=3",
+    "kinematic.sensing.feature_noise=0.01",
+    "rbfnn_mfac.aids.feedforward=true",
+)
+CALIBRATIONS = tuple(calibration_text(UNIVERSAL_ROBOTS[title], 1) for title in ("UR5", "UR10e"))
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+YAML_WORDS = ("&a ", "*a", "<<: ", "!!python/object:os.system ", "- ", "{", "}", "\t", "%YAML 9", "---", "2001-99-99")
+NUMBERS = ("nan", "inf", "-1", "0", "1e308", "1e-320", "9" * 400, "1_0", "0x10", "٣", "1e30", "91092500")
+AXIS_WORDS = (*AXES, *PROFILES, "factory=", "=", "+", "deg", "mm", "%", ":", "/")
+TOML_WORDS = ("[", "]", "{", "}", '"', "'''", "=", ".", "\n", "true", "1979-05-27", "[[run]]", "#", "[run]", "\\u0000")
+XML_WORDS = (
+    "<", ">", "&", "&#0;", '"', "]]>", "<!--", '<!DOCTYPE a [<!ENTITY b "c">]>', "&b;", "UTF-16", "klingon", "utf-7",
+    "<Dimension start='1e9'/>", "CoSimulation", "4294967296", "structuralParameter", "<?xml version='1.1'?>",
+)  # fmt: skip
+ZIP_WORDS = ("PK\x01\x02", "PK\x03\x04", "PK\x05\x06", "PK\x06\x06", "\xff\xff\xff\xff", "../", "\x00")
+
+WORDS: dict[str, Parser] = {
+    "--seeds": Parser(_seeds, ("5", "3,1,4", "100:120", "7,"), (",", ":", *NUMBERS), 4),
+    "--vary": Parser(
+        lambda text, _: parse_variation(text),
+        ("camera_rotation=0:180:30deg", "tool=5/10/20mm", "links=0:0.3:0.1"),
+        (*AXIS_WORDS, *NUMBERS),
+        4,
+    ),
+    "--set": Parser(_set, ASSIGNMENTS, (*TOML_WORDS, *NUMBERS, "kinematic", "law", "bullet", "exp1"), 3),
+    "--mismatch": Parser(
+        _mismatch,
+        ("moderate", "links=10%+tool=20mm", "factory=a.yaml", "severe+gear_ratio=5%"),
+        (*AXIS_WORDS, *NUMBERS),
+        4,
+    ),
+    "--noise": Parser(lambda text, _: _numbers("noise", text), ("1", "0,1,2.5"), (",", *NUMBERS), 2),
+    "--latency": Parser(lambda text, _: _times("latency", text), ("0.05", "0,0.1"), (",", *NUMBERS), 2),
+    "--robot": Parser(lambda text, _: find_robot(text), ("ur5", "panda"), ("~", "#", "/", "\0", "a.yaml", ".urdf"), 2),
+    "--plants": Parser(lambda text, _: split_plants(text), ("kinematic,fmu",), (",", "fmu:", ".toml", "\0", "~")),
+    "--controllers": Parser(
+        lambda text, _: split_controllers(text),
+        ("ukf_mfac,rbf_pid", "mfac+rls", "ukf_mfac:published"),
+        (",", "+", ":", "=", ".py", "./", "\0", "mfac", "ukf"),
+    ),
+    "--tasks": Parser(lambda text, _: split_tasks(text), ("exp1,circle", "all"), (",", "\0")),
+    "--platforms": Parser(
+        lambda text, _: parse_platforms(text), ("x86_64-linux,aarch64-darwin", "all"), (",",), error=ValueError
+    ),
+}
+"""What stands on the command line."""
+
+FILES: dict[str, Parser] = {
+    "configuration": Parser(_config, (CONFIG,), (*TOML_WORDS, *NUMBERS), 2),
+    "mapping": Parser(_mapping, (MAPPING,), (*TOML_WORDS, *NUMBERS), 2, error=ValueError),
+    "DH table": Parser(_robot(".toml"), (FOUR_JOINTS,), (*TOML_WORDS, *NUMBERS), 0.02),
+    "calibration": Parser(_robot(".yaml"), CALIBRATIONS, (*YAML_WORDS, *NUMBERS), 0.1),
+    "URDF": Parser(_robot(".urdf"), (odd_urdf(),), (*XML_WORDS, *NUMBERS, "prismatic", "mimic", "floating"), 0.02),
+    "waypoints": Parser(_waypoints, (CSV,), (",", "\n", '"', "\0", ";", *NUMBERS), 2, error=ValueError),
+    "networks": Parser(
+        _networks, (_npz(),), (*ZIP_WORDS, "<f8", "|O", "shape", "(1000000000000,)"), 0.5, error=ValueError
+    ),
+    "modelDescription": Parser(
+        _description, (describe(2), describe(3), describe_exchange()), (*XML_WORDS, *NUMBERS), 0.3, error=ValueError
+    ),
+    "FMU archive": Parser(
+        _fmu, tuple(_packed(2 + i % 2, method) for i, method in enumerate(METHODS)), ZIP_WORDS, 0.3, error=ValueError
+    ),
+    "reference run": Parser(
+        _reference, ("time,a[1],a[2]\n0,1,2\n0.05,1,2\n",), (",", "\n", '"', *NUMBERS), 2, error=ValueError
+    ),
+}
+"""What stands in files."""
+
+PARSERS = WORDS | FILES

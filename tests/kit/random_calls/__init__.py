@@ -1,0 +1,57 @@
+"""Random calls of exported FMUs under the address and undefined-behaviour sanitizers: builds the driver and runs it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+
+from servobench.fmus.export import FMI_SOURCES, SHARED_SOURCES, ExportOptions, source_files
+
+HERE = Path(__file__).parent
+SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
+COMMON = ("-std=c11", "-O1", "-g", "-ffp-contract=off", "-Wall", "-Wextra")
+
+
+@cache
+def can_sanitize() -> bool:
+    """Return whether this machine's compiler builds programs with sanitizers that run."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        return False
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "main.c").write_text("int main(void) { return 0; }\n")
+        build = [compiler, *SANITIZED, "main.c", "-o", "main"]
+        built = subprocess.run(build, cwd=folder, capture_output=True, check=False)
+        return built.returncode == 0 and subprocess.run([f"{folder}/main"], check=False).returncode == 0
+
+
+def build(folder: Path, version: int, defect: str = "") -> Path:
+    """Compile the driver with the sources of the exported UR5, without the check `defect`, to test the test."""
+    for name, text in source_files(ExportOptions(version)).items():
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text if not defect else text.replace(defect, "0"))
+    sources = folder / "sources"
+    shutil.copy(HERE / "calls.h", sources)
+    shutil.copy(HERE / f"calls{version}.c", sources)
+    files = [f"calls{version}.c", *FMI_SOURCES[version], *SHARED_SOURCES]
+    command = [shutil.which("cc") or "cc", *COMMON, *SANITIZED, *files, "-o", str(folder / "calls"), "-lm"]
+    subprocess.run(command, cwd=sources, check=True)
+    return folder / "calls"
+
+
+def run(program: Path, calls: int, seed: int) -> tuple[int, int]:
+    """Return how many calls were made and how many of them were refused.
+
+    Raises:
+        AssertionError: a sanitizer found something.
+    """
+    command = [program, str(calls), str(seed)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace")
+    assert done.returncode == 0, f"seed {seed}: {done.stderr[:3000]}"
+    made, refused = re.fullmatch(r"(\d+) calls, (\d+) refused\n", done.stdout).groups()
+    return int(made), int(refused)
