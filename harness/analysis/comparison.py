@@ -163,6 +163,11 @@ def compare_pairs(
     ]
 
 
+def differences_of_pairs(first: pd.Series[float], second: pd.Series[float]) -> pd.Series[float]:
+    """Return `first` − `second`, rounded to 10⁻¹² of the unit: equal times are sums of periods that differ by rounding."""
+    return (first - second).round(12)
+
+
 def _differences(
     runs: pd.DataFrame, pair: tuple[str, str], never: float, metric: str, keys: Sequence[str]
 ) -> FloatArray:
@@ -175,4 +180,4 @@ def _differences(
     first, second = first.align(second, join="inner")
     if len(first) == 0:
         raise ValueError(f"{pair[0]} and {pair[1]} have no run in common: nothing to compare")
-    return np.asarray(first - second, dtype=np.float64)
+    return np.asarray(differences_of_pairs(first, second), dtype=np.float64)

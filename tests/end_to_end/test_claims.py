@@ -13,7 +13,7 @@ from servobench.harness.batch.compare import TUNING
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.claims.answers import answer_all
 from servobench.harness.studies.claims.figures import draw_answers
-from servobench.harness.studies.claims.measurements import DEPENDS, NOT_REPRODUCED, REPRODUCED
+from servobench.harness.studies.claims.measurements import DEPENDS, NOT_REPRODUCED, REPRODUCED, UNDECIDED
 from servobench.harness.studies.claims.studies import (
     CIRCLE,
     ENTRIES,
@@ -120,6 +120,30 @@ def test_runs_that_never_settle_or_fail_count_as_slow():
     made[MAIN] = runs.assign(settling_time_s=runs["settling_time_s"].mask(mine & (runs["task"] == "exp1")))
     made[MAIN].loc[mine & (runs["task"] == "exp2"), "status"] = "feature_lost"
     assert verdicts(made)["1"] == f"{DEPENDS}: holds in 6 of 12"
+
+
+def test_times_that_are_equal_but_for_rounding_do_not_differ():
+    """The binary numbers next to 0.1 + 0.2 and 0.3 differ; the sign of such a rest decided claim 4 once."""
+    made = tables()
+    leaving, first = made[MAIN]["task"].isin(("exp1", "exp4")), made[MAIN]["controller"].isin((PROPOSED, "rbf_pid"))
+    times = np.where(leaving, np.where(first, 0.1 + 0.2, 0.3), 0.0)
+    made[MAIN] = made[MAIN].assign(settling_time_s=times)
+    assert times.max() > 0.3
+    assert verdicts(made)["4"] == NOT_REPRODUCED
+
+
+@pytest.mark.parametrize(
+    ("claim", "changes", "verdict"),
+    [
+        ("5", {"rms_error_evaluated": proposed(-0.015)}, UNDECIDED),
+        ("5", {}, NOT_REPRODUCED),
+        ("7", {"jacobian_error_mean": proposed(-0.05)}, UNDECIDED),
+    ],
+)
+def test_robots_too_few_for_a_rule_decide_nothing(claim, changes, verdict):
+    """With four robots not even four of four show a share above 80 %, and no sign test rejects anything."""
+    made = {name: each[each["seed"] < 4] for name, each in tables(**changes).items()}
+    assert verdicts(made)[claim] == verdict
 
 
 @pytest.mark.parametrize(("number", "same"), [("10.9 [9.6, 12.1]", True), ("10.0 [8.0, 11.0]", False)])

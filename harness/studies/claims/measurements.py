@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import settling_times
+from servobench.harness.analysis.comparison import differences_of_pairs, settling_times
 from servobench.harness.analysis.statistics import (
     NO_ESTIMATE,
     Estimate,
@@ -23,6 +23,7 @@ from servobench.harness.studies.claims.studies import CIRCLE, MOVES, OTHERS, PRO
 LEVEL: Final = 0.05
 DURATION: Final = 10.0  # [s] of a move
 REPRODUCED, NOT_REPRODUCED, DEPENDS = "reproduced", "not reproduced", "depends"
+UNDECIDED: Final = "too few robots to tell"
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Measurement:
         place: task.
         label: controller, reading or pairing.
         estimate: value and interval.
-        holds: whether the claim's rule holds here; None for a number that no rule judges.
+        holds: whether the claim's rule holds here; None for a number that no rule judges, and where the robots are so
+            few that it could not hold whatever came out.
     """
 
     panel: str
@@ -72,10 +74,16 @@ class Answer:
         return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
 
 
-def significant(differences: Sequence[pd.Series[float]]) -> list[bool]:
-    """Return for each sample of paired differences whether Wilcoxon's test rejects 0, after Holm over all of them."""
+def significant(differences: Sequence[pd.Series[float]]) -> list[bool | None]:
+    """Return for each sample of paired differences whether Wilcoxon's test rejects 0, after Holm over all of them.
+
+    None where not even differences of one sign would be rejected: their two-sided p-value is 2/2ⁿ with n pairs.
+    """
     p_values = [signed_rank_p_value(values.to_numpy()) if len(values) else 1.0 for values in differences]
-    return [p_value < LEVEL for p_value in holm(p_values)]
+    return [
+        p_value < LEVEL if 2.0 ** (1 - len(values)) < LEVEL else None
+        for p_value, values in zip(holm(p_values), differences, strict=True)
+    ]
 
 
 def pairings(
@@ -93,7 +101,7 @@ def pairings(
     """
     tables = {task: by_seed(runs, task, metric, never) for task in MOVES}
     found = {
-        (task, rival): (table[PROPOSED] - table[rival]).dropna() * factor
+        (task, rival): differences_of_pairs(table[PROPOSED], table[rival]).dropna() * factor
         for task, table in tables.items()
         for rival in OTHERS
     }
@@ -144,8 +152,11 @@ def answer(
     further: Sequence[Measurement] = (),
 ) -> Answer:
     """Return the answer whose verdict follows from the cases `judged`; `further` measurements are for the figure."""
-    count = held(judged)
-    verdict = f"{DEPENDS}: holds in {count} of {len(judged)}" if count else NOT_REPRODUCED
-    return Answer(
-        claim, statement, plant, REPRODUCED if count == len(judged) else verdict, evidence, (*judged, *further)
-    )
+    count, decided = held(judged), sum(m.holds is not None for m in judged)
+    if count == len(judged):
+        verdict = REPRODUCED
+    elif count == decided:
+        verdict = UNDECIDED
+    else:
+        verdict = f"{DEPENDS}: holds in {count} of {decided}" if count else NOT_REPRODUCED
+    return Answer(claim, statement, plant, verdict, evidence, (*judged, *further))
