@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from typing import ClassVar, Final
+from typing import Final
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller, installed_plant, is_published
@@ -20,10 +20,8 @@ PLANT: Final = "kinematic"  # on which controllers are tried
 TASK: Final = "exp1"
 
 
-class _Trains(RunFault):
+class _Trains(Exception):
     """A controller begins to train its networks: it can be built."""
-
-    status: ClassVar[str] = "trains"
 
 
 def usable_controller(name: str, robot: str = DEFAULT_ROBOT) -> ControllerEntry:
@@ -36,7 +34,7 @@ def usable_controller(name: str, robot: str = DEFAULT_ROBOT) -> ControllerEntry:
     if is_published(ControllerEntry, name):
         _refuse_task(name, "controller")
         request = RunRequest(PLANT, name, TASK, read_mismatch("none"), 0, robot=robot)
-        with contextlib.suppress(RunFault):  # the run's row will say so
+        with contextlib.suppress(RunFault, _Trains):  # of a fault the run's row will tell
             build(resolve(request, Settings()), progress=_stop).plant.close()
     return entry
 
@@ -75,4 +73,4 @@ def _refuse_task(name: str, what: str) -> None:
 
 
 def _stop(_share: float, _what: str) -> None:
-    raise _Trains("networks are trained for a run only")
+    raise _Trains
