@@ -164,7 +164,7 @@ def compare_pairs(
 
 
 def differences_of_pairs(first: pd.Series[float], second: pd.Series[float]) -> pd.Series[float]:
-    """Return `first` − `second`, rounded to 10⁻¹² of the unit: equal times are sums of periods that differ by rounding."""
+    """Return `first` − `second`, rounded to 10⁻¹² of the unit: equal times, as sums of periods, may differ by less."""
     return (first - second).round(12)
 
 
