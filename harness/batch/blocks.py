@@ -87,7 +87,7 @@ class Block:
 
     def singly(self) -> list[Block]:
         """Return each run as a block of its own."""
-        return [Block((job,), self.own) for job in self.jobs]
+        return [replace(self, jobs=(job,), together=False) for job in self.jobs]
 
     def part(self, begin: int, end: int | None = None, *, fresh: bool = False) -> Block:
         """Return some of the runs as a block."""
@@ -173,8 +173,9 @@ def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResul
     if not done and len(block.jobs) > 1 and block.together:
         return [], block.singly()
     single = replace(block, together=False)
-    if not end.certain:
-        return done, [single.part(len(done), fresh=True)]
+    rest = single.part(len(done), fresh=True)
+    if not end.certain and not (block.fresh and len(block.jobs) == 1):
+        return done, rest.singly() if end.alone else [rest]
     done.append(_failed(block.jobs[len(done)].cell, end.ending))
     return done, [single.part(len(done))] if len(done) < len(block.jobs) else []
 

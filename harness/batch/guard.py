@@ -53,6 +53,7 @@ class Limits:
 
     time: float | None = None  # [s] from one answer to the next
     memory: int | None = None  # [bytes] of a run and the processes that it starts
+    addresses: bool = False  # refuse each process more than this memory at once, also such as it never touches
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class End:
 
     ending: Ending
     certain: bool  # whether what it was at did it, and no earlier run of the same runner
+    alone: bool = False  # whether to be certain each run must be a task by itself: answers may have been lost
 
 
 def keep_guard(link: Connection, limits: Limits, modules: Sequence[str]) -> None:
@@ -224,7 +226,6 @@ def _be_runner(
     processes.end_with(parent)
     for each in inherited:
         each.close()
-    gc.unfreeze()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_SETMASK, set())
@@ -234,8 +235,8 @@ def _be_runner(
         faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     with Path(os.devnull).open() as nothing:
         os.dup2(nothing.fileno(), 0)  # what waits for the keyboard ends at once
-    if limits.memory is not None:
-        processes.limit_memory(limits.memory)
+    if limits.memory is not None and limits.addresses:
+        processes.limit_addresses(limits.memory)
     own = os.getpid()
 
     def tell(item: Any) -> None:  # noqa: ANN401 - any answer

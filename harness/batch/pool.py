@@ -146,7 +146,7 @@ class _Guarded:
                 self._process.kill()
                 self._process.join()
             self._process = self._link = None
-        return End(Ending(status, reason), certain=True)
+        return End(Ending(status, reason), certain=False, alone=True)
 
     def _start(self) -> Connection:
         """Return the link to a guard that runs."""

@@ -32,7 +32,8 @@ def lead_session() -> None:
 
 def adopt_orphans() -> None:
     """Become the parent of each descendant whose parent ends, where the system can do that."""
-    _prctl(ADOPT_ORPHANS, 1)
+    if LINUX:
+        _prctl(ADOPT_ORPHANS, 1)
 
 
 def end_with(parent: int) -> None:
@@ -41,14 +42,14 @@ def end_with(parent: int) -> None:
     Args:
         parent: process id of the parent, which may have ended before this call.
     """
-    _prctl(SET_DEATH_SIGNAL, int(signal.SIGTERM if not LINUX else signal.SIGKILL))
-    if LINUX and os.getppid() != parent:
-        os._exit(1)
+    if LINUX:
+        _prctl(SET_DEATH_SIGNAL, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
 
 
 def _prctl(option: int, value: int) -> None:
-    if LINUX:
-        ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
+    ctypes.CDLL(None).prctl(option, value, 0, 0, 0)
 
 
 def descendants(process: int) -> list[int]:
@@ -100,8 +101,11 @@ def machine_memory() -> int:
     return int(psutil.virtual_memory().total)
 
 
-def limit_memory(most: int) -> None:
-    """Refuse this process, and each that it starts, more than `most` further bytes of addresses, where that works."""
+def limit_addresses(most: int) -> None:
+    """Refuse this process, and each that it starts, more than `most` further bytes of addresses, where that works.
+
+    Not all addresses are memory: what drives graphics cards reserves hundreds of gigabytes of them.
+    """
     if not LINUX:
         return
     import resource  # noqa: PLC0415 - not on Windows

@@ -58,7 +58,9 @@ class Bounds:
         if foreign:
             time = FOREIGN_TIME if time is None else time
             memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine_memory() / count) if memory is None else memory
-        return Limits(None if time in (None, math.inf) else time, None if memory in (None, math.inf) else int(memory))
+        seconds = None if time is None or math.isinf(time) else time
+        size = None if memory is None or math.isinf(memory) else int(memory)
+        return Limits(seconds, size, addresses=self.run_memory is not None)
 
 
 def default_workers() -> int:

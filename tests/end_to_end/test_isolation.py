@@ -140,8 +140,8 @@ def test_a_batch_that_is_resumed_goes_past_a_run_that_hangs(tmp_path):
 
 def test_nothing_outlives_a_command_that_is_killed(tmp_path):
     out, mark = tmp_path / "out", "orphans"
-    hanging = ("sweep", "--controllers", places("LeavesChildren", "Hangs"), "--workers", "2", *SHORT, "--out", str(out))
-    process = start(*hanging, **{MARK: mark})
+    hanging = ("--controllers", places("HangsWithChildren", "Hangs"), "--workers", "2", *SHORT, "--out", str(out))
+    process = start("sweep", *hanging, **{MARK: mark})
     wait_for(lambda: any("time.sleep(300)" in " ".join(each.cmdline()) for each in left_behind(mark)))
     os.kill(process.pid, signal.SIGKILL)
     finish(process)

@@ -116,8 +116,11 @@ def dying_workers(how: Exception | End, sizes: list[int]) -> Workers:
             if not block.together:
                 with contextlib.suppress(Struck):
                     task.function(task.argument, tell)
-            end = replace(how, certain=how.certain or (task.fresh and not items))
-            future.set_result(Answer(items, end))
+            if how.alone:  # the last answer is lost with the guard
+                future.set_result(Answer(items[:-1], how))
+            else:
+                end = replace(how, certain=how.certain or (task.fresh and not items))
+                future.set_result(Answer(items, end))
         return future
 
     return Workers(submit, 2, lost=(ProcessDied,))
@@ -145,12 +148,12 @@ def test_a_block_that_is_lost_costs_only_the_run_that_did_it(alone, tmp_path, mo
     assert times(runs)[~lost].notna().all(axis=None)
 
 
-@pytest.mark.parametrize("certain", [True, False])
-def test_of_runs_that_go_one_by_one_those_before_and_after_a_death_are_carried_out_once(
-    alone, tmp_path, monkeypatch, certain
+@pytest.mark.parametrize(("certain", "guard", "again"), [(True, False, 0), (False, False, 8), (False, True, 8)])
+def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_again(
+    alone, tmp_path, monkeypatch, certain, guard, again
 ):
     sizes: list[int] = []
-    workers = contextlib.nullcontext(dying_workers(End(Ending("crashed", "it died"), certain), sizes))
+    workers = contextlib.nullcontext(dying_workers(End(Ending("crashed", "it died"), certain, guard), sizes))
     monkeypatch.setattr("servobench.harness.batch.campaign.open_workers", lambda *_, **__: workers)
     carry_out(CAMPAIGN, tmp_path / "out", Execution(2, block=1))
     runs = results.load_runs(tmp_path / "out")
@@ -158,7 +161,7 @@ def test_of_runs_that_go_one_by_one_those_before_and_after_a_death_are_carried_o
     assert lost.sum() == 4
     assert set(runs["reason"][lost]) == {"it died"}
     pd.testing.assert_frame_equal(judged(runs)[~lost], alone[~lost], check_exact=True)
-    assert sum(sizes) <= len(runs) + 8 * (4 if certain else 8)
+    assert sum(sizes) <= len(runs) + 8 * 4 + again * 4
 
 
 def job(index: int, kind: object) -> Job:

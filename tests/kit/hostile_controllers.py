@@ -146,6 +146,12 @@ class LeavesChildren(Quiet):
             subprocess.run([sys.executable, "-S", "-c", sleep], check=True)
 
 
+class HangsWithChildren(LeavesChildren):
+    def strike(self):
+        super().strike()
+        Hangs.strike(self)
+
+
 class Prints(Quiet):
     def strike(self):
         sys.stdout.write("x" * 2000 + "\n")
