@@ -25,6 +25,7 @@ def analyse(
     controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER...", help="Names of controllers.")],
     mismatch: Annotated[str, typer.Option(help="How far the true robot is from the nominal one.")] = "none",
     seed: Annotated[int, typer.Option(help="Of the move that warms controllers up, and of the robot.")] = 0,
+    robot: options.RobotOption = "ur5",
     jacobian: Annotated[
         str, typer.Option(help="Where estimators are frozen: at the true, nominal or estimated Jacobian.")
     ] = "true",
@@ -47,7 +48,8 @@ def analyse(
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.faults import RunFault
 
-    source, runs = _source(jacobian), _resolved(controllers, mismatch, seed, overrides.settings())
+    source, arm = _source(jacobian), options.known_robot(robot)
+    runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
     loops: list[LoopAnalysis] = []
     for run in runs:
         with console.status(f"analysing {run.request.controller}"):
@@ -83,7 +85,7 @@ def _source(jacobian: str) -> Source:
     raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
 
 
-def _resolved(controllers: list[str], mismatch: str, seed: int, settings: Settings) -> list[ResolvedRun]:
+def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
     """Return a run for each controller on the kinematic plant."""
     from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
     from servobench.harness.config.settings import ConfigurationError
@@ -92,9 +94,10 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, settings: Settin
 
     if seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {seed}")
-    names = options.split_controllers(",".join(controllers))
+    names = options.split_controllers(",".join(controllers), robot)
     check_settings(settings, [PLANT, TASK, *names])
-    return [resolve(RunRequest(PLANT, name, TASK, read_mismatch(mismatch), seed), settings) for name in names]
+    drawn = read_mismatch(mismatch)
+    return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]
 
 
 def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:

@@ -2,7 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import contextlib
+import io
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final
+
+ASKED_BY: Final = "_SERVOBENCH_COMPLETE"  # set by a shell that wants completions
+BASH: Final = "complete_bash"
+WORD_BREAKS: Final = frozenset(":=")  # at which bash splits a word, though names of methods and settings have them
+
+
+@contextlib.contextmanager
+def rejoining_words() -> Iterator[None]:
+    """Let bash complete within a word that it splits at a colon or an equals sign; it wants what follows the last."""
+    if os.environ.get(ASKED_BY) != BASH:
+        yield
+        return
+    words, index = os.environ["COMP_WORDS"].split("\n"), int(os.environ["COMP_CWORD"])
+    joined, before = join_words(words, index)
+    os.environ.update(COMP_WORDS="\n".join(joined), COMP_CWORD=str(len(joined) - 1))
+    answer = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(answer):
+            yield
+    finally:
+        for line in answer.getvalue().splitlines():
+            sys.stdout.write(line.removeprefix(before) + "\n")
+
+
+def join_words(words: list[str], index: int) -> tuple[list[str], str]:
+    """Return the words up to that of `index` as they were typed, and what the last one begins with before it."""
+    joined, before, after_break = list[str](), "", False
+    for word in words[: index + 1]:
+        is_break = bool(word) and WORD_BREAKS.issuperset(word)
+        if len(joined) > 1 and (is_break or after_break):
+            before = joined[-1] + (word if is_break else "")
+            joined[-1] += word
+        else:
+            before = ""
+            joined.append(word)
+        after_break = is_break
+    return joined, before
 
 
 def plants(incomplete: str) -> list[str]:

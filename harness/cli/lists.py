@@ -8,8 +8,10 @@ from typing import Annotated, Any
 import typer
 
 from servobench.harness.cli import completion
+from servobench.harness.cli.options import RobotOption
 from servobench.harness.cli.terminal import console, print_json
 
+DEFAULT_ROBOT = "ur5"
 HELP = "Show the settings of this one."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 
@@ -58,13 +60,19 @@ def controllers(
 
 def tasks(
     name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.tasks)] = None,
+    robot: RobotOption = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
+    from servobench.harness.config.robots import find_robot
+    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.tasks import TASKS, find_task
+    from servobench.harness.run.teaching import taught
 
     if name:
-        _show_settings(name, find_task(name).default, as_json=as_json)
+        _show_settings(name, taught(find_task(name), find_robot(robot)), as_json=as_json)
+    elif robot != DEFAULT_ROBOT:
+        raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
         _show_names(list(TASKS), find_task, [], as_json=as_json)
 

@@ -14,7 +14,7 @@ import typer
 import typer.main
 from rich.markup import escape
 
-from servobench.harness.cli import lists, runs, show, studies
+from servobench.harness.cli import completion, lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
 from servobench.harness.cli.check import check
 from servobench.harness.cli.fmu import fmu_app
@@ -26,6 +26,10 @@ from servobench.harness.cli.sweep import sweep
 
 INPUT_ERROR = 2  # exit code
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # a folder takes no more files
+ROBOTLESS = {  # why a command has no --robot
+    "claims": "the claims are those of the paper, which are about a UR5",
+    "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+}
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
     "Your own controller": (new, check),
@@ -78,7 +82,8 @@ def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
     _say_where_a_signal_strikes()
     try:
-        code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
+        with completion.rejoining_words():
+            code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
         code = INTERRUPTED
     except typer.TyperException as error:
@@ -115,6 +120,8 @@ def _refuse(line: str) -> NoReturn:
 def _usage_line(error: typer.TyperException) -> str:
     """Return what a command that cannot be understood is told with; nothing where its help was printed."""
     context = getattr(error, "ctx", None)
+    if context and getattr(error, "option_name", None) == "--robot" and context.info_name in ROBOTLESS:
+        return f"{context.info_name} has no --robot: {ROBOTLESS[context.info_name]}"
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())
     return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""

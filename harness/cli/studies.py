@@ -31,6 +31,7 @@ def robustness(
     plant: Annotated[str, typer.Option(help="Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
+    robot: options.RobotOption = "ur5",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
@@ -43,10 +44,11 @@ def robustness(
     from servobench.harness.studies.robustness import make_map
 
     settings = overrides.settings()
-    names = options.split_controllers(controllers)
-    where = options.split_plants(plant, "plant")[0]
+    arm = options.known_robot(robot)
+    names = options.split_controllers(controllers, arm)
+    where = options.split_plants(plant, "plant", arm)[0]
     with watching(console, out) as observer:
-        files = make_map(out, where, names, parse_seeds(seeds), settings, running.execution(observer))
+        files = make_map(out, where, names, parse_seeds(seeds), settings, running.execution(observer), arm)
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 
@@ -139,15 +141,20 @@ def _say_interrupted() -> None:
 
 def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
     """Score every change of one value of the settings in use and say which of them improve a score by too much."""
-    from servobench.harness.cli.progress import run_progress
+    from servobench.harness.cli.progress import Lines, run_progress
     from servobench.harness.studies.tuning.check import TOLERANCE, Check, improvements
 
-    checked = Check(folder, names, runs)
+    checked, lines = Check(folder, names, runs), Lines()
+    total, done = len(checked), checked.known()
+    begun = done
     with run_progress(console) as progress:
-        bar = progress.add_task("points", total=len(checked), completed=checked.known())
+        bar = progress.add_task("points", total=total, completed=done)
         try:
             for _ in checked.carry_out(workers):
                 progress.update(bar, advance=1)
+                done += 1
+                if not console.is_terminal:
+                    lines.tell((done - begun) / (total - begun), f"{done} of {total} points")
         except KeyboardInterrupt:
             progress.stop()
             _say_interrupted()
@@ -161,16 +168,22 @@ def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> b
     """Advance the studies to their end and show how far they are; return whether they got there."""
     from rich.progress import TextColumn
 
-    from servobench.harness.cli.progress import run_progress
+    from servobench.harness.cli.progress import Lines, run_progress
     from servobench.harness.studies.tuning.campaign import advance
 
-    total = plan.studies * (plan.trials + plan.search)
+    total, lines = plan.studies * (plan.trials + plan.search), Lines()
+    begun = sum(method.done for method in methods)
     with run_progress(console, TextColumn("points, best {task.fields[best]}")) as progress:
         bars = {method.name: progress.add_task(method.name, total=total, best="–") for method in methods}
         try:
             for method in advance(methods, plan, workers):
-                best = method.ledger.best()
-                progress.update(bars[method.name], completed=method.done, best="–" if best is None else f"{best:.4f}")
+                score = method.ledger.best()
+                best = "–" if score is None else f"{score:.4f}"
+                progress.update(bars[method.name], completed=method.done, best=best)
+                if not console.is_terminal:
+                    done, every = sum(each.done for each in methods), total * len(methods)
+                    text = f"{method.name}: {method.done} of {total} points, best {best}; in all {done} of {every}"
+                    lines.tell((done - begun) / max(every - begun, 1), text)
         except KeyboardInterrupt:
             return False
     return True

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import hashlib
+import importlib
+import importlib.util
 import sys
 import traceback
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +19,7 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.files import user_path
 from servobench.plant.settings import suggest
 
+PACKAGE = "servobench"
 PACKAGES = "site-packages"  # folder of installed packages, which may lie below that of a user's file
 
 
@@ -67,6 +73,7 @@ class SourceFile:
         if name in sys.modules:
             return sys.modules[name]
         make_importable(self.path.parent)
+        self._check_neighbours()
         module = ModuleType(name)
         module.__file__, module.__package__ = str(self.path), ""
         sys.modules[name] = module
@@ -78,6 +85,63 @@ class SourceFile:
                 raise ConfigurationError(describe_at(error, self.path.parent)) from error
             raise
         return module
+
+    def _check_neighbours(self) -> None:
+        """Refuse an import of a file beside this one if another module of that name would be taken.
+
+        A process has one module of a name: the `helper.py` of a second folder would silently be that of the first.
+
+        Raises:
+            ConfigurationError: names the import and both files.
+        """
+        importlib.invalidate_caches()
+        waiting, seen = [(self.path, self.text)], {PACKAGE}
+        while waiting:
+            file, text = waiting.pop()
+            for name, line in _imports(text):
+                beside = _beside(self.path.parent, name)
+                if beside is None or name in seen:
+                    continue
+                seen.add(name)
+                taken = _origin(name)
+                if taken is not None and taken != beside:
+                    raise ConfigurationError(
+                        f"{show(file)}:{line}: import {name} would take {show(taken)} instead of {show(beside)}, "
+                        "as a process has one module of a name; give one of them another name"
+                    )
+                with contextlib.suppress(OSError, ValueError):
+                    waiting.append((beside, beside.read_text(encoding="utf-8")))
+
+
+def _imports(text: str) -> Iterator[tuple[str, int]]:
+    """Yield the top-level names of modules that a text imports, with the line; nothing of one that cannot be read."""
+    try:
+        tree = ast.parse(text)
+    except (SyntaxError, ValueError):
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((each.name.partition(".")[0], node.lineno) for each in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module.partition(".")[0], node.lineno
+
+
+def _beside(folder: Path, name: str) -> Path | None:
+    """Return the file in a folder that holds a module; None if there is none."""
+    candidates = folder / f"{name}.py", folder / name / "__init__.py"
+    return next((path.resolve() for path in candidates if path.is_file()), None)
+
+
+def _origin(name: str) -> Path | None:
+    """Return the file that an import would take; None where none is known."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):  # an own module has no spec
+        file = getattr(sys.modules.get(name), "__file__", None)
+        return Path(file).resolve() if file else None
+    if spec is None or not spec.origin:
+        return None
+    return Path(spec.origin).resolve() if spec.has_location else Path(f"the built-in {name}")
 
 
 def make_importable(folder: Path) -> None:

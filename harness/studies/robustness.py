@@ -30,6 +30,7 @@ from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.sweep import Place
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.draw import save_figure
 from servobench.harness.pictures.panels import Styles, add_legend
@@ -99,6 +100,7 @@ def make_map(
     seeds: Sequence[int],
     settings: Settings,
     how: Execution,
+    robot: str = DEFAULT_ROBOT,
 ) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
@@ -109,24 +111,25 @@ def make_map(
         seeds: one robot each.
         settings: overrides of the defaults.
         how: how the runs are carried out.
+        robot: name, or the path of a file.
 
     Returns:
         The files of the pictures.
     """
     check_settings(settings, [plant, TASK, *controllers])
     settings = Settings(settings.sections)  # each part reads some of them
-    static, moved = map_cells(plant, controllers, seeds)
+    static, moved = map_cells(plant, controllers, seeds, robot)
     parts = (STATIC_CAMERA, static, settings), (MOVED_CAMERA, moved, moved_settings(settings))
     for name, cells, chosen in parts:
         folder = out / name
         carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
     results.write_summary(out, map_tables(out), results.read_manifest(out / STATIC_CAMERA))
-    limits = predicted_limits(controllers, settings)
+    limits = predicted_limits(controllers, settings, robot)
     pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
     return draw_map(results.load_runs(out), out / FIGURES, limits)
 
 
-def predicted_limits(controllers: Sequence[str], settings: Settings) -> dict[str, float]:
+def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str = DEFAULT_ROBOT) -> dict[str, float]:
     """Return from which latency on the loop of each composed controller is predicted to be unstable, in s.
 
     The prediction is that of small motions of the nominal robot, of the plant `kinematic`, without mismatch.
@@ -139,13 +142,15 @@ def predicted_limits(controllers: Sequence[str], settings: Settings) -> dict[str
         entry = find_controller(name)
         if entry.side_by_side:
             config = settings.resolve(name, default_config(entry))
-            limits[name] = latency_border(config, name, latencies, run, plant)
+            limits[name] = latency_border(config, name, latencies, run, plant, robot)
     return limits
 
 
-def map_cells(plant: str, controllers: Sequence[str], seeds: Sequence[int]) -> tuple[Grid[Cell], Grid[Cell]]:
+def map_cells(
+    plant: str, controllers: Sequence[str], seeds: Sequence[int], robot: str = DEFAULT_ROBOT
+) -> tuple[Grid[Cell], Grid[Cell]]:
     """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
-    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds).requests()
+    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot).requests()
     static, moved = (
         [Place(line.axis, magnitude) for line in LINES if (line.axis == MOVE) == moves for magnitude in line.places]
         for moves in (False, True)
@@ -237,7 +242,9 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
             axes.set_ylabel(scale.label)
         for axes in grid.flat[len(lines) :]:
             axes.set_axis_off()
-        notes = [f"{robots} robots a point on {plant}, bands are 95 % intervals"]
+        arm = runs["robot"].iloc[0] if "robot" in runs else DEFAULT_ROBOT  # folders of 0.1.0 have no such column
+        which = f"robots a point on {plant}" if arm == DEFAULT_ROBOT else f"{Path(arm).stem} a point on {plant}"
+        notes = [f"{robots} {which}, bands are 95 % intervals"]
         if 0 < len(flat) < len(curves):
             notes.append(_name_flat(flat, curves))
         if any(np.isinf(e.value) for axis in curves.values() for estimates in axis.values() for e in estimates):

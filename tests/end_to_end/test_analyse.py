@@ -45,3 +45,15 @@ def test_every_loop_can_be_identified(monkeypatch, capsys, tmp_path):
 def test_what_cannot_be_analysed_is_one_line(monkeypatch, capsys, tmp_path, arguments, message):
     assert servobench(monkeypatch, "analyse", *arguments, "--out", str(tmp_path)) == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_loop_of_another_arm_is_analysed(monkeypatch, tmp_path):
+    tables = []
+    for robot in ("ur5", "panda"):
+        out = tmp_path / robot
+        asked = ["broyden", "--jacobian", "nominal", "--mismatch", "moderate", "--robot", robot, "--out", str(out)]
+        assert servobench(monkeypatch, "analyse", *asked) == 0
+        tables.append(pd.read_csv(out / "analyse.csv"))
+    margins = [table["delay_margin_s"].iloc[0] for table in tables]
+    assert margins[1] > 0.0
+    assert margins[0] != margins[1]

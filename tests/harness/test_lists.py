@@ -100,3 +100,24 @@ def test_a_run_takes_its_controller_first(monkeypatch, capsys, tmp_path):
     )
     assert servobench(monkeypatch, "run", "constant", "--controller", "rls") == 2
     assert "two controllers are named, constant and --controller rls; a run has one" in capsys.readouterr().err
+
+
+def test_a_task_is_shown_for_an_arm(monkeypatch, capsys):
+    def settings(*arguments):
+        assert servobench(monkeypatch, "tasks", "circle", "--json", *arguments) == 0
+        return {each["setting"]: each["default"] for each in json.loads(capsys.readouterr().out)}
+
+    usual, other = settings(), settings("--robot", "ur10e")
+    assert usual == settings("--robot", "ur5")
+    assert other["circle.radius"] > 1.3 * usual["circle.radius"]
+    assert other["circle.start"] != usual["circle.start"]
+    assert servobench(monkeypatch, "tasks", "--robot", "ur10e") == 2
+    assert "--robot shows the settings of one task" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["tune", "claims"])
+def test_a_command_without_arms_says_why(monkeypatch, capsys, name):
+    assert servobench(monkeypatch, name, "--robot", "panda") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"servobench: {name} has no --robot: ")
+    assert "UR5" in error

@@ -267,3 +267,26 @@ def test_broken_entry_points_are_marked_and_spoil_neither_the_list_nor_all(tmp_p
     assert "'ukf_mfac'" in every
     assert not [name for name in set(LISTED) - {"whole"} if f"'{name}'" in every]
     assert done.stderr.count("servobench: left out: controller ") == len(LISTED) - 1
+
+
+def test_two_files_beside_two_controllers_that_have_one_name_are_refused(tmp_path):
+    for folder in "ab":
+        write(tmp_path, f"GAIN = {folder!r}\n", f"{folder}/own_helper_of_a_user.py")
+        write(tmp_path, "from own_middle_of_a_user import GAIN\n" + WHOLE, f"{folder}/mine.py")
+    write(tmp_path, "from own_helper_of_a_user import GAIN\n", "a/own_middle_of_a_user.py")
+    write(tmp_path, "import own_helper_of_a_user\n" + WHOLE, "b/direct.py")
+    assert choose_controller("first=a/mine.py") == "first"
+    taken = "import own_helper_of_a_user would take a/own_helper_of_a_user.py instead of b/own_helper_of_a_user.py"
+    with pytest.raises(ConfigurationError, match=f"^b/direct.py:1: {taken}, as a process has one module of a name"):
+        choose_controller("b/direct.py")
+    assert choose_controller("again=a/mine.py") == "again"
+
+
+@pytest.mark.parametrize("name", ["json", "rich", "sys"])
+def test_a_file_that_an_installed_module_would_hide_is_refused(tmp_path, name):
+    write(tmp_path, "GAIN = 3.0\n", f"{name}.py")
+    write(tmp_path, f"import {name}\n" + WHOLE)
+    with pytest.raises(ConfigurationError, match=rf"^mine\.py:1: import {name} would take .* instead of {name}\.py"):
+        choose_controller("./mine.py")
+    write(tmp_path, WHOLE, "other.py")  # which does not import it
+    assert choose_controller("./other.py") == "Mine"

@@ -102,3 +102,12 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
     assert axes.texts[0].get_text().replace("\n", " ") == "one line, 100 throughout: ukf_mfac, ukf_mpc"
     assert [text.get_text() for text in success.legends[0].get_texts()] == ["ukf_mfac", "ukf_mpc", "rls"]
     assert "half of the runs or more never settle" in figures[1].get_suptitle()
+
+
+def test_the_map_of_another_arm_has_its_runs_and_its_prediction():
+    usual, moved = map_cells("kinematic", ["constant"], [0], "panda")
+    assert {cell.request.robot for cell in [*usual, *moved]} == {"panda"}
+    fast = Settings({"pid+constant": {"law": {"proportional_gain": 9.0}}})
+    limits = [predicted_limits(["pid+constant"], fast, robot)["pid+constant"] for robot in ("ur5", "panda")]
+    assert 0.0 < limits[1] < 0.25
+    assert limits[0] != limits[1]

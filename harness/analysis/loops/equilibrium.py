@@ -10,12 +10,12 @@ from servobench.controllers.servo import Servo, ServoController, ServoState
 from servobench.harness.analysis.loops.arm import ArmModel
 from servobench.harness.analysis.loops.linearise import Rest, frozen, linearise
 from servobench.harness.analysis.loops.matrices import StateSpace
+from servobench.harness.config.robots import find_robot
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.resolved import ResolvedRun
 from servobench.plant.checks import FloatArray
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import nominal_ur5
 from servobench.plant.signals import Observation
 
 Source: TypeAlias = Literal["true", "nominal", "estimated"]
@@ -33,12 +33,14 @@ class Warm:
     Attributes:
         controller: in the state that the move left.
         model: the true robot.
+        nominal: the robot by its maker's description.
         rest: the place where it is now, as if the feature were wanted there.
         arm: linear model of arm and camera there.
     """
 
     controller: Controller
     model: HandEyeModel
+    nominal: HandEyeModel
     rest: Rest
     arm: ArmModel
 
@@ -62,7 +64,7 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
     rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)
-    return Warm(controller, model, rest, arm)
+    return Warm(controller, model, find_robot(resolved.request.robot).nominal, rest, arm)
 
 
 def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> ArmModel:
@@ -98,7 +100,7 @@ def at_rest(warm: Warm, source: Source) -> tuple[Servo, ServoState, Rest]:
     if not isinstance(controller, ServoController) or controller.state is None:
         raise TypeError(f"controller must be a ServoController after its warm-up, got {type(controller).__name__}")
     state, q = controller.state, rest.joint_position
-    J = {"true": warm.arm.jacobian, "nominal": nominal_ur5().jacobian(q), "estimated": state.jacobian}[source]
+    J = {"true": warm.arm.jacobian, "nominal": warm.nominal.jacobian(q), "estimated": state.jacobian}[source]
     servo, state = frozen(controller.servo, state, lambda _: J)
     reference = rest.reference(rest.feature)
     period = warm.arm.period

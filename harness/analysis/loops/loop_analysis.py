@@ -20,9 +20,11 @@ from servobench.harness.analysis.loops.identification import (
 )
 from servobench.harness.analysis.loops.margins import POINTS, LoopResponse, Margins, frequencies
 from servobench.harness.analysis.loops.matrices import StateSpace, closed_loop, is_stable
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.harness.run.tasks import RandomTask
+from servobench.harness.run.tasks import find_task
+from servobench.harness.run.teaching import taught
 from servobench.harness.run.threads import one_thread
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import RunFault
@@ -110,6 +112,7 @@ def delay_margin(
     run: RunSettings | None = None,
     plant: KinematicConfig | None = None,
     seed: int = 0,
+    robot: str = DEFAULT_ROBOT,
 ) -> float:
     """Return by how much later the camera may be before the loop of a composed controller is unstable, s.
 
@@ -122,6 +125,7 @@ def delay_margin(
         run: period and preview; default: those of a run.
         plant: lag, delays and noise; default: those of the kinematic plant.
         seed: of the move.
+        robot: name, or the path of a file.
 
     Returns:
         0 for a loop that is unstable without any addition, or whose controller cannot go on.
@@ -130,8 +134,9 @@ def delay_margin(
         TypeError: a controller that is not composed.
         ConfigurationError: a name or a setting that cannot be used.
     """
-    request = RunRequest(PLANT, name, TASK, Mismatch(), seed)
-    resolved = ResolvedRun(request, run or RunSettings(), plant or KinematicConfig(), config, RandomTask())
+    request = RunRequest(PLANT, name, TASK, Mismatch(), seed, robot=robot)
+    task = taught(find_task(TASK), find_robot(robot))
+    resolved = ResolvedRun(request, run or RunSettings(), plant or KinematicConfig(), config, task)
     with one_thread():
         try:
             warm = warm_up(resolved)
@@ -149,6 +154,7 @@ def latency_border(
     latencies: Sequence[float],
     run: RunSettings | None = None,
     plant: KinematicConfig | None = None,
+    robot: str = DEFAULT_ROBOT,
 ) -> float:
     """Return the latency of the camera [s] from which on a loop is predicted to be unstable; inf if none is.
 
@@ -160,6 +166,7 @@ def latency_border(
         latencies: ascending, from 0 on [s]; beyond the last one nothing is predicted.
         run: see `delay_margin`.
         plant: see `delay_margin`; its own latency is replaced.
+        robot: see `delay_margin`.
 
     Raises:
         TypeError: a controller that is not composed.
@@ -168,7 +175,7 @@ def latency_border(
     world, border = plant or KinematicConfig(), 0.0
     for latency in latencies:
         later = replace(world, sensing=replace(world.sensing, latency=latency))
-        margin = delay_margin(config, name, run, later)
+        margin = delay_margin(config, name, run, later, robot=robot)
         if margin == 0.0:
             return min(border, latency)
         border = latency + margin
