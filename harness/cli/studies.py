@@ -32,23 +32,26 @@ def robustness(
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
+    axes: Annotated[str, typer.Option(help="Comma-separated axes, such as outliers,jitter; default: seven.")] = "",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Draw success and settling time along seven axes.
 
-    The robustness map; each axis of the mismatch is varied by itself.
+    The robustness map; each axis of the mismatch or of the sensor is varied by itself.
     """
     from servobench.harness.batch.compare import parse_seeds
     from servobench.harness.cli.progress import watching
+    from servobench.harness.studies.map_lines import find_lines
     from servobench.harness.studies.robustness import make_map
 
     settings = overrides.settings()
+    lines = find_lines([axis.strip() for axis in axes.split(",") if axis.strip()])
     arm = options.known_robot(robot)
     names = options.split_controllers(controllers, arm)
     where = options.split_plants(plant, "plant", arm)[0]
     with watching(console, out) as observer:
-        files = make_map(out, where, names, parse_seeds(seeds), settings, running.execution(observer), arm)
+        files = make_map(out, where, names, parse_seeds(seeds), settings, running.execution(observer), arm, lines)
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 

@@ -1,7 +1,7 @@
-"""The robustness map: success and settling time along seven axes, each varied by itself from a `moderate` mismatch.
+"""The robustness map: success and settling time along axes, each varied by itself from a `moderate` mismatch.
 
 Every method gets the same robots, starts and targets at every place of the map. Runs whose camera is moved half-way
-take longer, so that there is time to recover.
+take longer, so that there is time to recover. The axes are those of `servobench.harness.studies.map_lines`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -38,14 +38,11 @@ from servobench.harness.pictures.places import Curves, draw_curves, same_curves
 from servobench.harness.pictures.style import TEXT, WIDTH, figure_style, method_styles
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import check_settings
+from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, NOISE, Line
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"
 TASK: Final = "random"
-MOVE: Final = "camera_move"
-LATENCY: Final = "latency"
-NOISE: Final = "noise"
 MOVE_DURATION: Final = 20.0  # [s], of a run whose camera is moved half-way
 
 STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it is
@@ -64,15 +61,6 @@ class Scale(NamedTuple):
     top: float  # upper edge of the panels
 
 
-@dataclass(frozen=True)
-class Line:
-    """An axis of the map."""
-
-    axis: str  # of the mismatch, or "latency" or "noise"
-    title: str  # label of the axis
-    places: tuple[Magnitude, ...]  # its magnitudes
-
-
 def _cell(place: Place, request: RunRequest) -> Cell:
     """Return a run at one place of its axis."""
     if place.magnitude is None or place.axis not in (LATENCY, NOISE):
@@ -80,17 +68,6 @@ def _cell(place: Place, request: RunRequest) -> Cell:
     number = place.magnitude.number
     late = replace(request, latency=number / 1000.0) if place.axis == LATENCY else None
     return Cell(late or replace(request, noise_factor=number), place.columns)
-
-
-LINES: Final = (
-    Line("camera_rotation", "camera turned [°]", parse_magnitudes("camera_rotation", "0:180:30deg")),
-    Line("links", "link lengths wrong by up to [%]", parse_magnitudes("links", "0:30:10%")),
-    Line("joint_offsets", "joint zeros wrong by up to [°]", parse_magnitudes("joint_offsets", "0:20:5deg")),
-    Line("tool", "tool wrong by up to [mm]", parse_magnitudes("tool", "0:100:25mm")),
-    Line(LATENCY, "camera latency [ms]", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
-    Line(NOISE, "sensor noise [times the usual]", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
-    Line(MOVE, "camera moved half-way [°]", parse_magnitudes(MOVE, "0:180:45deg")),
-)
 
 
 def make_map(
@@ -101,6 +78,7 @@ def make_map(
     settings: Settings,
     how: Execution,
     robot: str = DEFAULT_ROBOT,
+    lines: Sequence[Line] = LINES,
 ) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
@@ -112,19 +90,23 @@ def make_map(
         settings: overrides of the defaults.
         how: how the runs are carried out.
         robot: name, or the path of a file.
+        lines: its axes.
 
     Returns:
         The files of the pictures.
     """
     check_settings(settings, [plant, TASK, *controllers])
     settings = Settings(settings.sections)  # each part reads some of them
-    static, moved = map_cells(plant, controllers, seeds, robot)
-    parts = (STATIC_CAMERA, static, settings), (MOVED_CAMERA, moved, moved_settings(settings))
-    for name, cells, chosen in parts:
-        folder = out / name
+    static, moved = map_cells(plant, controllers, seeds, robot, lines)
+    parts = {STATIC_CAMERA: (static, settings), MOVED_CAMERA: (moved, moved_settings(settings))}
+    made = [name for name, (cells, _) in parts.items() if len(cells)]
+    for name in made:
+        folder, (cells, chosen) = out / name, parts[name]
         carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
-    results.write_summary(out, map_tables(out), results.read_manifest(out / STATIC_CAMERA))
-    limits = predicted_limits(controllers, settings, robot)
+    results.write_summary(out, map_tables(out), results.read_manifest(out / made[0]))
+    limits: dict[str, float] = {}
+    if any(line.axis == LATENCY for line in lines):
+        limits = predicted_limits(controllers, settings, robot)
     pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
     return draw_map(results.load_runs(out), out / FIGURES, limits)
 
@@ -137,7 +119,7 @@ def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str 
     line = next(line for line in LINES if line.axis == LATENCY)
     latencies = [place.number / 1000.0 for place in line.places]
     run, plant = settings.resolve("run", RunSettings()), settings.resolve("kinematic", KinematicConfig())
-    limits = {}
+    limits: dict[str, float] = {}
     for name in controllers:
         entry = find_controller(name)
         if entry.side_by_side:
@@ -147,12 +129,16 @@ def predicted_limits(controllers: Sequence[str], settings: Settings, robot: str 
 
 
 def map_cells(
-    plant: str, controllers: Sequence[str], seeds: Sequence[int], robot: str = DEFAULT_ROBOT
+    plant: str,
+    controllers: Sequence[str],
+    seeds: Sequence[int],
+    robot: str = DEFAULT_ROBOT,
+    lines: Sequence[Line] = LINES,
 ) -> tuple[Grid[Cell], Grid[Cell]]:
     """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
     requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot).requests()
     static, moved = (
-        [Place(line.axis, magnitude) for line in LINES if (line.axis == MOVE) == moves for magnitude in line.places]
+        [Place(line.axis, magnitude) for line in lines if (line.axis == MOVE) == moves for magnitude in line.places]
         for moves in (False, True)
     )
     return Grid(_cell, static, requests), Grid(_cell, moved, requests)
@@ -167,16 +153,20 @@ def moved_settings(settings: Settings) -> Settings:
 def map_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """Return the runs of a map by part; `moved_at_s` says when the camera was moved, NaN where it was not.
 
+    A map along few axes may have one part only.
+
     Raises:
         ConfigurationError: not the folder of a map.
     """
-    static, moved = (results.load_runs(folder / part) for part in (STATIC_CAMERA, MOVED_CAMERA))
+    if not (folder / MOVED_CAMERA).exists():
+        return {STATIC_CAMERA: results.load_runs(folder / STATIC_CAMERA)}
+    moved = results.load_runs(folder / MOVED_CAMERA)
     configuration = results.read_manifest(folder / MOVED_CAMERA)["configuration"]
     moment = configuration["run"]["camera_moves_at"] * configuration[TASK]["duration"]
-    return {
-        STATIC_CAMERA: static,
-        MOVED_CAMERA: moved.assign(moved_at_s=np.where(moved["magnitude"] == 0.0, np.nan, moment)),
-    }
+    tables = {MOVED_CAMERA: moved.assign(moved_at_s=np.where(moved["magnitude"] == 0.0, np.nan, moment))}
+    if (folder / STATIC_CAMERA).exists():
+        tables = {STATIC_CAMERA: results.load_runs(folder / STATIC_CAMERA), **tables}
+    return tables
 
 
 def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | None = None) -> list[Path]:
@@ -193,7 +183,7 @@ def draw_map(runs: pd.DataFrame, folder: Path, limits: Mapping[str, float] | Non
     Raises:
         ConfigurationError: the table is not that of a map.
     """
-    if "axis" not in runs or not set(runs["axis"]) & {line.axis for line in LINES}:
+    if "axis" not in runs or not set(runs["axis"]) & set(KNOWN_LINES):
         raise ConfigurationError("the table holds no axis of the robustness map; make one with `servobench robustness`")
     arrived = f"Runs that came within {settling_band(runs)} and stayed"
     took = "Median settling time, from the move where the camera moves"
@@ -218,14 +208,18 @@ def _draw(runs: pd.DataFrame, stem: Path, title: str, scale: Scale, limits: Mapp
     controllers = list(dict.fromkeys(runs["controller"]))
     styles = method_styles(controllers)
     curves: dict[str, Curves] = {}
-    for line in LINES:
+    for line in KNOWN_LINES.values():
         if line.axis in set(runs["axis"]):
             cells = dict(iter(runs[runs["axis"] == line.axis].groupby(["controller", "magnitude"])))
             curves[line.axis] = {
                 name: [scale.measure(cells[name, place.number]) for place in line.places] for name in controllers
             }
     flat = [axis for axis in curves if _is_flat(curves[axis])]
-    lines = [line for line in LINES if line.axis in curves and (line.axis not in flat or len(flat) == len(curves))]
+    lines = [
+        line
+        for line in KNOWN_LINES.values()
+        if line.axis in curves and (line.axis not in flat or len(flat) == len(curves))
+    ]
     robots, plant = runs["seed"].nunique(), runs["plant"].iloc[0]
     with figure_style(TEXT):
         columns = min(COLUMNS, len(lines))
@@ -264,7 +258,9 @@ def _name_flat(flat: Sequence[str], curves: Mapping[str, Curves]) -> str:
     """Return a sentence on the axes along which nothing differs."""
     found = next(iter(curves[flat[0]].values()))[0]
     words = "; ".join(
-        re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title) for line in LINES if line.axis in flat
+        re.sub(r" \[(.*)\]", rf" {line.places[-1].number:g} \1", line.title)
+        for line in KNOWN_LINES.values()
+        if line.axis in flat
     )
     return f"not drawn, as every method has {found.value:g} (interval from {found.low:.0f}) throughout: {words}"
 

@@ -8,19 +8,21 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from kit.command import servobench
 from servobench.harness.analysis.comparison import settled_share
+from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.studies import robustness
+from servobench.harness.studies import map_lines, robustness
+from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, Line, find_lines
 from servobench.harness.studies.robustness import (
-    LATENCY,
-    LINES,
-    MOVE,
     draw_map,
     map_cells,
     moved_settings,
     predicted_limits,
     settling_median,
 )
+from servobench.plant.noise.axes import SENSOR_AXES
+from servobench.plant.robot.mismatch import Magnitude
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():
@@ -33,6 +35,30 @@ def test_the_map_has_every_place_for_every_method_and_no_run_twice():
     latencies = {cell.request.latency for cell in usual if cell.columns["axis"] == "latency"}
     assert latencies == {0.0, 0.05, 0.1, 0.15, 0.2, 0.25}
     assert {cell.request.noise_factor for cell in usual if cell.columns["axis"] == "noise"} == {0.0, 1.0, 2.0, 4.0, 8.0}
+
+
+def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():
+    lines = find_lines(["jitter", "outliers"])
+    assert [line.axis for line in lines] == ["outliers", "jitter"]
+    static, moved = map_cells("kinematic", ["constant"], [0], lines=lines)
+    assert len(moved) == 0
+    assert {str(cell.request.mismatch) for cell in static} >= {"moderate+outliers=40%", "moderate+jitter=200ms"}
+    assert find_lines([]) is LINES
+    assert {*SENSOR_AXES} <= {*KNOWN_LINES}
+    with pytest.raises(ConfigurationError, match="the map has no axis 'outlier': did you mean 'outliers'"):
+        find_lines(["outlier"])
+
+
+def test_a_map_of_one_axis_is_carried_out_and_drawn(monkeypatch, tmp_path, capsys):
+    place = Line("jitter", "frames late by up to [ms]", (Magnitude(0.0, "ms"), Magnitude(200.0, "ms")))
+    monkeypatch.setattr(robustness, "KNOWN_LINES", {"jitter": place})
+    monkeypatch.setattr(map_lines, "KNOWN_LINES", {"jitter": place})
+    words = ("--axes", "jitter", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1")
+    out = tmp_path / "map"
+    assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=1", "--out", str(out)) == 0
+    assert (out / "figures" / "robustness.png").stat().st_size > 5000
+    assert [path.name for path in out.iterdir() if path.is_dir()] in (["usual", "figures"], ["figures", "usual"])
+    assert {"jitter=0ms", "jitter=200ms"} == {text.partition("+")[2] for text in results.load_runs(out)["mismatch"]}
 
 
 def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long():
