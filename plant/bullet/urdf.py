@@ -4,7 +4,7 @@ The body frame of link i is frame i of `SerialArm` (after the rotation of joint 
 fixed transform. A mismatched arm therefore turns into a mismatched simulation.
 
 The rendered arm has looks and no collision shapes, the simulated one the same cylinders and spheres as collision shapes
-and no looks. Numbers are written with `repr`, so that none loses a digit.
+and no looks.
 """
 
 from __future__ import annotations
@@ -13,15 +13,22 @@ from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.plant.bullet.meshes import rectangles_obj
+from servobench.plant.bullet.urdf_elements import (
+    add_joint,
+    add_link,
+    add_visual,
+    draw_cylinder,
+    draw_mesh,
+    draw_sphere,
+    numbers,
+    text,
+)
 from servobench.plant.checks import FloatArray
-from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.robot import Robot
-
-Colour = tuple[float, float, float, float]
 
 BASE_LINK, FLANGE_LINK, BALL_LINK = "base", "flange", "ball"
 ALUMINIUM = (0.76, 0.78, 0.80, 1.0)
@@ -66,7 +73,7 @@ def arm_urdf(arm: SerialArm, ball_mesh: str, robot: Robot | None = None) -> str:
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    return _text(_arm(arm, ball_mesh, robot or find_robot(UR5)))
+    return text(_arm(arm, ball_mesh, robot or find_robot(UR5)))
 
 
 def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot | None = None) -> str:
@@ -96,7 +103,7 @@ def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot 
         mass = link.find("inertial/mass")
         if link.get("name") == BALL_LINK and mass is not None:
             mass.set("value", repr(LIGHT_PART[0] + payload))
-    return _text(tree)
+    return text(tree)
 
 
 def _table(scale: float) -> tuple[float, float, float, float]:
@@ -118,14 +125,14 @@ def room_boxes(scale: float = 1.0) -> tuple[Box, Box]:
 def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     """Return the URDF of a body that consists of boxes, each of which is both drawn and a collision shape."""
     robot = ET.Element("robot", name="boxes")
-    body = _add_link(robot, "boxes", *BASE_PART)
+    body = add_link(robot, "boxes", *BASE_PART)
     for box in boxes:
-        shapes = [_add_visual(body, DARK_GREY, box.centre, np.zeros(3))]
+        shapes = [add_visual(body, DARK_GREY, box.centre, np.zeros(3))]
         collision = ET.SubElement(body, "collision")
-        ET.SubElement(collision, "origin", xyz=_numbers(box.centre), rpy=_numbers(np.zeros(3)))
+        ET.SubElement(collision, "origin", xyz=numbers(box.centre), rpy=numbers(np.zeros(3)))
         for geometry in (*shapes, ET.SubElement(collision, "geometry")):
-            ET.SubElement(geometry, "box", size=_numbers(box.size))
-    return _text(robot)
+            ET.SubElement(geometry, "box", size=numbers(box.size))
+    return text(robot)
 
 
 def _arm(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
@@ -137,7 +144,7 @@ def _arm(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
     robot = ET.Element("robot", name="arm")
     links = [BASE_LINK, *(f"{name}_link" for name in arm.joint_names)]
     origins = np.stack([arm.translation, arm.rpy], axis=1)
-    _draw_base(_add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], radius[0])
+    _draw_base(add_link(robot, BASE_LINK, *BASE_PART), arm.translation[0], radius[0])
     for i, name in enumerate(arm.joint_names):
         step = arm.translation[i + 1]
         R = rotation_from_rpy(arm.rpy[i + 1])
@@ -145,13 +152,13 @@ def _arm(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
         # A link without length, like a UR's shoulder in its calibration file, is long along its joint's axis.
         along = step if np.linalg.norm(step) > 1e-3 else (0.0, 0.0, 1.0)
         inertia = own.inertia[i] if own.inertia.ndim == 2 else R @ own.inertia[i] @ R.T
-        link = _add_link(robot, links[i + 1], mass[i], inertia, centre=centre, along=along)
+        link = add_link(robot, links[i + 1], mass[i], inertia, centre=centre, along=along)
         _draw_link(link, step, radius[i], aside[i])
-        _add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
-    _add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
-    _draw_tool(_add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, radius[-1], ball_radius)
-    _add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
-    _draw_mesh(_add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ball_radius)
+        add_joint(robot, name, (links[i], links[i + 1]), origins[i], turns=True)
+    add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
+    _draw_tool(add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, radius[-1], ball_radius)
+    add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
+    draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ball_radius)
     return robot
 
 
@@ -163,11 +170,11 @@ def bench_files(scale: float = 1.0) -> dict[str, str]:
     `bench.urdf` is the one to load; it names the others.
     """
     robot = ET.Element("robot", name="bench")
-    bench = _add_link(robot, "bench", *BASE_PART)
+    bench = add_link(robot, "bench", *BASE_PART)
     x0, y0, x1, y1 = _table(scale)
     for x in (x0 + 0.04, x1 - 0.04):
         for y in (y0 + 0.04, y1 - 0.04):
-            _draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
+            draw_cylinder(bench, DARK_GREY, (x, y, -FLOOR_DROP), (x, y, -0.04), 0.035)
     rim = [(x0, y0, x0 + 0.02, y1), (x1 - 0.02, y0, x1, y1)]
     rim += [(x0 + 0.02, y0, x1 - 0.02, y0 + 0.02), (x0 + 0.02, y1 - 0.02, x1 - 0.02, y1)]
     top = [(x0 + 0.02, y0 + 0.02, x1 - 0.02, y1 - 0.02)]
@@ -183,20 +190,15 @@ def bench_files(scale: float = 1.0) -> dict[str, str]:
         ("floor_b", FLOOR_B, tiles[1], -FLOOR_DROP),
     ):
         files[f"{name}.obj"] = rectangles_obj(rectangles, height)
-        _draw_mesh(bench, colour, f"{name}.obj", 1.0)
-    return files | {"bench.urdf": _text(robot)}
-
-
-def _text(robot: ET.Element) -> str:
-    ET.indent(robot)
-    return ET.tostring(robot, encoding="unicode")
+        draw_mesh(bench, colour, f"{name}.obj", 1.0)
+    return files | {"bench.urdf": text(robot)}
 
 
 def _draw_base(link: ET.Element, step: FloatArray, radius: float) -> None:
     """Draw the foot on the table and the stem up to the first joint."""
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius)
-    _draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius)
-    _draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.0), step, radius)
+    draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), (0.0, 0.0, 0.02), 1.45 * radius)
+    draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.02), (0.0, 0.0, 0.035), 1.2 * radius)
+    draw_cylinder(link, ALUMINIUM, (0.0, 0.0, 0.0), step, radius)
 
 
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
@@ -205,116 +207,18 @@ def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -
     far_aside = abs(side) > radius
     # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.
     outwards = np.array([0.0, 0.0, np.copysign(1.12 * radius, side if far_aside else -1.0)])
-    _draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
-    _draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
-    _draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
-    _draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
+    draw_cylinder(link, ALUMINIUM, np.zeros(3) if far_aside else -outwards, top + outwards, 1.06 * radius)
+    draw_cylinder(link, LIGHT_BLUE, top + outwards, top + 1.25 * outwards, radius)
+    draw_cylinder(link, ALUMINIUM, top, corner, 0.8 * radius)
+    draw_cylinder(link, DARK_GREY, corner, end, 0.95 * radius)
     if far_aside:
-        _draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
-        _draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
+        draw_cylinder(link, ALUMINIUM, corner - 0.8 * outwards, corner + 0.9 * outwards, 1.02 * radius)
+        draw_cylinder(link, LIGHT_BLUE, corner + 0.9 * outwards, corner + 1.1 * outwards, 0.95 * radius)
     else:
-        _draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
+        draw_sphere(link, ALUMINIUM, corner, 0.85 * radius)
 
 
 def _draw_tool(link: ET.Element, tool: FloatArray, radius: float, ball_radius: float) -> None:
     """Draw the flange's plate and the stick that carries the ball."""
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius)
-    _draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * ball_radius)
-
-
-def _numbers(values: npt.ArrayLike) -> str:
-    """Return numbers as URDF writes them, with spaces between."""
-    return " ".join(repr(value) for value in np.asarray(values, dtype=np.float64).tolist())
-
-
-def rpy_along(direction: npt.ArrayLike) -> FloatArray:
-    """Return the roll, pitch, yaw, (3,) rad, that turn the z axis into `direction` (3,)."""
-    x, y, z = np.asarray(direction, dtype=np.float64).tolist()
-    return np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
-
-
-def _add_link(
-    robot: ET.Element,
-    name: str,
-    mass: float,
-    inertia: npt.ArrayLike,
-    *,
-    centre: npt.ArrayLike = (0.0, 0.0, 0.0),
-    along: npt.ArrayLike = (0.0, 0.0, 1.0),
-) -> ET.Element:
-    """Add a link and return it.
-
-    Args:
-        robot: the URDF.
-        name: of the link.
-        mass: kg.
-        inertia: kg m², about the centre of mass: (2,) across `along` and about it, or (3, 3) in the body frame.
-        centre: (3,), m, centre of mass in the body frame.
-        along: (3,), the direction about which the link is symmetric, in the body frame.
-    """
-    link = ET.SubElement(robot, "link", name=name)
-    inertial = ET.SubElement(link, "inertial")
-    rpy, (xx, yy, zz) = _principal(np.asarray(inertia, dtype=np.float64), along)
-    ET.SubElement(inertial, "origin", xyz=_numbers(centre), rpy=_numbers(rpy))
-    ET.SubElement(inertial, "mass", value=repr(float(mass)))
-    ET.SubElement(inertial, "inertia", ixx=repr(xx), iyy=repr(yy), izz=repr(zz), ixy="0", ixz="0", iyz="0")
-    return link
-
-
-def _principal(inertia: FloatArray, along: npt.ArrayLike) -> tuple[FloatArray, list[float]]:
-    """Return roll, pitch, yaw [rad] of the principal axes of an inertia, and the moments about them [kg m²]."""
-    if inertia.ndim == 1:
-        across, about = inertia.tolist()
-        return rpy_along(along), [across, across, about]
-    moments, axes = np.linalg.eigh(inertia)
-    axes[:, 2] *= np.sign(np.linalg.det(axes))
-    return rpy_from_rotation(axes), moments.tolist()
-
-
-def _add_joint(robot: ET.Element, name: str, ends: tuple[str, str], origin: FloatArray, *, turns: bool) -> None:
-    """Add a joint about z, or a fixed one.
-
-    Args:
-        robot: the URDF.
-        name: of the joint.
-        ends: names of the parent link and of the child link.
-        origin: (2, 3), the joint in the parent's frame: translation, m, and roll, pitch, yaw, rad.
-        turns: whether it turns; a turning joint has no limits, as the plant holds them.
-    """
-    joint = ET.SubElement(robot, "joint", name=name, type="continuous" if turns else "fixed")
-    ET.SubElement(joint, "parent", link=ends[0])
-    ET.SubElement(joint, "child", link=ends[1])
-    ET.SubElement(joint, "origin", xyz=_numbers(origin[0]), rpy=_numbers(origin[1]))
-    if turns:
-        ET.SubElement(joint, "axis", xyz="0 0 1")
-
-
-def _add_visual(link: ET.Element, colour: Colour, xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> ET.Element:
-    """Add a drawn part at `xyz` (3,) m, `rpy` (3,) rad of the body frame and return its empty geometry."""
-    visual = ET.SubElement(link, "visual")
-    ET.SubElement(visual, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
-    # PyBullet keeps materials by name, so every colour needs a name of its own.
-    material = ET.SubElement(visual, "material", name="rgba_" + "_".join(f"{255 * part:.0f}" for part in colour))
-    ET.SubElement(material, "color", rgba=_numbers(colour))
-    return ET.SubElement(visual, "geometry")
-
-
-def _draw_cylinder(link: ET.Element, colour: Colour, start: npt.ArrayLike, end: npt.ArrayLike, radius: float) -> None:
-    """Draw a cylinder between two points (3,) m of the body frame; nothing where they coincide."""
-    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
-    length = float(np.linalg.norm(b - a))
-    if length > 1e-6:
-        geometry = _add_visual(link, colour, (a + b) / 2, rpy_along(b - a))
-        ET.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(length))
-
-
-def _draw_sphere(link: ET.Element, colour: Colour, centre: npt.ArrayLike, radius: float) -> None:
-    """Draw a sphere at a point (3,) m of the body frame."""
-    geometry = _add_visual(link, colour, centre, np.zeros(3))
-    ET.SubElement(geometry, "sphere", radius=repr(float(radius)))
-
-
-def _draw_mesh(link: ET.Element, colour: Colour, file_name: str, scale: float) -> None:
-    """Draw a mesh at the body frame's origin, `scale` times as large as in its file."""
-    geometry = _add_visual(link, colour, np.zeros(3), np.zeros(3))
-    ET.SubElement(geometry, "mesh", filename=file_name, scale=_numbers([scale] * 3))
+    draw_cylinder(link, DARK_GREY, (0.0, 0.0, -0.012), (0.0, 0.0, 0.004), 0.9 * radius)
+    draw_cylinder(link, DARK_GREY, (0.0, 0.0, 0.0), tool, 0.25 * ball_radius)
