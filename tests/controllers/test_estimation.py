@@ -1,17 +1,15 @@
 """Tests of the estimate stage: what the estimator learns from and what Ĵ is made of, under each `aids.model`."""
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from kit.toy import KNOWLEDGE, PERIOD, M, N, jacobian_network, only_jacobian, plant_spec
+from kit.toy import KNOWLEDGE, PERIOD, M, N, Recorder, jacobian_network, only_jacobian, plant_spec
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
-from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.plant.signals import Observation
@@ -132,22 +130,6 @@ def test_an_estimator_with_a_model_learns_in_its_own_frame_what_the_rotation_doe
         wanted = TURN @ true.jacobian(q[-1])
         found.append(np.linalg.norm(states[-1].jacobian - wanted) / np.linalg.norm(wanted))
     assert found[0] < 0.7 * found[1]
-
-
-class Recorded(NamedTuple):
-    J: np.ndarray
-
-
-class Recorder(Estimator):
-    def __init__(self):
-        self.motions = []
-
-    def start(self, jacobian):
-        return Recorded(jacobian)
-
-    def update(self, state, motion):
-        self.motions.append(motion)
-        return state
 
 
 @pytest.mark.parametrize("aids", [{}, {"delay": "given"}], ids=["as read", "paired"])

@@ -1,16 +1,14 @@
 """Tests of the composed controller: what it hands to its parts, what it refuses, what each lane does."""
 
 import dataclasses
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from kit.toy import plant_spec, seen
+from kit.toy import Recorded, Recorder, plant_spec, seen
 from servobench.controllers.aids import EQUIPPED, AidsConfig
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
-from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.estimators.fixed import ConstantEstimator
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.laws.law import Law
@@ -21,25 +19,6 @@ from servobench.plant.faults import ControllerDiverged
 
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
 KNOWLEDGE = RobotKnowledge(plant_spec(3, 2, reach=1.0), 1, nominal_jacobian=lambda q: J0)
-
-
-class Recorded(NamedTuple):
-    J: np.ndarray
-
-
-class Recorder(Estimator):
-    def __init__(self):
-        self.motions = []
-
-    def start(self, jacobian):
-        return Recorded(jacobian)
-
-    def update(self, state, motion):
-        self.motions.append(motion)
-        return state
-
-    def diagnostics(self, state):
-        return {"motions": len(self.motions)}
 
 
 class Broken(Law):

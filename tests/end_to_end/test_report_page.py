@@ -145,6 +145,8 @@ def test_the_address_of_a_run_can_be_sent_to_somebody(browser, pages):
     browser.call("Page.navigate", url="about:blank")
     browser.call("Page.navigate", url=pages["comparison"].resolve().as_uri() + "#run-8")
     browser.wait_for("document.querySelector('tr.detail svg path.own')")
+    opened = browser.evaluate("Array.from(document.querySelectorAll('tr.detail h4'), h => h.textContent)")
+    assert opened == ["kinematic-someone_elses-circle-moderate-0"]
 
 
 def test_a_run_without_steps_says_so(browser, pages):

@@ -6,61 +6,45 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 import servobench
 from kit.command import PACKAGE
+from kit.resting import Resting
 from servobench.harness.config.builds import NoSettings
 
 SHORT = {"exp1": {"duration": 0.5}}
 
 
-class Still(servobench.Controller):
-    """Commands no motion."""
-
-    def __init__(self, knowledge: servobench.RobotKnowledge) -> None:
-        self.n = knowledge.spec.n
-
-    def reset(self, observation, seed):
-        pass
-
-    def step(self, observation, reference):
-        return servobench.Command(np.zeros(self.n))
-
-    def diagnostics(self):
-        return {}
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_controller_class_is_compared_with_a_named_one(workers):
-    table = servobench.compare([Still, "ukf_mfac"], seeds=2, settings=SHORT, workers=workers)
-    assert table["controller"].tolist() == ["Still", "Still", "ukf_mfac", "ukf_mfac"]
+    table = servobench.compare([Resting, "ukf_mfac"], seeds=2, settings=SHORT, workers=workers)
+    assert table["controller"].tolist() == ["Resting", "Resting", "ukf_mfac", "ukf_mfac"]
     assert (table["status"] == "completed").all(), table["reason"].tolist()
     effort = table.groupby("controller")["control_effort_rad"].max()
-    assert effort["Still"] == 0.0 < effort["ukf_mfac"]
+    assert effort["Resting"] == 0.0 < effort["ukf_mfac"]
 
 
 def test_a_controller_that_cannot_be_pickled_is_compared_in_this_process():
-    class Local(Still):
-        """As Still."""
+    class Local(Resting):
+        """As Resting."""
 
     table = servobench.compare([Local], settings=SHORT, workers=2)
     assert table["status"].tolist() == ["completed"]
 
 
 def test_a_folder_is_written_and_read(tmp_path):
-    table = servobench.compare([Still], settings=SHORT, out=tmp_path / "out")
+    table = servobench.compare([Resting], settings=SHORT, out=tmp_path / "out")
     found = servobench.load(tmp_path / "out")
     assert found.runs["run_id"].tolist() == table["run_id"].tolist()
     assert found.steps is not None
     assert len(found.steps) == 10
-    assert found.manifest["controllers"] == ["Still"]
+    assert found.manifest["controllers"] == ["Resting"]
 
 
 def test_one_run_has_its_row_and_steps():
-    result = servobench.run(Still, seed=3, settings=SHORT)
-    assert (result.row["controller"], result.row["seed"], len(result.steps)) == ("Still", 3, 10)
+    result = servobench.run(Resting, seed=3, settings=SHORT)
+    assert (result.row["controller"], result.row["seed"], len(result.steps)) == ("Resting", 3, 10)
 
 
 def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
@@ -69,11 +53,11 @@ def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
         match="controller is of type int, wanted a subclass of servobench.Controller or a servobench.ControllerEntry",
     ):
         servobench.run(3)
-    taken = servobench.ControllerEntry("ukf_mfac", "", NoSettings, lambda _config, knowledge: Still(knowledge))
+    taken = servobench.ControllerEntry("ukf_mfac", "", NoSettings, lambda _config, knowledge: Resting(knowledge))
     with pytest.raises(ValueError, match="a controller called 'ukf_mfac' exists already"):
         servobench.compare([taken])
     with pytest.raises(ValueError, match="seeds must name at least one"):
-        servobench.compare([Still], seeds=())
+        servobench.compare([Resting], seeds=())
 
 
 def test_every_public_name_has_a_docstring_and_no_other_name_is_there():

@@ -19,38 +19,37 @@ from servobench.plant.signals import Command
 
 COUNT = itertools.count()
 
-KILLERS = """
+KILLERS = f"""
 import ctypes
 import os
 import time
-import numpy as np
-import servobench
+{WHOLE}
 
-
-class Segv(servobench.Controller):
-    def __init__(self, knowledge):
-        self.n = knowledge.spec.n
-
-    def reset(self, observation, seed):
-        pass
-
+class Segv(Mine):
     def step(self, observation, reference):
         return servobench.Command(np.full(self.n, ctypes.string_at(0)[0]))
 
 
-class Hang(Segv):
+class Hang(Mine):
     def step(self, observation, reference):
         while True:
             time.sleep(0.1)
 
 
-class Exit(Segv):
+class Exit(Mine):
     def step(self, observation, reference):
         os._exit(9)
 """
+
+
+def line_of(code: str) -> int:
+    """Return the line of a piece of code in the file of killers."""
+    return 1 + KILLERS[: KILLERS.index(code)].count("\n")
+
+
 KILLING = {
-    "Segv": ("command", "kill.py:17: it killed the process by SIGSEGV"),
-    "Hang": ("command", "kill.py:23: no answer after 3 s; is there a loop without an end"),
+    "Segv": ("command", f"kill.py:{line_of('string_at')}: it killed the process by SIGSEGV"),
+    "Hang": ("command", f"kill.py:{line_of('time.sleep')}: no answer after 3 s; is there a loop without an end"),
     "Exit": ("command", "it ended the process with exit code 9"),
 }
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import servobench
+from kit.resting import Resting
 from servobench.controllers.controller import Controller
 from servobench.harness.batch import results
 from servobench.harness.run.ending import Ending, log_entry
@@ -17,22 +18,6 @@ from servobench.plant.faults import FilterDiverged, RunFault
 from servobench.plant.signals import Command
 
 SHORT = {"exp2": {"duration": 0.5}, "random": {"duration": 0.5}}
-
-
-class Resting(Controller):
-    """Does nothing; others below do one thing wrong."""
-
-    def __init__(self, knowledge):
-        self.n = knowledge.spec.n
-
-    def reset(self, observation, seed):
-        pass
-
-    def step(self, observation, reference):
-        return Command(np.zeros(self.n))
-
-    def diagnostics(self):
-        return {}
 
 
 class KeyLost(Resting):

@@ -9,35 +9,29 @@ import subprocess
 import sys
 from functools import partial
 
-import numpy as np
 import pytest
 
 from kit.command import PACKAGE, servobench
-from servobench.controllers.controller import Controller, ControllerEntry
+from kit.resting import Resting
+from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.config.builds import NoSettings
 from servobench.harness.config.entries import CONTROLLER
 from servobench.harness.config.own import own_object
 from servobench.harness.config.registry import offering
-from servobench.plant.signals import Command
 
 
-class Ending(Controller):
+class Ending(Resting):
     """Rests for three periods and then raises something."""
 
     def __init__(self, raised, knowledge):
-        self.raised, self.n = raised, knowledge.spec.n
-
-    def reset(self, observation, seed):
-        pass
+        super().__init__(knowledge)
+        self.raised = raised
 
     def step(self, observation, reference):
         if observation.time > 0.1:
             raise self.raised
-        return Command(np.zeros(self.n))
-
-    def diagnostics(self):
-        return {}
+        return super().step(observation, reference)
 
 
 def ending(name: str, raised: BaseException) -> ControllerEntry:

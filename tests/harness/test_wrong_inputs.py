@@ -55,6 +55,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("tasks", "exp22"), "unknown task 'exp22': did you mean 'exp2'?"),
     # mismatches
     ((*RUN, "--mismatch", "moderat"), "'moderat' is not known here; did you mean 'moderate'?"),
+    ((*RUN, "--mismatch", "mild"), "'mild' is not known here; wanted one profile (none, factory, moderate"),
     ((*RUN, "--mismatch", "camera_rotaton=5deg"), "did you mean 'camera_rotation'?"),
     ((*RUN, "--mismatch", "links"), "with one of the units '%', none, such as links=10%; got ''"),
     ((*RUN, "--mismatch", "links=5mm"), "links needs a magnitude with one of the units '%', none"),
@@ -118,6 +119,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=text.csv"), "text.csv, row 1: z_m is not a number: 'far'"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=backwards.csv"), "waypoint times must ascend"),
     ((*RUN, "--task", "waypoints", "--set", "waypoints.file=columns.csv"), "with the columns time_s, x_m, y_m, z_m"),
+    ((*RUN, "--task", "waypoints", "--set", "waypoints.file=no.csv"), "waypoint file no.csv cannot be read"),
     # lists, seeds and places
     ((*RUN, "--seed", "-1"), "seeds must name at least one seed, none of them negative"),
     ((*RUN, "--seed", "10000"), "seed 10000 cannot be used to judge: 10000:20000 are kept for tuning"),
@@ -126,6 +128,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--out", "file/new"), "cannot be made"),
     ((*RUN, "--out", "full"), "results folder full exists already; name another one with --out"),
     (("compare", "--controllers", "constant,constant"), "--controllers names constant twice"),
+    (("compare", "--controllers", "constant,cnstant"), "unknown controller 'cnstant': did you mean 'constant'?"),
     (("compare", "--controllers", "constant,all"), "--controllers names constant twice"),
     (("compare", "--controllers", "map_mfac,rbfnn_mfac_plus"), "is asked for twice"),
     (("compare", "--plants", "kinematic,kinematic"), "--plants names kinematic twice"),
@@ -136,6 +139,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*COMPARE, "--mismatch", "none,sever"), "did you mean 'severe'?"),
     ((*COMPARE, "--seeds", "3,1,3"), "seeds name 3 twice, got '3,1,3'"),
     ((*COMPARE, "--seeds", "5:1"), "seeds must name at least one seed"),
+    ((*COMPARE, "--seeds", "many"), "seeds must be a count (5), a list (3,1,4) or a range (100:120), got 'many'"),
     ((*COMPARE, "--seeds", "1:2:3"), "seeds must be a count (5), a list (3,1,4) or a range (100:120), got '1:2:3'"),
     ((*COMPARE, "--workers", "0"), "--workers"),
     ((*COMPARE, "--run-timeout", "0"), "--run-timeout"),

@@ -48,8 +48,12 @@ def plain(printed):
 
 
 def carry_out(text, monkeypatch, capsys, folder):
-    """Do what a page says in a folder; every output is that of the page, with `...` for lines that are left out."""
+    """Do what a page says in a folder, and return how many commands it had.
+
+    Every output is that of the page, with `...` for lines that are left out.
+    """
     monkeypatch.chdir(folder)
+    count = 0
     for kind, what, content in steps(text):
         if kind == "file":
             Path(what).parent.mkdir(parents=True, exist_ok=True)
@@ -61,6 +65,8 @@ def carry_out(text, monkeypatch, capsys, folder):
         captured = capsys.readouterr()
         assert code == 0, f"{what}: exit code {code}: {captured.out}{captured.err}"
         compare(" ".join(what), plain(content), plain(captured.out))
+        count += 1
+    return count
 
 
 def compare(command, told, printed):

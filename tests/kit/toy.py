@@ -2,12 +2,13 @@
 
 from collections import deque
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.estimator import Motion
+from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 from servobench.controllers.stages.finish import Finish
@@ -31,6 +32,29 @@ def motion(dq, dy, e=None, q=None, duration=PERIOD):
     """Return a motion of the joints by dq and of the feature by dy."""
     dq, dy = np.asarray(dq, dtype=float), np.asarray(dy, dtype=float)
     return Motion(np.zeros(dq.size) if q is None else q, dq, dy, np.zeros(dy.size) if e is None else e, duration)
+
+
+class Recorded(NamedTuple):
+    """The state of a `Recorder`."""
+
+    J: np.ndarray
+
+
+class Recorder(Estimator):
+    """An estimator that keeps the motions it is given and learns nothing."""
+
+    def __init__(self):
+        self.motions = []
+
+    def start(self, jacobian):
+        return Recorded(jacobian)
+
+    def update(self, state, motion):
+        self.motions.append(motion)
+        return state
+
+    def diagnostics(self, state):
+        return {"motions": len(self.motions)}
 
 
 class Learning:
