@@ -64,6 +64,7 @@ def record(
     from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
+    from servobench.plant.bullet.bullet_plant import rendering_engine
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
     check_installed(("pybullet",), "a film of the rendered arm")
@@ -79,6 +80,7 @@ def record(
                 raise ConfigurationError("--run names a run of a results folder, and no folder is given")
             chosen = {name: value for name, value in new.items() if value is not None}
             shown = _new_run(RECORDED | chosen, read_settings(config, set_ or []))
+        console.print(f"rendered by {rendering_engine()}", soft_wrap=True, markup=False, highlight=False)
         paths = write_recording(
             stretch(shown, begin, length),
             (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"]),

@@ -171,6 +171,19 @@ def installed_plant(name: str) -> PlantEntry:
     return entry
 
 
+def engine_of(name: str) -> str:
+    """Return which engine computes or renders a plant, in a line; empty where there is none, or no such plant here."""
+    try:
+        return _told(find_plant(name))
+    except (ConfigurationError, ImportError):
+        return ""
+
+
+@cache
+def _told(entry: PlantEntry) -> str:
+    return entry.engine() if entry.engine is not None else ""
+
+
 def default_plant() -> tuple[str, str]:
     """Return the plant of a run for which none is named, and why it is not the first choice; empty if it is."""
     first, second = DEFAULT_PLANTS

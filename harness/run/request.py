@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from servobench.harness.config.registry import FORMER_NAMES
+from servobench.harness.config.registry import FORMER_NAMES, engine_of
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.robot.mismatch import Mismatch
@@ -96,7 +96,7 @@ class RunRequest:
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""
         columns = {f"{name}_s" if name in TIMES else name: value for name, value in vars(self).items()}
-        return {"run_id": self.run_id, **columns, "mismatch": str(self.mismatch)}
+        return {"run_id": self.run_id, **columns, "mismatch": str(self.mismatch), "engine": engine_of(self.plant)}
 
 
 def read_mismatch(text: str) -> Mismatch:

@@ -4,6 +4,7 @@ import pickle
 
 import pytest
 
+from kit.plants import NEEDS_BULLET
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import controller_names, find_controller
@@ -60,3 +61,13 @@ def test_a_setting_of_the_past_is_refused_with_its_new_name():
     for section, key, now in (("law", "step_factor", "gain"), ("estimator", "process_deviation", "walk")):
         with pytest.raises(ConfigurationError, match=f"^ukf_mfac.{section} has no setting '{key}' any more: .*{now}"):
             resolve(request, Settings({"ukf_mfac": {section: {key: 0.1}}}))
+
+
+@pytest.mark.parametrize(
+    ("plant", "engine"),
+    [("kinematic", ""), ("there_is_none", ""), pytest.param("bullet", "PyBullet ", marks=NEEDS_BULLET)],
+)
+def test_a_row_names_the_engine_that_renders_its_plant(plant, engine):
+    told = RunRequest(plant, "constant", "exp1", "none", 0).as_row()["engine"]
+    assert told.startswith(engine)
+    assert bool(told) == bool(engine)
