@@ -68,7 +68,8 @@ class Job:
     def owner(self) -> str:
         """Whose code the run carries out: the names of its plant and controller; empty for that of this package."""
         plant, controller = self.cell.request.plant, self.cell.request.controller
-        return f"{plant} {controller}" if is_foreign_plant(plant) or is_foreign_controller(controller) else ""
+        foreign = is_foreign_plant(plant, trusted=not getattr(self.run.plant, "isolate", True))
+        return f"{plant} {controller}" if foreign or is_foreign_controller(controller) else ""
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,8 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     own = offered([*runs.plants, *runs.controllers])
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
-    with open_workers(how.workers, how.scheduler, bounds, **names, own=own) as place:
+    trusted = [name for name, section in campaign.settings.sections.items() if section.get("isolate") is False]
+    with open_workers(how.workers, how.scheduler, bounds, **names, own=own, trusted=trusted) as place:
         _carry_out_at(place, campaign, runs, own, folder, how)
 
 

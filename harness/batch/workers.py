@@ -10,7 +10,7 @@ import math
 import os
 import pickle
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -87,6 +87,7 @@ def open_workers(
     plants: Iterable[str] = (),
     controllers: Iterable[str] = (),
     own: Sequence[Offer] = (),
+    trusted: Collection[str] = (),
 ) -> Iterator[Workers]:
     """Yield workers; their processes start with the first task and end with the context.
 
@@ -98,6 +99,7 @@ def open_workers(
         plants: names of the plants of the runs.
         controllers: names of the controllers.
         own: controllers and plants that users gave.
+        trusted: names of FMUs that may share a process with the code of this package.
 
     Raises:
         ConfigurationError: Dask is not installed, its scheduler does not answer or has no workers, or a limit is asked
@@ -114,7 +116,8 @@ def open_workers(
             yield workers
         return
     plants, controllers = tuple(plants), tuple(controllers)
-    foreign = any(map(is_foreign_plant, plants)) or any(map(is_foreign_controller, controllers))
+    foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)
+    foreign = foreign or any(map(is_foreign_controller, controllers))
     limits = bounds.limits(count, foreign=foreign and bounds.isolate and can_travel(own))
     if count == 1 and limits == Limits():
         yield Workers()
@@ -136,7 +139,8 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
         client = Client(scheduler, timeout=SCHEDULER_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise ConfigurationError(
-            f"the scheduler {scheduler} does not answer; start one with `dask scheduler` and name its address"
+            f"the scheduler {scheduler} does not answer; start one with `dask scheduler --host 127.0.0.1` and name "
+            "its address"
         ) from error
     try:
         try:

@@ -49,15 +49,13 @@ def export(
 
 @fmu_app.command()
 def validate(file: FileArgument) -> None:
-    """Check archive and description, and repeat its reference run."""
-    from servobench.fmus.validate import validate_fmu
-    from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.faults import FmuError
+    """Check archive and description, and repeat its reference run.
 
-    try:
-        found = validate_fmu(file)
-    except (ValueError, FmuError) as error:
-        raise ConfigurationError(str(error)) from error
+    The run happens in a process of its own.
+    """
+    from servobench.harness.batch.validation import validate_apart
+
+    found = validate_apart(file)
     for problem in found.problems:
         console.print(f"problem: {problem}", soft_wrap=True, markup=False)
     if found.deviation is None:

@@ -215,9 +215,9 @@ def find_controller(name: str) -> ControllerEntry:
     return _load_controller(name)
 
 
-def is_foreign_plant(name: str) -> bool:
-    """Return whether a plant runs code that is not of this package."""
-    return name not in PLANTS
+def is_foreign_plant(name: str, *, trusted: bool = False) -> bool:
+    """Return whether a plant runs code that is not of this package, or of an FMU that the user trusts like it."""
+    return name not in PLANTS and not (trusted and name.startswith(MAPPED))
 
 
 def is_foreign_controller(name: str) -> bool:

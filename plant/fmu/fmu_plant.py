@@ -24,6 +24,8 @@ class FmuConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
+    isolate: bool = True
+    """Carry its runs out in a process of their own, with limits; false for an FMU that you trust like servobench."""
 
     RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
