@@ -138,7 +138,8 @@ def test_the_tail_mean_of_hundred_errors_is_the_mean_of_the_worst_ten_or_five():
     errors = np.random.default_rng(2).permutation(np.arange(1.0, 101.0))
     assert tail_mean(errors, 0.9) == pytest.approx(95.5)
     assert tail_mean(errors, 0.95) == pytest.approx(98.0)
-    assert tail_mean([*errors, NEVER]) == np.inf
+    assert tail_mean([*errors, NEVER]) == tail_mean([NEVER]) == np.inf
+    assert tail_mean([3.0]) == 3.0
     assert tail_mean([*errors, NEVER], 0.9, missing="left_out") < 97.0
     with pytest.raises(ValueError, match="level must be at least 0 and below 1, got 1"):
         tail_mean(errors, 1.0)
