@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 UNIT := tests/plant tests/controllers tests/fmus tests/harness
 RUNS ?= results/pages
 
-.PHONY: run check test results nightly lint format tables docs release benchmark lock clean
+.PHONY: run check test results nightly golden lint format tables docs release benchmark lock clean
 
 run: $(VENV)/ready
 	$(BIN)/servobench compare --plants bullet,fmu --mismatch moderate \
@@ -24,12 +24,18 @@ test: lint
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
 
-# Too long for every change: whether the stored figures of these studies come out again; writes nothing into the pages.
+# Too long for every change: whether the stored figures of these studies come out again, and whether the unit tests notice
+# small faults in the code; writes nothing into the pages. What the tests did not notice is listed in results/mutation.
 nightly: $(VENV)/ready
 	$(BIN)/python tests/fuzz/campaign.py --inputs 1000000
 	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
+	$(BIN)/python tests/kit/mutation.py
+
+# Make the golden runs anew (tests/closed_loop/golden_runs.csv), and how far rounding moves them; prints a line for CHANGELOG.md.
+golden: $(VENV)/ready
+	$(BIN)/python tests/kit/golden.py
 
 lint: $(VENV)/ready
 	$(BIN)/ruff format --check .

@@ -1,0 +1,109 @@
+"""Golden runs: the first periods of every method on every plant, and when it has settled; `python tests/kit/golden.py`.
+
+One run of the task exp2 with seed 0 and the mismatch moderate is made for each method on each plant. Of each of its
+first periods the table `golden_runs.csv` keeps Σ_i i u_i [rad/s], a sum in which a change of any joint's command
+shows; a change of the plant shows in the commands of the next period. `spread` is how far rounding moves these sums:
+the largest deviation among the kernels of OpenBLAS, numpy's plain loops and a start one unit in the last place away,
+at least `MIN_SPREAD`. The table is renewed by this file, which prints the line that CHANGELOG.md is then to have.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import servobench
+from servobench.harness.config.registry import CONTROLLERS
+from servobench.harness.run.tasks import find_task
+
+PERIODS = 20  # that are compared
+PERIOD = 0.05  # [s]
+TASK = "exp2"
+DURATIONS = {"kinematic": 4.0, "fmu": 4.0, "bullet": PERIODS * PERIOD}  # [s]; a rendered run takes long
+MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow command
+TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
+SUMS = [f"u{k:02d}" for k in range(PERIODS)]
+KERNELS = ("Haswell", "Sandybridge", "Nehalem")
+SIMD = "AVX512F AVX512CD AVX512_SKX AVX2 FMA3 F16C"
+VARIANTS: tuple[Mapping[str, str], ...] = (
+    *({"OPENBLAS_CORETYPE": kernel} for kernel in KERNELS),
+    {"NPY_DISABLE_CPU_FEATURES": SIMD},
+    {"GOLDEN_START": "next"},
+)
+
+
+def golden_runs(plant: str, controllers: tuple[str, ...] = CONTROLLERS) -> pd.DataFrame:
+    """Make the runs on a plant and return the rows of the table, without the spread."""
+    settings: dict[str, dict[str, Any]] = {TASK: {"duration": DURATIONS[plant]}, "run": {"period": PERIOD}}
+    if plant == "bullet":
+        settings[plant] = {"scenery": False}  # which changes no bit of an observation
+    if os.environ.get("GOLDEN_START") == "next":
+        settings[TASK]["start"] = np.nextafter(find_task(TASK).default.start, np.inf).tolist()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        servobench.compare(controllers, [plant], [TASK], settings=settings, out=out)
+        tables = servobench.load(out)
+    assert tables.steps is not None
+    rows = []
+    for run in tables.runs.itertuples():
+        steps = tables.steps[tables.steps["run_id"] == run.run_id]
+        u = steps.filter(like="joint_velocity_command_").to_numpy()[:PERIODS]
+        values = [float(f"{value:.15g}") for value in u @ np.arange(1.0, u.shape[1] + 1.0)]
+        sums = dict(zip(SUMS, values, strict=True))
+        rows.append({"plant": plant, "controller": run.controller, "settled": run.settling_time_s, **sums})
+    return pd.DataFrame(rows)
+
+
+def stored() -> pd.DataFrame:
+    """Return the table as it is kept."""
+    return pd.read_csv(TABLE)
+
+
+def changelog_line() -> str:
+    """Return the line of CHANGELOG.md that belongs to the table as it is kept."""
+    return f"Golden runs: `{hashlib.sha256(TABLE.read_bytes()).hexdigest()[:16]}`."
+
+
+def _variant(environment: Mapping[str, str], folder: Path) -> pd.DataFrame:
+    """Return the table as another process makes it."""
+    path = folder / "variant.csv"
+    subprocess.run([sys.executable, __file__, str(path)], env={**os.environ, **environment}, check=True)
+    return pd.read_csv(path)
+
+
+def _all() -> pd.DataFrame:
+    return pd.concat([golden_runs(plant) for plant in DURATIONS], ignore_index=True)
+
+
+def renew() -> None:
+    """Make the runs in all variants and write the table anew."""
+    table = _all()
+    spread = np.full(len(table), MIN_SPREAD)
+    with tempfile.TemporaryDirectory() as folder:
+        for environment in VARIANTS:
+            other = _variant(environment, Path(folder))
+            deviation = (other[SUMS] - table[SUMS]).abs().max(axis=1).to_numpy()
+            late = (other["settled"] - table["settled"]).abs().max()
+            print(
+                f"{environment}: {np.median(deviation):.1e} to {deviation.max():.1e} rad/s, settled {late:.2g} s apart"
+            )
+            spread = np.maximum(spread, deviation)
+    table.insert(3, "spread", [float(f"{value:.1e}") for value in spread])
+    table.to_csv(TABLE, index=False)
+    print(f"CHANGELOG.md is to have the line, where it says what changed:\n{changelog_line()}")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        _all().to_csv(sys.argv[1], index=False)
+    else:
+        renew()
