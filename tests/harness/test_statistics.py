@@ -143,6 +143,8 @@ def test_the_tail_mean_of_hundred_errors_is_the_mean_of_the_worst_ten_or_five():
     assert tail_mean([*errors, NEVER], 0.9, missing="left_out") < 97.0
     with pytest.raises(ValueError, match="level must be at least 0 and below 1, got 1"):
         tail_mean(errors, 1.0)
+    with pytest.raises(ValueError, match="values must hold at least one number"):
+        tail_mean([NEVER], missing="left_out")
 
 
 def test_the_signed_rank_test_enumerates_all_signs():
