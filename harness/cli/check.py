@@ -30,6 +30,8 @@ def check(
     from servobench.harness.check.plants import check_plant
     from servobench.harness.config.settings import ConfigurationError
 
+    if subject == ["plant"]:
+        raise ConfigurationError("check plant needs a plant, such as servobench check plant ./cell.py")
     if subject[0] == "plant" and len(subject) == 2:
         checks: Checks = check_plant
         name = subject[1]

@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import Any, Final, Generic
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.config.entries import Entry, Kind, make_entry
+from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import SourceFile, describe_at, make_importable
 from servobench.plant.plant import PlantEntry
@@ -125,7 +125,9 @@ def _pick(kind: Kind[Any], module: ModuleType, where: str, name: str | None) -> 
         return next(iter(found.values()))
     if not found:
         bases = " or ".join(f"servobench.{each.__name__}" for each in kind.bases)
-        raise ConfigurationError(f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY")
+        others = [f"the {other.word} {each}" for other in (CONTROLLER, PLANT) for each in _members(other, module)]
+        hint = f"; it defines {' and '.join(others)}" if others else ""
+        raise ConfigurationError(f"{where} defines no {kind.word}: no subclass of {bases} and no ENTRY{hint}")
     first, *_ = found
     raise ConfigurationError(f"{where} defines {', '.join(found)}; name one of them, such as {where}:{first}")
 

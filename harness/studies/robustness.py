@@ -29,7 +29,7 @@ from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.sweep import Place
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import find_controller
+from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.draw import save_figure
@@ -94,7 +94,12 @@ def make_map(
 
     Returns:
         The files of the pictures.
+
+    Raises:
+        ConfigurationError: a plant with a robot of its own, or what `carry_out` refuses.
     """
+    if find_plant(plant).own_robot:
+        raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")
     check_settings(settings, [plant, TASK, *controllers])
     settings = Settings(settings.sections)  # each part reads some of them
     static, moved = map_cells(plant, controllers, seeds, robot, lines)

@@ -106,6 +106,10 @@ def test_a_controller_that_cannot_be_loaded_is_refused_as_elsewhere(tmp_path, mo
     assert capsys.readouterr().err == "servobench: mine.py:6: class Mine lacks step, which it must define\n"
     assert command(monkeypatch, "check", "robot", "./mine.py") == 2
     assert "check needs a controller, or the word plant and a plant" in capsys.readouterr().err
+    assert command(monkeypatch, "check", "plant") == 2
+    assert (
+        capsys.readouterr().err == "servobench: check plant needs a plant, such as servobench check plant ./cell.py\n"
+    )
 
 
 def plant_with(**methods) -> PlantEntry:

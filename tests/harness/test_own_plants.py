@@ -136,7 +136,11 @@ BROKEN = {
     "syntax": (CELL.replace("setup.robot()", "setup.robot("), "cell.py:10: SyntaxError: '(' was never closed"),
     "no such module": ("import torhc\n" + CELL, "cell.py:1: ModuleNotFoundError: No module named 'torhc'"),
     "no advance": (CELL.replace("def advance", "def go"), "cell.py:6: class Cell lacks advance, which it must define"),
-    "nothing in it": (WHOLE, "./cell.py defines no plant: no subclass of servobench.Plant or servobench.World"),
+    "nothing in it": (
+        WHOLE,
+        "./cell.py defines no plant: no subclass of servobench.Plant or servobench.World and no ENTRY; "
+        "it defines the controller Mine",
+    ),
     "two of them": (TWO, "./cell.py defines Cell, Other; name one of them, such as ./cell.py:Cell"),
     "no setup": (
         CELL.replace("self, setup", "self"),
@@ -211,3 +215,6 @@ def test_a_plant_is_named_on_every_command_that_takes_one(tmp_path, monkeypatch,
     asked = ["--plants", "./cell.py", "--controllers", "constant", "--tasks", "exp1", "--no-report", "--workers", "1"]
     assert command(monkeypatch, "compare", *asked, "--config", "cell.toml", "--out", "out") == 0
     assert "exp1 on Cell, moderate" in capsys.readouterr().out
+    write(tmp_path, PLAIN_CELL, "own.py")
+    assert command(monkeypatch, "robustness", "--plant", "./own.py", "--controllers", "constant", "--out", "map") == 2
+    assert "the map varies the true robot, and plant Plain brings one of its own" in capsys.readouterr().err
