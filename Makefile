@@ -24,13 +24,15 @@ test: lint
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
 
-# Too long for every change: whether the stored figures of these studies come out again, and whether the unit tests notice
-# small faults in the code; writes nothing into the pages. What the tests did not notice is listed in results/mutation.
+# Too long for every change: whether the stored figures of these studies come out again, whether a sweep with hostile
+# controllers loses no run, and whether the unit tests notice small faults in the code; writes nothing into the pages.
+# What the tests did not notice is listed in results/mutation.
 nightly: $(VENV)/ready
 	$(BIN)/python tests/fuzz/campaign.py --inputs 1000000
 	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
+	$(BIN)/python benchmarks/hard_night.py --runs 10000
 	$(BIN)/python tests/kit/mutation.py
 
 # Make the golden runs anew (tests/closed_loop/golden_runs.csv), and how far rounding moves them; prints a line for CHANGELOG.md.
