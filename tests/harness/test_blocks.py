@@ -26,6 +26,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.ending import Ending
 from servobench.harness.run.episode import RunResult
 from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import ResolvedRun
 
 PLAN = SweepPlan(
     Batch(("kinematic",), ("constant", "broyden"), ("random",), ("moderate",), range(6)),
@@ -165,7 +166,8 @@ def test_of_runs_that_go_one_by_one_no_other_is_blamed_and_few_are_carried_out_a
 
 
 def job(index: int, kind: object) -> Job:
-    return Job(index, Cell(RunRequest("kinematic", "constant", "random", "none", index)), None, kind)
+    request = RunRequest("kinematic", "constant", "random", "none", index)
+    return Job(index, Cell(request), ResolvedRun(request, None, None, None, None), kind)
 
 
 def test_a_block_has_consecutive_runs_of_one_kind():
