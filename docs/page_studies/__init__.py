@@ -7,6 +7,7 @@ from page_studies.audit import AUDIT
 from page_studies.claims import CLAIMS
 from page_studies.failures import FAILURES
 from page_studies.held_out import HELD_OUT, RENDERED_STUDY, TUNING_STUDIES
+from page_studies.noise import NOISE_STUDIES
 from page_studies.performance import PERFORMANCE
 from page_studies.physical import DYNAMICS, ENDS, LONG, RATES_STUDY
 from page_studies.readme import README
@@ -17,5 +18,6 @@ STUDIES = {
     for study in (
         HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, AUDIT, CLAIMS, RATES_STUDY, LONG, ENDS, DYNAMICS, WORLDS,
         LEARNING, PAIRS_STUDY, MAP, README, FAILURES, PERFORMANCE,
+        *NOISE_STUDIES,
     )
 }  # fmt: skip
