@@ -6,6 +6,7 @@ whereas converting lists at every call costs several.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import logging
 from abc import ABC, abstractmethod
@@ -20,14 +21,14 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription, Variable, total_size
-from servobench.plant.fmu.library import load_library, unload_library
+from servobench.plant.fmu.library import condemn, is_condemned, load_library, unload_library
 
 logger = logging.getLogger("servobench.fmu")
 
 Call: TypeAlias = Callable[[], None]
 RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
 STATUS_WORDS = ("ok", "warning", "discard", "error", "fatal", "pending")
-OK, WARNING, DISCARD = 0, 1, 2
+OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
 REMEMBERED_MESSAGES = 5
 MIN_PROGRESS = 1e-9  # share of a step that a partial step must cover
 STATUS_LEVELS = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR, logging.ERROR, logging.DEBUG)
@@ -125,6 +126,7 @@ class Instance(ABC):
         self.description = description
         self.root = root
         self.log = MessageLog(description.path.name)
+        self._begun = False  # whether it has to be terminated before it is freed
         self._owns_library = library is None
         self._library = load_library(description, root) if library is None else library
         self._component = ctypes.c_void_p()
@@ -141,8 +143,18 @@ class Instance(ABC):
     def _instantiate(self) -> int | None:
         """Make an instance and return its address."""
 
-    @abstractmethod
+    @property
+    def fatal(self) -> bool:
+        """Whether it, or another instance of its library, reported a fatal error, after which nothing may be called."""
+        return self._library is not None and is_condemned(self._library)
+
     def start(self, time: float) -> None:
+        """Go through initialisation, to begin at `time`."""
+        self._initialise(time)
+        self._begun = True
+
+    @abstractmethod
+    def _initialise(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
 
     @abstractmethod
@@ -194,6 +206,7 @@ class Instance(ABC):
     def reset(self) -> None:
         """Return to the state after instantiation."""
         self.call("Reset")
+        self._begun = False
 
     @abstractmethod
     def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
@@ -254,12 +267,15 @@ class Instance(ABC):
         return state
 
     def close(self) -> None:
-        """Free the instance and unload a library of its own; calling it twice is allowed."""
-        if self._component.value:
+        """End and free the instance and unload a library of its own; calling it twice is allowed."""
+        if self._component.value and not self.fatal:
+            if self._begun:
+                with contextlib.suppress(ValueError):  # of an FMU that does not export it
+                    self.function("Terminate")(self._component)
             release = self.function("FreeInstance")
             release.restype = None
             release(self._component)
-            self._component = ctypes.c_void_p()
+        self._component, self._begun = ctypes.c_void_p(), False
         if self._owns_library and self._library is not None:
             unload_library(self._library)
         self._library = None
@@ -271,10 +287,15 @@ class Instance(ABC):
             FmuError: it is not.
         """
         if status > WARNING or status < OK:
+            self._begun = False  # after an error only its freeing is allowed
+            if status == FATAL:
+                condemn(self._library)
             raise self.log.failure(function, status)
 
     def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
         """Call a function of the library on the instance and check its status; not for the inner loop."""
+        if self.fatal:
+            raise FmuError(f"{self.description.path.name} reported a fatal error before, so it cannot be called again")
         self.check(f"{self.prefix}{name}", self.function(name)(self._component, *arguments))
 
     def function(self, name: str) -> Any:  # noqa: ANN401 - a ctypes function

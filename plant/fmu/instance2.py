@@ -59,8 +59,7 @@ class Instance2(Instance):
         )
         return address
 
-    def start(self, time: float) -> None:
-        """Go through initialisation, to begin at `time`."""
+    def _initialise(self, time: float) -> None:
         nothing = ctypes.c_double(0.0)
         no = ctypes.c_int(0)
         self.call("SetupExperiment", no, nothing, ctypes.c_double(time), no, nothing)

@@ -45,8 +45,7 @@ class Instance3(Instance):
         )
         return address
 
-    def start(self, time: float) -> None:
-        """Go through initialisation, to begin at `time`."""
+    def _initialise(self, time: float) -> None:
         nothing, no = ctypes.c_double(0.0), ctypes.c_bool(False)
         self.call("EnterInitializationMode", no, nothing, ctypes.c_double(time), no, nothing)
         self.call("ExitInitializationMode")

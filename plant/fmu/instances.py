@@ -70,7 +70,7 @@ class Lane:
 
     def close(self) -> None:
         """Free the instance and its states."""
-        while self.states:
+        while self.states and not self.instance.fatal:
             self.instance.free(self.states.pop())
         self.instance.close()
 
@@ -135,16 +135,18 @@ class Instances:
 
     def _settle(self, results: Sequence[int], settle: Callable[[Instance, int], None]) -> None:
         for i, result in enumerate(results):
-            if result:
+            if result and self.live[i] is self.lanes[i]:
                 try:
                     settle(self.lanes[i].instance, result)
                 except FmuError as fault:
                     self.drop(i, fault)
 
     def drop(self, i: int, fault: FmuError) -> None:
-        """Call an instance no more, because of a fault; that of a single run raises."""
-        self._fail(i, fault)
-        self.live[i] = self.lanes[i].resting()
+        """Call an instance no more, because of a fault, nor any other if it is fatal; that of a single run raises."""
+        for j in range(len(self.lanes)) if self.lanes[i].instance.fatal else (i,):
+            if self.live[j] is self.lanes[j]:
+                self._fail(j, fault)
+                self.live[j] = self.lanes[j].resting()
 
     def keep(self, chosen: Sequence[int]) -> None:
         """Close all other instances."""

@@ -10,6 +10,18 @@ from typing import Any
 
 from servobench.plant.fmu.description import FmuDescription
 
+_fatal: set[int] = set()  # handles of libraries that may never be called again; they stay loaded
+
+
+def condemn(library: Any) -> None:  # noqa: ANN401 - a ctypes library
+    """Take note that an instance reported a fatal error: no instance of this library may be called again."""
+    _fatal.add(library._handle)
+
+
+def is_condemned(library: Any) -> bool:  # noqa: ANN401 - a ctypes library
+    """Return whether no instance of a library may be called again."""
+    return library._handle in _fatal
+
 
 def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN401 - a ctypes library
     """Load the FMU's library for this machine.
@@ -25,7 +37,8 @@ def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN40
         file = binaries / folder / wanted
         if file.is_file() and file.resolve().is_relative_to(root.resolve()):
             try:
-                return ctypes.CDLL(str(file)) if not description.once_per_process else _load_copy(file)
+                library = None if description.once_per_process else ctypes.CDLL(str(file))
+                return _load_copy(file) if library is None or is_condemned(library) else library
             except OSError as error:
                 raise ValueError(f"the library in {description.path.name} cannot be loaded: {error}") from error
         if file.parent.is_dir():
@@ -48,7 +61,9 @@ def _load_copy(file: Path) -> ctypes.CDLL:
 
 
 def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Give the library back to the system."""
+    """Give the library back to the system, unless it may never be called again, not even to unload it."""
+    if is_condemned(library):
+        return
     from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
 
     freeLibrary(library._handle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import zipfile
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from kit.foreign_fmu import build_crane, describe_with
+from servobench.fmus.compile import this_platform
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench import Bench
 from servobench.plant.cache import cache_folder
@@ -329,3 +331,42 @@ def test_memory_stays_flat_over_many_lives_of_a_plant(tmp_path, version):
     before = resident()
     live(100)
     assert resident() - before < 5e6
+
+
+def counts(path: Path, version: int) -> tuple[int, int]:
+    """Return how often the crane was terminated, and how often it was called after a fatal error."""
+    folder = extract_fmu(path) / "binaries" / this_platform().folder(version)
+    library = ctypes.CDLL(str(folder / f"crane{this_platform().suffix}"))
+    return tuple(ctypes.c_int.in_dll(library, name).value for name in ("terminated", "called_after_fatal"))
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_fmu_is_terminated_before_it_is_freed(tmp_path, version):
+    before = counts(build_crane(tmp_path / "crane.fmu", version), version)[0]
+    plant = crane(tmp_path, version)
+    plant.step(Command([0.0, 0.0]))
+    plant.close()
+    plant.close()
+    failed = crane(tmp_path, version, parameters={"quirk": np.array(1.0)})
+    with pytest.raises(FmuError, match="DoStep returned error"):
+        failed.step(Command([0.0, 0.0]))
+    failed.close()  # after an error it may be freed only
+    assert counts(tmp_path / "crane.fmu", version) == (before + 1, 0)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_nothing_of_an_fmu_is_called_after_a_fatal_error(tmp_path, version):
+    path = build_crane(tmp_path / "crane.fmu", version)
+    quirks = np.array([[0.0], [0.0], [9.0]])  # those beside it in a period are called before that is known
+    mapping = FmuMapping(path, **NAMES[version], parameters={"quirk": quirks})
+    world = FmuWorld(mapping, np.tile(START, (3, 1)), PERIOD)
+    world.advance(np.zeros((3, 2)))
+    world.advance(np.zeros((3, 2)))
+    assert set(world.faults) == {0, 1, 2}
+    assert "DoStep returned fatal" in str(world.faults[0])
+    world.close()
+    assert counts(path, version)[1] == 0
+    again = crane(tmp_path, version)  # which loads the library once more
+    again.step(Command([0.1, 0.1]))
+    again.close()
+    assert counts(path, version)[1] == 0

@@ -2,7 +2,8 @@
 
 Its parameter `quirk` makes it misbehave: 1 step fails, 2 result is NaN, 3 every step ends half way, 4 a step makes no
 progress, 5 initialisation fails, 6 it asks to end the simulation (FMI 3), 7 result becomes NaN,
-8 every step ends after 10 µs.
+8 every step ends after 10 µs, 9 a step reports a fatal error. It counts calls of Terminate, and calls after a fatal
+error.
 """
 
 from __future__ import annotations

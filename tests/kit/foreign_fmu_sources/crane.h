@@ -4,7 +4,10 @@
 #include <stddef.h>
 #include <stdlib.h>
 
-enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION, BECOMES_NAN, CREEPS };
+enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION, BECOMES_NAN, CREEPS, DIES };
+
+int terminated, called_after_fatal; /* how often; for tests */
+static bool dead;
 
 typedef struct {
     double time, wheel[2], push[2], place[2], arm[2], quirk, rate[2];

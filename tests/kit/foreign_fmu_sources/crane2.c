@@ -16,7 +16,18 @@ void *fmi2Instantiate(const char *name, int type, const char *guid, const char *
     return c;
 }
 
-void fmi2FreeInstance(void *c) { free(c); }
+void fmi2FreeInstance(void *c)
+{
+    called_after_fatal += dead;
+    free(c);
+}
+
+int fmi2Terminate(void *c)
+{
+    called_after_fatal += dead;
+    terminated++;
+    return 0;
+}
 
 int fmi2SetupExperiment(void *c, int a, double b, double start, int d, double e)
 {
@@ -65,6 +76,11 @@ int fmi2DoStep(void *component, double time, double h, int unused)
     if (c->quirk == STEP_FAILS) {
         callbacks->log(callbacks->environment, "crane", 3, "error", "load %d kg is too heavy at %s", 900, "noon");
         return 3;
+    }
+    called_after_fatal += dead;
+    if (c->quirk == DIES) {
+        dead = true;
+        return 4;
     }
     if (c->quirk == NO_PROGRESS) return 2;
     if (c->quirk == ENDS_HALF_WAY && h > 0.02) {

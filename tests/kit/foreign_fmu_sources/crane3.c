@@ -14,7 +14,18 @@ void *fmi3InstantiateCoSimulation(const char *name, const char *token, const cha
     return c;
 }
 
-void fmi3FreeInstance(void *c) { free(c); }
+void fmi3FreeInstance(void *c)
+{
+    called_after_fatal += dead;
+    free(c);
+}
+
+int fmi3Terminate(void *c)
+{
+    called_after_fatal += dead;
+    terminated++;
+    return 0;
+}
 
 int fmi3EnterInitializationMode(void *c, bool a, double b, double start, bool d, double e)
 {
@@ -62,6 +73,11 @@ int fmi3DoStep(void *component, double time, double h, bool unused, bool *event,
     Crane *c = component;
     *event = *end = *early = false;
     *last = time;
+    called_after_fatal += dead;
+    if (c->quirk == DIES) {
+        dead = true;
+        return 4;
+    }
     if (c->quirk == STEP_FAILS) {
         log_message(0, 3, "error", "load 900 kg is too heavy at noon");
         return 3;
