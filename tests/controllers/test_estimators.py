@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from kit.toy import Learning, motion, plant_spec
 from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator, projection_update
 from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
 from servobench.controllers.estimators.fixed import ConstantEstimator, TrueConfig, TrueEstimator
@@ -225,3 +226,13 @@ def test_the_true_estimator_answers_with_the_truth_where_the_arm_is():
     estimator = TrueEstimator(TrueConfig(), knowledge)
     run = Learning(estimator, np.zeros((1, 2)))
     np.testing.assert_array_equal(run.jacobian(np.array([2.0, 3.0])), [[4.0, 9.0]])
+
+
+def test_an_estimator_that_lacks_what_it_needs_is_refused():
+    knowledge = RobotKnowledge(plant_spec(3, 2), 1)
+    with pytest.raises(ValueError, match="true_jacobian must be known for the estimator 'true'"):
+        TrueEstimator(TrueConfig(), knowledge)
+    with pytest.raises(ValueError, match="nominal_jacobian must be known for the estimator 'arm'"):
+        ArmEstimator(ArmConfig(), knowledge)
+    with pytest.raises(ValueError, match="covariance_limit must be at least initial_covariance"):
+        RlsConfig(initial_covariance=2.0, covariance_limit=1.0)

@@ -157,3 +157,33 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
         write_atomically(path, fail)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
+    cv2 = pytest.importorskip("cv2")
+    picture = np.full((6, 8, 3), (200, 30, 10), dtype=np.uint8)
+    results.write_part(folder, 0, [RunResult({"run_id": "run0"}, None, picture), RunResult({"run_id": "run1"}, None)])
+    written = list((folder / results.PICTURES).iterdir())
+    assert [path.name for path in written] == ["run0.png"]
+    colours = cv2.cvtColor(cv2.imread(str(written[0])), cv2.COLOR_BGR2RGB)
+    np.testing.assert_array_equal(colours, np.full((12, 16, 3), (200, 30, 10)))
+
+
+def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
+    tables = {name: pd.DataFrame({"run_id": [f"{name}{i}" for i in range(2)], "seed": [0, 1]}) for name in "ab"}
+    results.write_summary(folder, tables, {"parts": ["a", "b"]})
+    runs = results.load_runs(folder)
+    assert runs[["run_id", "part"]].values.tolist() == [["a0", "a"], ["a1", "a"], ["b0", "b"], ["b1", "b"]]
+    assert results.read_manifest(folder)["parts"] == ["a", "b"]
+
+
+def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, monkeypatch):
+    monkeypatch.setattr(results, "ROW_GROUP", 2)
+    for index in range(5):
+        add_part(folder, index)
+    assert results.has_steps(folder)
+    results.collect(folder)
+    assert results.has_steps(folder)
+    groups = list(results.iterate_runs(folder, ["seed", "no such column"]))
+    assert [list(group.columns) for group in groups] == [["seed"]] * 3
+    assert [group["seed"].tolist() for group in groups] == [[0, 1], [2, 3], [4]]

@@ -42,7 +42,8 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "estimators": (
         ("controllers/estimators/*.py",),
         ("controllers/test_estimators.py", "controllers/test_arm_estimator.py", "controllers/test_rbf.py",
-         "controllers/test_rbf_lyapunov.py", "controllers/test_estimator_lanes.py"),
+         "controllers/test_rbf_lyapunov.py", "controllers/test_estimator_lanes.py",
+         "controllers/test_correntropy.py", "controllers/test_robust.py"),
     ),
     "laws": (
         ("controllers/laws/*.py", "controllers/laws/mpc/*.py"),

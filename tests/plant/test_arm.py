@@ -7,6 +7,7 @@ from servobench.plant.robot.arm import (
     SerialArm,
     arm_from_calibration,
     arm_from_dh,
+    arm_from_modified_dh,
     rotation_from_rpy,
 )
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
@@ -170,3 +171,19 @@ def test_a_malformed_calibration_is_one_clear_error(tmp_path, content, message):
 def test_a_wrong_argument_is_named(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_the_modified_convention_turns_about_the_axis_behind_a_link(rows):
+    """A product of Craig's transforms, Rx(α) Tx(a) Rz(θ) Tz(d); a fourth row leads to the flange."""
+    rng = np.random.default_rng(5)
+    a, d, alpha = rng.uniform(-1.0, 1.0, (3, rows))
+    arm, angles = arm_from_modified_dh(a, d, alpha, ("a", "b", "c")), rng.uniform(-3.0, 3.0, 3)
+    pose = np.eye(4)
+    for a_i, d_i, alpha_i, angle in zip(a, d, alpha, [*angles, 0.0], strict=False):
+        along, up = np.eye(4), np.eye(4)
+        along[0, 3], up[2, 3] = a_i, d_i
+        pose = pose @ elementary("x", alpha_i) @ along @ elementary("z", angle) @ up
+    np.testing.assert_allclose(arm.ball_position(angles), pose[:3, 3], atol=1e-12)
+    with pytest.raises(ValueError, match="d must have shape"):
+        arm_from_modified_dh(a, d[:2], alpha, ("a", "b", "c"))
