@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Final
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Final, NoReturn
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller, installed_plant, is_published
@@ -18,10 +21,11 @@ from servobench.plant.plant import PlantEntry, PlantSetup
 
 PLANT: Final = "kinematic"  # on which controllers are tried
 TASK: Final = "exp1"
+ANSWER_LIMIT = 30.0  # [s] to load and build one: slow imports are allowed, a list that never comes is not
 
 
-class _Trains(Exception):
-    """A controller begins to train its networks: it can be built."""
+class _Trains(BaseException):
+    """A controller begins to train its networks: it can be built. No `Exception`, which would count as its error."""
 
 
 def usable_controller(name: str, robot: str = DEFAULT_ROBOT) -> ControllerEntry:
@@ -30,8 +34,10 @@ def usable_controller(name: str, robot: str = DEFAULT_ROBOT) -> ControllerEntry:
     Raises:
         ConfigurationError: it cannot be found, loaded or built, in one line.
     """
-    entry = find_controller(name)
-    if is_published(ControllerEntry, name):
+    if not is_published(ControllerEntry, name):
+        return find_controller(name)
+    with _answering_within(ANSWER_LIMIT):
+        entry = find_controller(name)
         _refuse_task(name, "controller")
         request = RunRequest(PLANT, name, TASK, read_mismatch("none"), 0, robot=robot)
         with contextlib.suppress(RunFault, _Trains):  # of a fault the run's row will tell
@@ -45,8 +51,10 @@ def usable_plant(name: str, robot: str = DEFAULT_ROBOT) -> PlantEntry:
     Raises:
         ConfigurationError: it cannot be found, loaded or built, in one line.
     """
-    entry = installed_plant(name)
-    if is_published(PlantEntry, name):
+    if not is_published(PlantEntry, name):
+        return installed_plant(name)
+    with _answering_within(ANSWER_LIMIT):
+        entry = installed_plant(name)
         _refuse_task(name, "plant")
         try:
             with contextlib.suppress(RunFault):
@@ -65,6 +73,25 @@ def _try(entry: PlantEntry, robot_name: str) -> None:
     plant = entry.build(config, setup)
     with contextlib.suppress(Exception):  # `servobench check plant` tells of it
         plant.close()
+
+
+@contextlib.contextmanager
+def _answering_within(limit: float) -> Iterator[None]:
+    """Raise a TimeoutError in code that takes longer than a limit [s]; only where a signal can interrupt it."""
+    if not hasattr(signal, "SIGALRM") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(_number: int, _frame: object) -> NoReturn:
+        raise TimeoutError(f"no answer after {limit:g} s")
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, limit)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def _refuse_task(name: str, what: str) -> None:

@@ -27,6 +27,7 @@ settings = some_law:UNSETTLED
 gone = some_law:Nothing
 a/b = some_law:Mine
 circle = some_law:Mine
+hang = some_law:Hang
 ukf_mfac = some_law:Mine
 all = some_law:Mine
 [servobench.plants]
@@ -64,6 +65,12 @@ class Exit(Mine):
 class Signature(Mine):
     def __init__(self):
         pass
+
+
+class Hang(Mine):
+    def __init__(self, knowledge):
+        while True:
+            pass
 """
 )
 CELLS = (
@@ -104,6 +111,7 @@ CONTROLLERS = {
     "got 'a/b'",
     "circle": "a task is called 'circle', too; give the controller another name",
 }
+HANGING = "controller hang: site/some_law.py:58: TimeoutError: no answer after 2 s"
 PLANTS = {
     "crashing": "plant crashing: site/some_cell.py:37: ZeroDivisionError: division by zero",
     "needy": "plant 'needy' (some_cell:NEEDY) cannot be used: ",
@@ -121,7 +129,9 @@ import contextlib, io, json, sys
 from servobench.controllers import methods
 from servobench.harness.cli.main import main
 from servobench.harness.config import registry
+from servobench.harness.run import trial
 
+trial.ANSWER_LIMIT = 2.0
 registry.METHODS = {name: registry.METHODS[name] for name in ("ukf_mfac", "constant")}
 told = []
 for arguments in json.loads(sys.argv[1]):
@@ -169,7 +179,8 @@ def test_the_list_marks_each_and_shows_the_others(told):
     listed = [(each["name"], each.get("error")) for each in json.loads(out)]
     assert code == 0
     assert {name: error for name, error in listed if error and name in CONTROLLERS} == CONTROLLERS
-    assert [error for _, error in listed if error and error not in CONTROLLERS.values()] == list(UNUSED.values())
+    others = [error for _, error in listed if error and error not in CONTROLLERS.values()]
+    assert others == [HANGING, *UNUSED.values()]
     assert [name for name, error in listed if error is None] == ["ukf_mfac", "constant", "nmpc_calibrated", "whole"]
 
 
@@ -187,7 +198,7 @@ def test_the_list_of_plants_marks_each_and_shows_the_others(told):
 def test_all_others_are_compared_and_each_broken_one_is_a_line(told):
     code, out, errors = told["compare"]
     assert code == 0, errors
-    left_out = [f"servobench: left out: {line}" for line in CONTROLLERS.values()]
+    left_out = [f"servobench: left out: {line}" for line in [*CONTROLLERS.values(), HANGING]]
     notes = [f"servobench: note: {line}" for line in UNUSED.values()]
     lines = [line for line in errors.splitlines() if line.startswith("servobench: ")]
     assert sorted(lines) == sorted(left_out + notes)
