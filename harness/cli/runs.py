@@ -79,7 +79,7 @@ def run(
     if method and controller and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     controller = method or controller or DEFAULT_CONTROLLER
-    plant = choose_plant(plant) if plant else options.default_plant()
+    plant = options.default_plant() if plant is None else choose_plant(plant)
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)

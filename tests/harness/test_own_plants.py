@@ -204,6 +204,11 @@ def test_what_fails_in_a_run_is_a_row_that_says_where(tmp_path, line, with_, rea
     assert re.search(reason, table["reason"].iloc[0]), table["reason"].iloc[0]
 
 
+def test_an_empty_name_is_no_plant(monkeypatch, capsys):
+    assert command(monkeypatch, "run", "constant", "--plant", "") == 2
+    assert capsys.readouterr().err.startswith("servobench: unknown plant ''")
+
+
 def test_a_plant_is_named_on_every_command_that_takes_one(tmp_path, monkeypatch, capsys):
     write(tmp_path, CONFIGURED_CELL, "cell.py")
     assert command(monkeypatch, "plants", "./cell.py", "--json") == 0
