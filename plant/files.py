@@ -1,13 +1,16 @@
-"""Files: written whole or not at all, and TOML that is refused in one line."""
+"""Files: written whole or not at all, also after a power cut, and TOML that is refused in one line."""
 
 from __future__ import annotations
 
 import os
+import re
 import threading
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+PARTIAL: Final = re.compile(r"\..+-\d+-\d+")  # name of a file that is being written, or was when its process was killed
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -17,10 +20,12 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         path: the file; an old one is replaced.
         write: writes the content to the path that it is given.
     """
-    partial = path.with_name(f".{path.name}-{os.getpid()}-{threading.get_ident()}")
+    partial = partial_path(path)
     try:
         write(partial)
+        sync(partial)
         partial.replace(path)
+        sync(path.parent)
     finally:
         partial.unlink(missing_ok=True)
 
@@ -53,3 +58,22 @@ def user_path(text: str) -> Path:
         return Path(text).expanduser()
     except RuntimeError as error:
         raise ValueError(f"path {text!r} names a home folder that is not known") from error
+
+
+def partial_path(path: Path) -> Path:
+    """Return the name under which this thread writes a file."""
+    return path.with_name(f".{path.name}-{os.getpid()}-{threading.get_ident()}")
+
+
+def sync(path: Path) -> None:
+    """Wait until what a file holds, or which files a folder has, is on the disk.
+
+    Without it a file may have its name before it has its content, so that a power cut leaves an empty one.
+    """
+    if os.name == "nt" and path.is_dir():
+        return  # Windows opens no folders
+    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

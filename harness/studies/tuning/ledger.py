@@ -7,6 +7,7 @@ settings and the cost of every run.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, final
@@ -72,6 +73,8 @@ class Ledger:
                 file.truncate(whole)
                 file.seek(whole)
                 file.write((record if whole else json.dumps(self._fingerprint) + "\n" + record).encode())
+                file.flush()
+                os.fsync(file.fileno())
         except OSError as error:
             raise ConfigurationError(f"study {self.path} cannot be written: {error.strerror}") from error
         self._costs[_key(settings)] = list(costs)
