@@ -8,8 +8,9 @@ columns aside. Runs are made when they are needed, so that the memory of this pr
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,17 @@ from servobench.harness.batch.blocks import (
     cut,
     even_size,
 )
+from servobench.harness.batch.checksums import writing
 from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.grid import Grid
-from servobench.harness.batch.lock import check_empty, locked
+from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
+from servobench.harness.batch.lock import Lock, check_empty, is_unused, locked
 from servobench.harness.batch.manifest import OWN, describe_batch
 from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Bounds, Workers, open_workers
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import RunResult
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve_sections, select
@@ -129,15 +133,19 @@ def _carry_out_at(
     manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
-    if how.resume:
-        results.read_manifest(folder)
-    with locked(folder, new=not how.resume):
-        if how.resume:
-            check_same_campaign(folder, manifest, how.observer)
+    resume = how.resume and not is_unused(folder)
+    if resume:
+        check_resumable(folder)
+    with locked(folder, new=not resume) as lock:
+        if lock.stale is not None:
+            how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
+        if resume:
+            prepare_folder(folder, manifest, how.observer)
         else:
             results.create_folder(folder, manifest)
-        if (folder / results.PARTS).is_dir():
-            _carry_out_missing(campaign, jobs, own, folder, place, how)
+        if not results.is_whole(folder, manifest["run_count"]):
+            write = partial(_write_part, folder, lock, manifest["campaign"])
+            _carry_out_missing(campaign, jobs, own, folder, place, how, write)
         results.collect(folder)
 
 
@@ -165,6 +173,18 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
         else:
             build_once(job.run, observer.training)
     return sections
+
+
+def prepare_folder(folder: Path, manifest: dict[str, Any], observer: Observer) -> None:
+    """Check the folder of a batch that is to go on, and mend it before anything is computed.
+
+    Raises:
+        ConfigurationError: not a results folder, or one of other runs or settings.
+    """
+    restored = restore_manifest(folder, manifest)
+    check_same_campaign(folder, manifest, observer)
+    for line in [restored] * bool(restored) + list(mend(folder, manifest)):
+        observer.note(f"note: {line}")
 
 
 def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Observer) -> None:
@@ -226,7 +246,13 @@ class _Jobs:
 
 
 def _carry_out_missing(
-    campaign: Campaign, jobs: _Jobs, own: tuple[Offer, ...], folder: Path, place: Workers, how: Execution
+    campaign: Campaign,
+    jobs: _Jobs,
+    own: tuple[Offer, ...],
+    folder: Path,
+    place: Workers,
+    how: Execution,
+    write: Callable[[int, Sequence[RunResult]], None],
 ) -> None:
     """Carry out the runs whose part is not in the folder."""
     total = len(campaign.cells)
@@ -242,8 +268,15 @@ def _carry_out_missing(
     )
     keep = folder if campaign.steps and not place.cluster else None
     for block, outcome in carry_out_blocks(blocks, place, steps=campaign.steps, keep=keep, debug=how.debug):
-        results.write_part(folder, block.index, outcome)
+        write(block.index, outcome)
         how.observer.finished([result.row for result in outcome])
+
+
+def _write_part(folder: Path, lock: Lock, campaign: str, index: int, outcome: Sequence[RunResult]) -> None:
+    """Write finished runs, unless the folder was removed meanwhile."""
+    with writing(folder):
+        lock.check()
+    results.write_part(folder, index, outcome, campaign)
 
 
 def _request(cell: Cell) -> RunRequest:

@@ -1,19 +1,103 @@
-"""One process at a time in a results folder."""
+"""One process at a time in a results folder, and who it is.
+
+The lock is `flock` on the file `.lock`: the system releases it when the process ends, however it ends. The file says
+who holds it. Where the file system has no such locks (some network mounts) or the system has none (Windows), the file
+itself is the lock: the process that could create it holds it, until that process is known to have ended. A process of
+another machine cannot be looked at, so there the file stays until someone removes it.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import getpass
+import json
 import os
+import platform
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Final
 
+from servobench.harness.batch.checksums import SUMS
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.files import PARTIAL
 
 LOCK = ".lock"
+PARTS: Final = "parts"
+UNREADABLE_OWNER: Final = "a process that did not write its name"
+
+
+@dataclass(frozen=True)
+class Holder:
+    """The process that holds a lock."""
+
+    owner: str  # name of the user
+    host: str
+    pid: int
+    begun: str  # date and time at which it took the lock, UTC
+    started: str  # of the process, as the system counts; a later process with the same number differs here
+
+    @classmethod
+    def this_process(cls) -> Holder:
+        """Return what this process writes into a lock."""
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        return cls(_user(), platform.node(), os.getpid(), now, _start_of(os.getpid()))
+
+    @classmethod
+    def read(cls, file: Path) -> Holder | None:
+        """Return the holder that a lock names; None where it names none."""
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+            texts = (str(content[key])[:200] for key in ("owner", "host", "begun", "started"))
+            owner, host, begun, started = (" ".join(text.split()) for text in texts)
+            return cls(owner, host, int(content["pid"]), begun, started)
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def __str__(self) -> str:
+        """Return who it is in words."""
+        return f"process {self.pid} of {self.owner} on {self.host}, since {self.begun}"
+
+    @property
+    def here(self) -> bool:
+        """Whether it is a process of this machine."""
+        return self.host == platform.node()
+
+    @property
+    def gone(self) -> bool:
+        """Whether it is known to have ended; never for a process of another machine."""
+        if not self.here or os.name == "nt":  # there is no harmless way to ask on Windows
+            return False
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return True
+        except (OSError, OverflowError):
+            return self.pid <= 0
+        return self.started != _start_of(self.pid)
+
+
+class Lock:
+    """A lock that this process holds."""
+
+    def __init__(self, file: Path, descriptor: int, stale: Holder | None) -> None:
+        """Take note of the open file, and of the holder before, which ended without giving the lock back."""
+        self._file, self._descriptor, self.stale = file, descriptor, stale
+
+    def check(self) -> None:
+        """Refuse to go on in a folder that is another one by now.
+
+        Raises:
+            FileNotFoundError: the folder was removed, or removed and made again by another process.
+        """
+        if not _same(self._file, self._descriptor):
+            raise FileNotFoundError(errno.ENOENT, "it was removed by another process", str(self._file.parent))
 
 
 @contextlib.contextmanager
-def locked(folder: Path, *, new: bool = False) -> Iterator[None]:
+def locked(folder: Path, *, new: bool = False) -> Iterator[Lock]:
     """Keep other processes from writing the same folder; the lock of a process that died does not count.
 
     Args:
@@ -25,35 +109,127 @@ def locked(folder: Path, *, new: bool = False) -> Iterator[None]:
     """
     if new:
         check_empty(folder)
+    path = folder / LOCK
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / LOCK).open("a")
+        descriptor, stale = _acquire(path)
     except OSError as error:
-        raise ConfigurationError(f"results folder {folder} cannot be made: {error.strerror}") from error
-    with file:
-        if not _lock(file.fileno()):
-            raise ConfigurationError(f"results folder {folder} is being written by another process")
+        raise ConfigurationError(f"results folder {folder} cannot be written: {error.strerror}") from error
+    lock = Lock(path, descriptor, stale)
+    try:
+        with contextlib.suppress(OSError):  # a full disk does not keep the lock from being held
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, json.dumps(asdict(Holder.this_process())).encode() + b"\n")
+        yield lock
+    finally:
+        with contextlib.suppress(OSError):  # the folder may be gone, or read-only by now
+            if _same(path, descriptor):
+                path.unlink()
+        os.close(descriptor)
+
+
+def current_holder(folder: Path) -> Holder | None:
+    """Return the process that writes a folder, as far as it can be told; None if none does."""
+    holder = Holder.read(folder / LOCK)
+    return None if holder is None or holder.gone else holder
+
+
+def _acquire(path: Path) -> tuple[int, Holder | None]:
+    """Return the descriptor of the locked file, and the holder whose process ended without giving it back."""
+    before = None
+    while True:
+        before = Holder.read(path) or before
         try:
-            yield
-        finally:
-            (folder / LOCK).unlink(missing_ok=True)
+            descriptor, created = _open(path)
+        except FileNotFoundError:  # given back in this moment
+            if path.parent.is_dir():
+                continue
+            raise
+        try:
+            possible = _flock(descriptor)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise ConfigurationError(_refusal(path, Holder.read(path) or before)) from None
+        if _same(path, descriptor) and (possible or created):
+            return descriptor, before
+        os.close(descriptor)
+        if not possible and path.exists():
+            _remove_stale(path, before)
 
 
-def _lock(descriptor: int) -> bool:
-    """Lock an open file as long as it is open; return whether that was possible."""
+def _open(path: Path) -> tuple[int, bool]:
+    """Open the file of a lock and return whether it was created; Windows removes it when its process ends."""
+    flags = os.O_RDWR | getattr(os, "O_TEMPORARY", 0)
+    try:
+        return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666), True
+    except FileExistsError:
+        return os.open(path, flags), False
+
+
+def _flock(descriptor: int) -> bool:
+    """Lock an open file as long as it is open; return whether there are such locks here.
+
+    Raises:
+        BlockingIOError: another process has it.
+    """
     try:
         import fcntl  # noqa: PLC0415 - not on Windows
     except ImportError:
-        return True
+        return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
+        raise
+    except OSError:  # such as ENOLCK of a network mount without a lock service
         return False
-    return os.fstat(descriptor).st_nlink > 0  # another process held this file and has removed it since
+    return True
+
+
+def _remove_stale(path: Path, holder: Holder | None) -> None:
+    """Remove a file whose existence is the lock, if its process is known to have ended.
+
+    Raises:
+        ConfigurationError: it is not.
+    """
+    if holder is None or not holder.gone:
+        raise ConfigurationError(f"{_refusal(path, holder)}; if it has ended, remove {path} and try again")
+    aside = path.with_name(f"{path.name}-{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):  # another process was quicker
+        path.rename(aside)
+        if Holder.read(aside) != holder:  # and has taken the lock
+            os.link(aside, path)
+        aside.unlink()
+
+
+def _refusal(path: Path, holder: Holder | None) -> str:
+    return f"results folder {path.parent} is being written by {holder or UNREADABLE_OWNER}"
+
+
+def _same(path: Path, descriptor: int) -> bool:
+    """Return whether an open file still has its name."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except OSError:
+        return False
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # a user without a name, as in a container
+        return f"user {os.getuid()}" if hasattr(os, "getuid") else "an unknown user"
+
+
+def _start_of(pid: int) -> str:
+    """Return when a process of this machine started, in the system's own count; empty where it does not say."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[19]
+    except (OSError, IndexError, UnicodeDecodeError):
+        return ""
 
 
 def check_empty(folder: Path, *, can_resume: bool = False) -> None:
-    """Refuse a folder with anything in it.
+    """Refuse a folder with anything in it but what a batch leaves that could not begin.
 
     Args:
         folder: that is to be made.
@@ -62,6 +238,14 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
     Raises:
         ConfigurationError: it has.
     """
-    if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
+    if folder.exists() and not is_unused(folder):
         resume = ", or continue its batch with --resume" if can_resume and folder.is_dir() else ""
         raise ConfigurationError(f"results folder {folder} exists already; name another one with --out{resume}")
+
+
+def is_unused(folder: Path) -> bool:
+    """Return whether a folder is empty, or holds only what a batch leaves that ended before its first run."""
+    if not folder.is_dir():
+        return False
+    inside = (path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name))
+    return all(path.name == PARTS and path.is_dir() and not any(path.iterdir()) for path in inside)

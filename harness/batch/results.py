@@ -1,17 +1,17 @@
 """A folder of results: `runs.parquet` (a row a run), `steps.parquet` (a row a period), `manifest.json`, `failures.log`.
 
-While runs are under way, finished ones lie below `parts/`: a pair of files for each run or block of runs, each written
-atomically, steps first, so that a part counts once its rows are there. At the end the parts are put together. If the
-process was killed, `load_runs` and `load_steps` read the parts, and `collect` puts together what there is.
+While runs are under way, finished ones lie below `parts/`: a group of files for each run or block of runs, each written
+atomically, rows last, so that a part counts once its rows are there. At the end the parts are put together. If the
+process was killed, `load_runs` and `load_steps` read the parts, and `collect` puts together what there is. A file that
+is not what was written is refused by name: `SHA256SUMS` vouches for all of them.
 """
 
 from __future__ import annotations
 
-import json
-import math
 import os
+import re
 import shutil
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -19,86 +19,91 @@ from typing import TYPE_CHECKING, Any, Final
 import pandas as pd
 import pyarrow as pa
 import pyarrow.dataset as ds
-import pyarrow.parquet as pq
 
-from servobench.harness.batch.lock import check_empty
+from servobench.harness.batch import parquet
+from servobench.harness.batch.checksums import (
+    SUMS,
+    DamagedFile,
+    Sums,
+    digest,
+    fault,
+    keep_sums,
+    read_sums,
+    write_vouched,
+    writing,
+)
+from servobench.harness.batch.lock import PARTS, check_empty
+from servobench.harness.batch.manifest_text import decode, encode
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import log_entry
-from servobench.plant.files import write_atomically
+from servobench.plant.files import PARTIAL, write_atomically
 
 if TYPE_CHECKING:
     from servobench.harness.run.episode import RunResult
     from servobench.plant.plant import ImageArray
 
-SCHEMA_VERSION = "4"
-CHANGES: Final = {"3": "; the column latency_periods [periods] is now latency_s [s]"}  # since an earlier schema
-PARTS = "parts"
 PICTURES = "pictures"
 RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 FAILURES = "failures.log"
 MANIFEST = "manifest.json"
-ROW_GROUP: Final = 2048  # [rows] of a table that are in memory at a time while parts are put together
+PART: Final = re.compile(rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})")
 
 
 def create_folder(folder: Path, manifest: dict[str, Any]) -> None:
-    """Make a new results folder with its manifest.
+    """Make a new results folder with its manifest, also where an earlier call could not.
 
     Raises:
         ConfigurationError: the folder has something in it, or cannot be made.
     """
     check_empty(folder)
     try:
-        (folder / PARTS).mkdir(parents=True)
+        (folder / PARTS).mkdir(parents=True, exist_ok=True)
+        for path in folder.iterdir():
+            if path.name == SUMS or PARTIAL.fullmatch(path.name):
+                path.unlink()
         write_manifest(folder, manifest)
     except OSError as error:
         raise ConfigurationError(f"results folder {folder} cannot be made: {error.strerror}") from error
 
 
 def write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    """Write `manifest.json` atomically; JSON has no infinity, so a setting without limit reads "inf"."""
-    content = json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2, allow_nan=False)
-    _write_text(folder / MANIFEST, content + "\n")
+    """Write `manifest.json`."""
+    write_vouched(folder, {MANIFEST: _text(encode(manifest))})
 
 
-def _in_json(value: Any) -> Any:  # noqa: ANN401 - whatever a manifest holds
-    if isinstance(value, dict):
-        return {key: _in_json(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_in_json(item) for item in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+def part_name(index: int, kind: str) -> str:
+    """Return the name within a results folder of a file of the part that begins with the run `index`."""
+    return f"{PARTS}/{index:08d}.{kind}"
 
 
-def write_part(folder: Path, index: int, outcome: Sequence[RunResult]) -> None:
+def write_part(folder: Path, index: int, outcome: Sequence[RunResult], campaign: str = "") -> None:
     """Write finished runs as one part, all else before the rows that make it count.
 
     Args:
         folder: a results folder.
         index: of the first of them among all runs.
         outcome: results of consecutive runs.
+        campaign: digest of the batch that the runs are of; see `servobench.harness.batch.manifest`.
+
+    Raises:
+        UnwritableFolder: the folder takes no more files.
     """
-    for result in outcome:
-        if result.picture is not None:
-            _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result.picture)
     steps = [result.steps for result in outcome if result.steps is not None and len(result.steps)]
-    if steps:
-        _write_frame(pd.concat(steps, ignore_index=True), folder / PARTS / f"{index:08d}.{STEPS}")
     failures = "".join(log_entry(result.row, result.trace) for result in outcome)
+    files: dict[str, Callable[[Path], object]] = {}
+    if steps:
+        frame = pa.Table.from_pandas(pd.concat(steps, ignore_index=True), preserve_index=False)
+        files[part_name(index, STEPS)] = partial(parquet.write_table, frame.replace_schema_metadata())
     if failures:
-        _write_text(folder / PARTS / f"{index:08d}.{FAILURES}", failures)
-    rows = _table([result.row for result in outcome])
-    write_atomically(folder / PARTS / f"{index:08d}.{RUNS}", partial(pq.write_table, rows))
-
-
-def _table(rows: Sequence[Mapping[str, Any]]) -> pa.Table:
-    """Return rows as a table with the columns of all; NaN is null, and a column of NaN alone is one of numbers."""
-
-    def column(name: str) -> pa.Array:
-        values = [row.get(name) for row in rows]
-        made = pa.array(values, from_pandas=True)
-        return made.cast(pa.float64()) if pa.types.is_null(made.type) and float in map(type, values) else made
-
-    return pa.table({name: column(name) for name in dict.fromkeys(name for row in rows for name in row)})
+        files[part_name(index, FAILURES)] = _text(failures)
+    rows = parquet.as_table([result.row for result in outcome])
+    files[part_name(index, RUNS)] = partial(parquet.write_table, rows, batch=f"{campaign}@{index}")
+    with writing(folder):
+        for result in outcome:
+            if result.picture is not None:
+                _write_picture(folder / PICTURES / f"{result.row['run_id']}.png", result.picture)
+        write_vouched(folder, files)
 
 
 def _write_picture(path: Path, picture: ImageArray) -> None:
@@ -117,16 +122,44 @@ def write_summary(folder: Path, tables: dict[str, pd.DataFrame], manifest: dict[
         folder: the folder.
         tables: tables of runs by the name of the sweep; it becomes the column `part`.
         manifest: of the whole.
+
+    Raises:
+        UnwritableFolder: the folder takes no more files.
     """
     runs = pd.concat([table.assign(part=name) for name, table in tables.items()], ignore_index=True)
-    _write_frame(runs, folder / RUNS)
-    write_manifest(folder, manifest)
+    rows = pa.Table.from_pandas(runs, preserve_index=False).replace_schema_metadata()
+    with writing(folder):
+        write_vouched(folder, {RUNS: partial(parquet.write_table, rows)})
+        write_manifest(folder, manifest)
+
+
+def part_indices(folder: Path) -> list[int]:
+    """Return the first run of each part that counts, in order."""
+    matches = (PART.fullmatch(path.name) for path in (folder / PARTS).glob(f"*.{RUNS}"))
+    return sorted(int(match[1]) for match in matches if match)
+
+
+def part_names(folder: Path, kind: str, sums: Sums | None) -> list[str]:
+    """Return the names of the files of one kind that the parts have, or should have, in order."""
+    names = (part_name(index, kind) for index in part_indices(folder))
+    return [name for name in names if (folder / name).is_file() or name in (sums or {})]
 
 
 def finished_runs(folder: Path) -> list[range]:
     """Return the indices of the runs whose part is there, in order."""
-    begins = ((int(path.name.split(".")[0]), pq.read_metadata(path).num_rows) for path in _part_files(folder, RUNS))
-    return [range(begin, begin + count) for begin, count in begins]
+    indices = part_indices(folder)
+    return [range(begin, begin + parquet.row_count(folder, part_name(begin, RUNS))) for begin in indices]
+
+
+def is_whole(folder: Path, wanted: int) -> bool:
+    """Return whether the tables of a folder are what was written, and have at least as many runs as are wanted."""
+    sums = read_sums(folder)
+    if any(fault(folder, name, sums) for name in (RUNS, STEPS) if name == RUNS or _expected(folder, name, sums)):
+        return False
+    try:
+        return parquet.row_count(folder, RUNS) >= wanted
+    except DamagedFile:
+        return False
 
 
 def collect(folder: Path) -> int:
@@ -136,26 +169,33 @@ def collect(folder: Path) -> int:
         Number of runs.
 
     Raises:
-        ConfigurationError: there are no parts and no tables.
+        ConfigurationError: there are no parts and no tables, or a file is not what was written.
+        UnwritableFolder: the folder takes no more files.
     """
-    wanted = read_manifest(folder).get("run_count", 0)
-    if (folder / RUNS).is_file():
-        count = int(pq.read_metadata(folder / RUNS).num_rows)
-        if count >= wanted:  # the tables are whole, at most the clean-up is left
-            shutil.rmtree(folder / PARTS, ignore_errors=True)
-            return count
-    if not _part_files(folder, RUNS):
+    manifest = read_manifest(folder)
+    wanted, campaign = manifest.get("run_count", 0), manifest.get("campaign", "")
+    if is_whole(folder, wanted):  # at most the clean-up is left
+        shutil.rmtree(folder / PARTS, ignore_errors=True)
+        return parquet.row_count(folder, RUNS)
+    sums = read_sums(folder)
+    if not part_indices(folder):
+        _refuse_damaged(folder, [name for name in (RUNS, STEPS) if _expected(folder, name, sums)])
         raise ConfigurationError(f"{folder} holds no finished run")
-    for kind in (STEPS, RUNS):
-        files = _part_files(folder, kind)
-        if files:
-            write_atomically(folder / kind, partial(_join, files))
-    failures = [path.read_text(encoding="utf-8") for path in _part_files(folder, FAILURES)]
-    if failures:
-        _write_text(folder / FAILURES, "".join(failures))
-    count = int(pq.read_metadata(folder / RUNS).num_rows)
-    if count >= wanted:
-        shutil.rmtree(folder / PARTS)
+    files: dict[str, Callable[[Path], object]] = {}
+    for kind in (STEPS, FAILURES, RUNS):
+        names = part_names(folder, kind, sums)
+        _refuse_damaged(folder, names)
+        if names and kind == FAILURES:
+            files[kind] = _text("".join((folder / name).read_text(encoding="utf-8") for name in names))
+        elif names:
+            files[kind] = partial(parquet.join, folder, names, campaign)
+    with writing(folder):
+        write_vouched(folder, files)
+        count = parquet.row_count(folder, RUNS)
+        if count >= wanted:
+            own = [MANIFEST, *files]
+            keep_sums(folder, {name: frozenset([digest(folder / name)]) for name in own}, own)
+            shutil.rmtree(folder / PARTS)
     return count
 
 
@@ -163,18 +203,16 @@ def load_runs(folder: Path) -> pd.DataFrame:
     """Return the table of runs of a results folder, also of one whose batch was killed.
 
     Raises:
-        ConfigurationError: not a results folder, or one of another schema.
+        ConfigurationError: not a results folder, one of another schema, or a file of it is not what was written.
     """
     check_folder(folder)
-    return _load(folder, RUNS)
+    return parquet.read_tables(folder, _intact(folder, RUNS))
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
-    """Yield the table of runs of a finished batch, at most `ROW_GROUP` rows at a time and those of `columns` it has."""
-    with pq.ParquetFile(folder / RUNS) as file:
-        known = [name for name in columns if name in file.schema_arrow.names]
-        for group in range(file.num_row_groups):
-            yield file.read_row_group(group, known, use_threads=False).to_pandas()
+    """Yield the table of runs of a finished batch, some thousand rows at a time and those of `columns` it has."""
+    _refuse_damaged(folder, [RUNS])
+    return parquet.row_groups(folder, RUNS, columns)
 
 
 def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collection[str] | None = None) -> pd.DataFrame:
@@ -186,10 +224,11 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
         columns: these only, as far as there are such; None for all.
 
     Raises:
-        ConfigurationError: not a results folder, or one of another schema.
+        ConfigurationError: not a results folder, one of another schema, or a file of it is not what was written.
     """
     check_folder(folder)
-    steps = _load(folder, STEPS, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
+    only = None if run_ids is None else ds.field("run_id").isin(run_ids)
+    steps = parquet.read_tables(folder, _intact(folder, STEPS), only, columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
     return steps
@@ -197,7 +236,7 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
 
 def has_steps(folder: Path) -> bool:
     """Return whether a results folder has a table of steps."""
-    return (folder / STEPS).is_file() or bool(_part_files(folder, STEPS))
+    return (folder / STEPS).is_file() or bool(part_names(folder, STEPS, None))
 
 
 def check_folder(folder: Path) -> None:
@@ -207,7 +246,7 @@ def check_folder(folder: Path) -> None:
         ConfigurationError: says what is missing or different.
     """
     read_manifest(folder)
-    if not (folder / RUNS).is_file() and not _part_files(folder, RUNS):
+    if not (folder / RUNS).is_file() and not part_indices(folder):
         raise ConfigurationError(f"{folder} holds no finished run")
 
 
@@ -215,19 +254,16 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a results folder.
 
     Raises:
-        ConfigurationError: not a results folder, or one of another schema.
+        ConfigurationError: not a results folder, one of another schema, or the manifest is not what was written.
     """
+    sums = read_sums(folder)
+    if MANIFEST in (sums or {}):
+        _refuse_damaged(folder, [MANIFEST])
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        text = (folder / MANIFEST).read_text(encoding="utf-8")
+        return decode(folder, MANIFEST, text)
+    except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read") from error
-    version = manifest.get("schema_version") if isinstance(manifest, dict) else None
-    if version != SCHEMA_VERSION:
-        raise ConfigurationError(
-            f"{folder} has results of schema {version!r}; this servobench reads {SCHEMA_VERSION!r}"
-            f"{CHANGES.get(str(version), '')}"
-        )
-    return dict(manifest)
 
 
 def point_latest(folder: Path) -> None:
@@ -243,53 +279,30 @@ def point_latest(folder: Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _part_files(folder: Path, kind: str) -> list[Path]:
-    """Return the files of one kind of the parts that count, in order."""
-    rows = sorted((folder / PARTS).glob(f"[0-9]*.{RUNS}"))
-    files = [path.with_name(path.name.removesuffix(RUNS) + kind) for path in rows]
-    return [path for path in files if path.is_file()]
+def _expected(folder: Path, name: str, sums: Sums | None) -> bool:
+    """Return whether a folder has a file, or should have it."""
+    return (folder / name).exists() or name in (sums or {})
 
 
-def _load(
-    folder: Path, kind: str, only: ds.Expression | None = None, columns: Collection[str] | None = None
-) -> pd.DataFrame:
-    paths = [folder / kind] if (folder / kind).is_file() else _part_files(folder, kind)
-    if not paths:
-        return pd.DataFrame()
-    data = ds.dataset([str(path) for path in paths], _common_schema(paths))
-    wanted = None if columns is None else [name for name in data.schema.names if name in columns]
-    table: pd.DataFrame = data.to_table(filter=only, columns=wanted).to_pandas()
-    return table
+def _intact(folder: Path, kind: str) -> list[str]:
+    """Return the names of the table of one kind, or of the parts of it, each of which is what was written."""
+    names = [kind] if (folder / kind).is_file() else part_names(folder, kind, read_sums(folder))
+    _refuse_damaged(folder, names)
+    return names
 
 
-def _common_schema(paths: Sequence[Path]) -> pa.Schema:
-    """Return the columns of all tables; of a column that one has as nothing, the type is that of the others."""
-    common = pa.schema([])
-    for path in paths:
-        own = pq.read_schema(path).remove_metadata()
-        if own != common:
-            common = pa.unify_schemas([common, own], promote_options="permissive")
-    return common
+def _refuse_damaged(folder: Path, names: Sequence[str]) -> None:
+    """Refuse files that are not what was written.
+
+    Raises:
+        DamagedFile: names the first of them.
+    """
+    sums = read_sums(folder)
+    for name in names:
+        what = fault(folder, name, sums)
+        if what is not None:
+            raise DamagedFile(folder, name, what)
 
 
-def _join(paths: Sequence[Path], path: Path) -> None:
-    """Write tables as one, holding few rows in memory; what a table lacks is null."""
-    empty = _common_schema(paths).empty_table()
-    with pq.ParquetWriter(path, empty.schema) as writer:
-        waiting = empty
-        for file in paths:
-            with pq.ParquetFile(file) as part:  # threads and datasets would hold memory that grows with the parts
-                waiting = pa.concat_tables([waiting, part.read(use_threads=False)], promote_options="permissive")
-            if len(waiting) >= ROW_GROUP:
-                writer.write_table(waiting)
-                waiting = empty
-        if len(waiting):
-            writer.write_table(waiting)
-
-
-def _write_frame(frame: pd.DataFrame, path: Path) -> None:
-    write_atomically(path, lambda file: pq.write_table(pa.Table.from_pandas(frame, preserve_index=False), file))
-
-
-def _write_text(path: Path, text: str) -> None:
-    write_atomically(path, lambda file: file.write_text(text, encoding="utf-8", errors="backslashreplace"))
+def _text(text: str) -> Callable[[Path], object]:
+    return lambda file: file.write_text(text, encoding="utf-8", errors="backslashreplace")

@@ -23,9 +23,10 @@ from servobench.harness.cli.new import new
 from servobench.harness.cli.options import FAILED, INTERRUPTED, grouped
 from servobench.harness.cli.record import record
 from servobench.harness.cli.sweep import sweep
+from servobench.harness.cli.verify import verify
 
 INPUT_ERROR = 2  # exit code
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)  # a folder takes no more files
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
 ROBOTLESS = {  # why a command has no --robot
     "claims": "the claims are those of the paper, which are about a UR5",
     "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
@@ -35,7 +36,7 @@ PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in 
     "Your own controller": (new, check),
     "What there is": (lists.plants, lists.controllers, lists.tasks, init),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
-    "Tools": (runs.train, runs.collect),
+    "Tools": (runs.train, runs.collect, verify),
 }
 COMPLETION_HELP = {  # by the option that typer adds
     "install_completion": "Let this shell complete names.",
@@ -94,10 +95,10 @@ def main() -> None:
             raise
         _refuse(line)
     except OSError as error:
-        if error.errno not in FULL or "--debug" in sys.argv:
+        line = _line_of_system(error)
+        if line is None or "--debug" in sys.argv:
             raise
-        where = f" ({error.filename})" if error.filename else ""
-        sys.stderr.write(f"servobench: {os.strerror(error.errno)}{where}; finished runs are kept, --resume continues\n")
+        sys.stderr.write(f"servobench: {line}; finished runs are kept, --resume continues\n")
         code = FAILED
     if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that say more end by themselves
         sys.stderr.write("servobench: interrupted\n")
@@ -125,6 +126,17 @@ def _usage_line(error: typer.TyperException) -> str:
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())
     return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""
+
+
+def _line_of_system(error: OSError) -> str | None:
+    """Return what a folder that takes no more files is told with; None for a defect."""
+    from servobench.harness.batch.checksums import UnwritableFolder
+
+    if isinstance(error, UnwritableFolder):
+        return str(error.strerror)
+    if error.errno not in FULL:
+        return None
+    return f"{os.strerror(error.errno)}{f' ({error.filename})' if error.filename else ''}"
 
 
 def _line_for_user(error: ValueError | ImportError) -> str | None:

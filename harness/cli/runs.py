@@ -158,9 +158,12 @@ def train(
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
     """Make the tables of a batch that was killed."""
     from servobench.harness.batch import results
+    from servobench.harness.batch.lock import locked
 
     results.check_folder(folder)
-    console.print(f"{results.collect(folder)} runs in {folder / results.RUNS}")
+    with locked(folder):
+        count = results.collect(folder)
+    console.print(f"{count} runs in {folder / results.RUNS}")
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ import pytest
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.batch import results
+from servobench.harness.batch.checksums import write_vouched
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import HEADINGS, draw_figures, folder_figures, picture_of
@@ -108,8 +109,8 @@ def test_a_run_that_ended_after_three_periods_is_drawn_and_marked(tmp_path):
     runs, steps = pd.read_parquet(folder / results.RUNS), pd.read_parquet(folder / results.STEPS)
     first = runs["run_id"][0]
     runs.loc[0, "status"] = "feature_lost"
-    runs.to_parquet(folder / results.RUNS)
-    steps[(steps["run_id"] != first) | (steps["step"] < 3)].to_parquet(folder / results.STEPS)
+    short = steps[(steps["run_id"] != first) | (steps["step"] < 3)]
+    write_vouched(folder, {results.RUNS: runs.to_parquet, results.STEPS: short.to_parquet})
     for named in folder_figures(folder):
         if named.kind in ("errors", "paths", "jacobian"):
             assert ENDED in legend_of(named.figure), named.kind

@@ -13,6 +13,7 @@ from kit.browser import browser_page, find_browser
 from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.batch import results
+from servobench.harness.batch.checksums import SUMS, write_vouched
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures import report
 
@@ -115,9 +116,10 @@ def test_a_folder_with_further_tables_shows_them(tmp_path):
 
 def test_folders_that_cannot_be_reported_are_one_line(monkeypatch, capsys, tmp_path):
     foreign = comparison(tmp_path / "foreign")
+    (foreign / SUMS).unlink()
     (foreign / results.MANIFEST).write_text('{"schema_version": "0"}')
     empty = comparison(tmp_path / "empty")
-    pd.read_parquet(empty / results.RUNS).iloc[:0].to_parquet(empty / results.RUNS)
+    write_vouched(empty, {results.RUNS: pd.read_parquet(empty / results.RUNS).iloc[:0].to_parquet})
     for folder, words in (
         (foreign, "has results of schema '0'; this servobench reads"),
         (empty, "holds no finished run"),

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from servobench.harness.batch import results
+from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.lock import LOCK, locked
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import RunResult
@@ -22,7 +23,7 @@ def add_part(folder, index: int, **extra: float) -> None:
 @pytest.fixture
 def folder(tmp_path):
     made = tmp_path / "out"
-    results.create_folder(made, {"seeds": [0]})
+    results.create_folder(made, {"seeds": "0"})
     return made
 
 
@@ -88,6 +89,7 @@ def test_a_folder_with_something_in_it_or_that_cannot_be_made_is_refused(tmp_pat
 def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
     with pytest.raises(ConfigurationError, match="holds no finished run"):
         results.load_runs(folder)
+    (folder / SUMS).unlink()  # an earlier version had none
     (folder / results.MANIFEST).write_text(json.dumps({"schema_version": "0"}))
     with pytest.raises(ConfigurationError, match="results of schema '0'; this servobench reads"):
         results.load_runs(folder)

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
+from servobench.harness.batch.checksums import write_vouched
 
 CONTROLLERS = ("rbfnn_mfac", "ukf_mfac", "someone_elses")
 MANIFEST = {"created": "2026-01-01T00:00:00+00:00", "packages": {"servobench": "0.1.0"}, "python": "3.11.0"}
@@ -53,9 +54,9 @@ def made_up_row(run_id: str, **values: object) -> dict[str, object]:
 def write_folder(folder: Path, rows: list[dict[str, object]], steps: list[pd.DataFrame]) -> Path:
     results.create_folder(folder, MANIFEST)
     (folder / results.PARTS).rmdir()
-    pd.DataFrame(rows).to_parquet(folder / results.RUNS)
+    write_vouched(folder, {results.RUNS: pd.DataFrame(rows).to_parquet})
     if steps:
-        pd.concat(steps, ignore_index=True).to_parquet(folder / results.STEPS)
+        write_vouched(folder, {results.STEPS: pd.concat(steps, ignore_index=True).to_parquet})
     return folder
 
 

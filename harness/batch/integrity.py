@@ -1,0 +1,234 @@
+"""What is wrong with a results folder, and what `--resume` does about it: only what is damaged is carried out again."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from servobench.harness.batch import parquet, results
+from servobench.harness.batch.checksums import (
+    SUMS,
+    DamagedFile,
+    Sums,
+    digest,
+    fault,
+    keep_sums,
+    read_sums,
+    write_vouched,
+    writing,
+)
+from servobench.harness.batch.lock import PARTS
+from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.ending import log_entry
+from servobench.plant.files import PARTIAL
+
+AGAIN: Final = "repeat the command that made the folder with --resume"
+LOGGED: Final = ("run_id", "status", "reason")  # columns of which the log of failures is made
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A file of a results folder with which something is wrong.
+
+    Attributes:
+        name: of the file within the folder.
+        what: is wrong with it, as a predicate.
+        remedy: what to do, or to type.
+    """
+
+    name: str
+    what: str
+    remedy: str
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What was found in a results folder.
+
+    Attributes:
+        findings: files with which something is wrong.
+        files: number of files that were looked at.
+        runs: number of runs that are there and intact.
+        wanted: number of runs of the batch; 0 where the folder does not tell.
+    """
+
+    findings: list[Finding]
+    files: int
+    runs: int
+    wanted: int
+
+
+def examine(folder: Path) -> Examination:
+    """Read all files of a results folder that hold results and say what is wrong with them.
+
+    Raises:
+        ConfigurationError: there is no such folder, or nothing of a batch is in it.
+    """
+    check_resumable(folder)
+    sums, findings, manifest = read_sums(folder), [], {}
+    try:
+        manifest = results.read_manifest(folder)
+    except ConfigurationError as error:
+        wrong = error.what if isinstance(error, DamagedFile) else "cannot be read"
+        findings.append(Finding(MANIFEST, wrong, f"{AGAIN}; it is written anew if the runs are of that command"))
+    if sums is None:
+        remedy = f"if you trust the files as they are: cd {folder} && sha256sum {MANIFEST} *.parquet > {SUMS}"
+        findings.append(Finding(SUMS, "is missing, so that nothing vouches for the other files", remedy))
+    names = [name for name in (RUNS, STEPS, FAILURES) if (folder / name).exists() or name in (sums or {})]
+    faults = {name: what for name in names if (what := _fault(folder, name, sums))}
+    for name, what in faults.items():
+        remedy = "it is written anew, without traces" if name == FAILURES else "runs that are in no part are repeated"
+        findings.append(Finding(name, what, f"{AGAIN}; {remedy}"))
+    count = 0
+    for part in _parts(folder, sums, manifest.get("campaign")):
+        names += part.names
+        count += part.count
+        if part.what:
+            findings.append(Finding(part.wrong, part.what, f"{AGAIN}; only the runs of this part are repeated"))
+    strays = [path.name for path in sorted((folder / PARTS).glob("[!.]*")) if not PART.fullmatch(path.name)]
+    findings += [Finding(f"{PARTS}/{name}", "is no file of a batch", "move it elsewhere") for name in strays]
+    if RUNS in names and not faults.keys() & {RUNS, STEPS}:
+        count = max(count, parquet.row_count(folder, RUNS))
+    return Examination(findings, len(names) + 1, count, manifest.get("run_count", 0))
+
+
+def check_resumable(folder: Path) -> None:
+    """Refuse a folder in which nothing of a batch is left.
+
+    Raises:
+        ConfigurationError: names it.
+    """
+    if not any((folder / name).exists() for name in (MANIFEST, RUNS, SUMS, PARTS)):
+        raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read")
+
+
+def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+    """Remove what is damaged of a folder whose batch is to go on, so that its runs count as missing.
+
+    Args:
+        folder: a results folder that is locked.
+        manifest: of the batch.
+
+    Yields:
+        A line for each file with which something is wrong.
+    """
+    sums = read_sums(folder)
+    kept: dict[str, frozenset[str]] = {}
+    with writing(folder):
+        for part in _parts(folder, sums, manifest["campaign"]):
+            if part.what:
+                yield f"{folder / part.wrong} {part.what}: its runs are carried out again"
+                for name in reversed(part.names):  # the rows first: without them the part does not count
+                    (folder / name).unlink(missing_ok=True)
+            else:
+                kept |= {name: frozenset([digest(folder / name)]) for name in part.names}
+        for name in (MANIFEST, RUNS, STEPS, FAILURES):
+            what = _fault(folder, name, sums) if (folder / name).exists() or name in (sums or {}) else None
+            if sums is not None and name in sums:
+                kept[name] = sums[name]
+            elif (what is None or name == MANIFEST) and (folder / name).exists():
+                kept[name] = frozenset([digest(folder / name)])
+            if what and name in (RUNS, STEPS):
+                yield f"{folder / name} {what}: runs that are in no part are carried out again"
+        keep_sums(folder, kept, list(kept))
+        for path in (*folder.glob(".*"), *(folder / PARTS).glob(".*")):  # what a process left that was killed
+            if PARTIAL.fullmatch(path.name):
+                path.unlink()
+        if not results.is_whole(folder, manifest["run_count"]):
+            (folder / PARTS).mkdir(exist_ok=True)
+            return
+        shutil.rmtree(folder / PARTS, ignore_errors=True)
+        if FAILURES in kept and (what := fault(folder, FAILURES, kept)):
+            yield f"{folder / FAILURES} {what}: it is written anew, without traces"
+            write_vouched(folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")})
+
+
+def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
+    """Write a manifest anew that is damaged or missing, if all tables say that they are of that batch.
+
+    Args:
+        folder: a folder that is locked.
+        manifest: of the batch that is asked for.
+
+    Returns:
+        A line that says so; empty where nothing was to be done.
+
+    Raises:
+        ConfigurationError: tables are of another batch or do not say of which, or the folder is of another schema.
+    """
+    try:
+        results.read_manifest(folder)
+    except DamagedFile as error:
+        damage = error
+    except ConfigurationError:
+        if (folder / MANIFEST).exists():
+            raise
+        damage = DamagedFile(folder, MANIFEST, "is missing")
+    else:
+        return ""
+    names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
+    names += [RUNS] if (folder / RUNS).exists() else []
+    owners = {parquet.owner(folder, name).partition("@")[0] for name in names}
+    if owners - {manifest["campaign"]} or not owners:
+        raise ConfigurationError(
+            f"{folder / MANIFEST} {damage.what}, and the tables are not of this batch or do not say so; "
+            "restore the file from a copy, or name another folder with --out"
+        ) from damage
+    with writing(folder):
+        results.write_manifest(folder, manifest)
+    return f"{folder / MANIFEST} {damage.what}: it is written anew"
+
+
+@dataclass(frozen=True)
+class _Part:
+    names: list[str]  # of its files within the folder, rows last
+    count: int = 0  # of its runs that are intact
+    wrong: str = ""  # name of the file with which something is wrong
+    what: str = ""  # is wrong with it
+
+
+def _parts(folder: Path, sums: Sums | None, campaign: str | None) -> Iterator[_Part]:
+    """Yield the parts of a folder, in order; where `campaign` is not known, parts may be of any."""
+    end = 0
+    for index in results.part_indices(folder):
+        names = [results.part_name(index, kind) for kind in (STEPS, FAILURES, RUNS)]
+        names = [name for name in names if (folder / name).exists() or name in (sums or {})]
+        faults = [(name, what) for name in names if (what := _fault(folder, name, sums))]
+        rows = results.part_name(index, RUNS)
+        if not faults:
+            batch, _, first = parquet.owner(folder, rows).rpartition("@")
+            if batch not in ("", campaign or batch):
+                faults = [(rows, "holds the rows of another batch")]
+            elif first not in ("", f"{index}"):
+                faults = [(rows, "holds the rows of other runs")]
+            elif index < end:
+                faults = [(rows, "holds runs that the part before it has, too")]
+        if faults:
+            yield _Part(names, 0, *faults[0])
+        else:
+            count = parquet.row_count(folder, rows)
+            end = index + count
+            yield _Part(names, count)
+
+
+def _fault(folder: Path, name: str, sums: Sums | None) -> str | None:
+    """Return what is wrong with a file; a table that nothing vouches for is read as a whole."""
+    what = fault(folder, name, sums)
+    if what is None and sums is None and name.endswith(".parquet"):
+        try:
+            for _ in parquet.row_groups(folder, name, parquet.common_schema(folder, [name]).names):
+                pass
+        except DamagedFile as error:
+            return error.what
+    return what
+
+
+def _log(folder: Path) -> str:
+    """Return the log of failures as far as the table of runs tells it."""
+    tables = parquet.row_groups(folder, RUNS, LOGGED)
+    rows = (dict(zip(table.columns, row, strict=True)) for table in tables for row in table.to_numpy())
+    return "".join(log_entry(row, "") for row in rows)

@@ -1,0 +1,252 @@
+"""What is damaged is named in one line by every command, found before anything is computed, and alone made again."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import judged
+from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
+from servobench.harness.batch.checksums import SUMS, DamagedFile
+from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.sweep import SweepPlan
+from servobench.harness.batch.workers import Bounds
+from servobench.harness.config.settings import ConfigurationError, Settings
+
+RUNS = 24
+
+
+class Notes(Observer):
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.repeated = 0
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def finished(self, rows) -> None:
+        self.repeated += len(rows)
+
+
+class Stop(Notes):
+    """Ends the batch before its last part, as a kill does."""
+
+    def finished(self, rows) -> None:
+        super().finished(rows)
+        if self.repeated >= RUNS - 8:
+            raise KeyboardInterrupt
+
+
+def run(folder, observer=None, *, resume=False, seeds=range(RUNS), steps=False) -> Notes:
+    batch = Batch(("kinematic",), ("constant",), ("random",), ("moderate",), seeds)
+    settings = Settings(
+        {"random": {"duration": 0.3}, "run": {"lost_after": 0.05}, "kinematic": {"sensing": {"drop_probability": 0.1}}}
+    )
+    observer = observer or Notes()
+    how = Execution(workers=1, resume=resume, observer=observer, block=1, bounds=Bounds(isolate=False))
+    carry_out(Campaign(SweepPlan(batch).cells(), settings, steps), folder, how)
+    return observer
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "out"
+    run(folder)
+    assert results.load_runs(folder)["status"].nunique() > 1
+    assert examine(folder).findings == []
+    return folder
+
+
+@pytest.fixture(scope="module")
+def half(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("half") / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, Stop())
+    assert examine(folder).runs == RUNS - 8
+    return folder
+
+
+def copy(folder, tmp_path):
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def flip(path, seed=0):
+    content = bytearray(path.read_bytes())
+    content[np.random.default_rng(seed).integers(len(content))] ^= 1 << seed % 8
+    path.write_bytes(content)
+
+
+def assert_same(folder, whole):
+    pd.testing.assert_frame_equal(judged(results.load_runs(folder)), judged(results.load_runs(whole)), check_exact=True)
+    assert examine(folder).findings == []
+    assert sorted(path.name for path in folder.iterdir()) == sorted(path.name for path in whole.iterdir())
+    assert (folder / results.FAILURES).read_text() == (whole / results.FAILURES).read_text()
+
+
+DAMAGES = {
+    "is empty": lambda path: path.write_bytes(b""),
+    "is cut off": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "was changed since it was written": flip,
+}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(half, whole, tmp_path, what):
+    folder = copy(half, tmp_path)
+    part = folder / results.part_name(8, results.RUNS)
+    DAMAGES[what](part)
+    for command in (results.load_runs, results.collect):
+        with pytest.raises(DamagedFile, match=rf"00000008\.runs\.parquet {what}; repeat .* --resume, or type: servob"):
+            command(folder)
+    (finding,) = examine(folder).findings
+    assert (finding.name, finding.what) == (results.part_name(8, results.RUNS), what)
+    resumed = run(folder, resume=True)
+    assert resumed.repeated == 16
+    assert any(f"{part} {what}: its runs are carried out again" in note for note in resumed.notes)
+    assert_same(folder, whole)
+
+
+def test_a_part_with_the_rows_of_another_is_refused(half, whole, tmp_path):
+    folder = copy(half, tmp_path)
+    first, second = (folder / results.part_name(index, results.RUNS) for index in (0, 8))
+    shutil.copy(first, second)
+    assert [finding.what for finding in examine(folder).findings] == ["was changed since it was written"]
+    (folder / SUMS).unlink()  # nothing vouches for it, but it says itself which rows it holds
+    assert "holds the rows of other runs" in [finding.what for finding in examine(folder).findings]
+    assert run(folder, resume=True).repeated == 16
+    assert_same(folder, whole)
+
+
+def test_parts_without_checksums_are_read_and_kept(half, whole, tmp_path):
+    folder = copy(half, tmp_path)
+    (folder / SUMS).unlink()
+    assert len(results.load_runs(folder)) == RUNS - 8
+    assert run(folder, resume=True).repeated == 8
+    assert_same(folder, whole)
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_a_damaged_table_is_named_and_made_again(whole, tmp_path, what):
+    folder = copy(whole, tmp_path)
+    DAMAGES[what](folder / results.RUNS)
+    with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
+        results.load_runs(folder)
+    with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
+        results.collect(folder)
+    assert run(folder, resume=True).repeated == RUNS
+    assert_same(folder, whole)
+
+
+def test_no_bit_of_a_folder_can_change_in_silence(whole, tmp_path):
+    kept = {path.name: path.read_bytes() for path in whole.iterdir()}
+    folder = copy(whole, tmp_path)
+    for seed in range(100):
+        name = (results.RUNS, results.MANIFEST)[seed % 2]
+        flip(folder / name, seed)
+        with pytest.raises(DamagedFile, match=f"{name} was changed|{name} is cut off"):
+            results.load_runs(folder)
+        (folder / name).write_bytes(kept[name])
+    results.load_runs(folder)
+
+
+def test_a_flipped_bit_is_found_by_the_page_checksums_where_the_table_stands_alone(whole, tmp_path):
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    for name in (results.MANIFEST, results.RUNS):
+        shutil.copy(whole / name, alone / name)
+    before = results.load_runs(alone)
+    content = (alone / results.RUNS).read_bytes()
+    found = 0
+    for seed in range(60):
+        flip(alone / results.RUNS, seed)
+        with contextlib.suppress(DamagedFile):
+            found += not results.load_runs(alone).equals(before)
+        (alone / results.RUNS).write_bytes(content)
+    assert found <= 3  # in headers of pages and in the footer, for which only the file of checksums vouches
+
+
+def test_a_lost_log_of_failures_is_made_from_the_table(whole, tmp_path):
+    folder = copy(whole, tmp_path)
+    (folder / results.FAILURES).write_bytes(b"")
+    assert [finding.name for finding in examine(folder).findings] == [results.FAILURES]
+    assert run(folder, resume=True).repeated == 0
+    assert_same(folder, whole)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b'{"schema_version": "4", "run_count": "many"}'])
+def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for(half, whole, tmp_path, content):
+    folder = copy(half, tmp_path)
+    (folder / results.MANIFEST).unlink() if content is None else (folder / results.MANIFEST).write_bytes(content)
+    with pytest.raises(ConfigurationError, match=r"manifest\.json"):
+        results.load_runs(folder)
+    assert [finding.name for finding in examine(folder).findings] == [results.MANIFEST]
+    with pytest.raises(ConfigurationError, match="are not of this batch or do not say so"):
+        run(folder, resume=True, seeds=range(5))
+    assert run(folder, resume=True).repeated == 8
+    assert_same(folder, whole)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "wanted"),
+    [
+        ("run_count", "many", "a whole number"),
+        ("run_count", True, "a whole number"),
+        ("created", 3, "text"),
+        ("plants", ["a", 1], "a list of text"),
+        ("configuration", {"run": 1}, "an object of an object"),
+        ("own_controllers", {"mine": None}, "an object of an object"),
+        ("packages", [], "an object"),
+    ],
+)
+def test_a_manifest_of_wrong_types_is_one_line(whole, tmp_path, key, value, wanted):
+    folder = copy(whole, tmp_path)
+    (folder / SUMS).unlink()
+    manifest = json.loads((folder / results.MANIFEST).read_text()) | {key: value}
+    (folder / results.MANIFEST).write_text(json.dumps(manifest))
+    for command in (results.load_runs, results.collect):
+        with pytest.raises(ConfigurationError, match=f"manifest.json is damaged: {key} must be {wanted}, got"):
+            command(folder)
+
+
+def test_stray_files_are_named_and_count_for_nothing(half, whole, tmp_path):
+    folder = copy(half, tmp_path)
+    part = folder / results.part_name(0, results.RUNS)
+    for name in ("1x.runs.parquet", "0.runs.parquet", "notes.txt"):
+        shutil.copy(part, folder / results.PARTS / name)
+    assert len(results.load_runs(folder)) == RUNS - 8
+    assert {finding.what for finding in examine(folder).findings} == {"is no file of a batch"}
+    shutil.copy(part, folder / results.part_name(20, results.RUNS))
+    assert examine(folder).findings[0].what == "is not listed in SHA256SUMS"
+    assert run(folder, resume=True).repeated == 8
+    assert_same(folder, whole)
+
+
+def test_a_line_that_a_killed_process_left_unfinished_is_passed_over(half, whole, tmp_path):
+    folder = copy(half, tmp_path)
+    with (folder / SUMS).open("a") as file:
+        file.write("0123456789abcdef")
+    assert run(folder, resume=True).repeated == 8
+    assert_same(folder, whole)
+
+
+def test_steps_that_are_damaged_or_missing_make_their_part_count_no_more(tmp_path):
+    folder = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, Stop(), steps=True)
+    (folder / results.part_name(3, results.STEPS)).unlink()
+    flip(folder / results.part_name(5, results.STEPS))
+    with pytest.raises(DamagedFile, match=r"00000003\.steps\.parquet is missing"):
+        results.load_steps(folder)
+    assert run(folder, resume=True, steps=True).repeated == 8 + 2
+    flip(folder / results.STEPS)
+    with pytest.raises(DamagedFile, match=r"steps\.parquet was changed"):
+        results.load_steps(folder)
+    assert run(folder, resume=True, steps=True).repeated == RUNS
+    assert results.load_steps(folder)["run_id"].nunique() > RUNS - 8

@@ -1,0 +1,132 @@
+"""One process at a time in a results folder, whatever the file system can do, and who it is."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+
+import pytest
+
+from kit.command import PACKAGE
+from servobench.harness.batch.lock import LOCK, Holder, locked
+from servobench.harness.config.settings import ConfigurationError
+
+HOLD = """
+import sys
+from pathlib import Path
+from servobench.harness.batch.lock import locked
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(params=["flock", "file"])
+def way(request, monkeypatch):
+    """The locks of a local file system, and those of one that has none."""
+    if request.param == "file":
+
+        def refuse(*_):
+            raise OSError(errno.ENOLCK, "No locks available")
+
+        monkeypatch.setattr(fcntl, "flock", refuse)
+    return request.param
+
+
+@contextmanager
+def other_process(folder):
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], env={**os.environ, "PYTHONPATH": str(PACKAGE)},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert process.stdout.readline() == "held\n"
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+
+
+def test_the_second_process_learns_who_holds_the_folder_and_a_killed_one_holds_it_no_more(tmp_path, way):
+    out = tmp_path / "out"
+    with other_process(out) as process:
+        with pytest.raises(ConfigurationError, match="is being written by process") as refused, locked(out):
+            pass
+        words = str(refused.value)
+        assert f"process {process.pid} of " in words
+        assert f" on {platform.node()}, since 20" in words
+        assert "\n" not in words
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        with locked(out) as lock:
+            assert lock.stale.pid == process.pid
+            assert json.loads((out / LOCK).read_text())["pid"] == os.getpid()
+    assert list(out.iterdir()) == []
+
+
+def test_a_lock_that_is_given_back_leaves_nothing_and_can_be_taken_again(tmp_path, way):
+    for _ in range(3):
+        with locked(tmp_path / "out") as lock:
+            assert lock.stale is None
+            with pytest.raises(ConfigurationError, match=f"process {os.getpid()} of"), locked(tmp_path / "out"):
+                pass
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"pid": "x"}', '{"pid": 1}', "\x00" * 50])
+def test_a_lock_that_says_nothing_useful_holds_where_the_system_does(tmp_path, content):
+    (tmp_path / LOCK).write_text(content)
+    with locked(tmp_path) as lock:
+        assert lock.stale is None
+
+
+def holder(**changes) -> Holder:
+    return replace(Holder.this_process(), **changes)
+
+
+def test_a_process_with_the_number_of_one_that_ended_is_another_one():
+    assert not holder().gone
+    assert holder(started="1").gone
+    assert holder(pid=2**22 + 1).gone
+    assert holder(pid=-1).gone or not holder(pid=-1).here
+    assert not holder(pid=2**22 + 1, host="elsewhere").gone
+
+
+def test_without_locks_of_the_system_the_file_of_another_machine_holds_until_someone_removes_it(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    (tmp_path / LOCK).write_text(json.dumps(asdict(holder(host="elsewhere", pid=7))))
+    with locked(tmp_path) as lock:  # the system's locks reach all machines that share the folder
+        assert lock.stale.host == "elsewhere"
+    (tmp_path / LOCK).write_text(json.dumps(asdict(holder(host="elsewhere", pid=7))))
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    for _ in range(2):
+        with pytest.raises(ConfigurationError, match=r"on elsewhere, .*; if it has ended, remove .*\.lock and try"):
+            locked(tmp_path).__enter__()
+    (tmp_path / LOCK).unlink()
+    with locked(tmp_path):
+        pass
+
+
+def test_a_folder_that_was_removed_is_noticed(tmp_path):
+    out = tmp_path / "out"
+    with locked(out) as lock:
+        lock.check()
+        (out / LOCK).unlink()
+        out.rmdir()
+        with pytest.raises(FileNotFoundError):
+            lock.check()
+        with locked(out), pytest.raises(FileNotFoundError, match="removed by another process"):
+            lock.check()
+    assert out.is_dir()
