@@ -30,6 +30,8 @@ results: $(VENV)/ready
 nightly: $(VENV)/ready
 	$(BIN)/python tests/fuzz/campaign.py --inputs 1000000
 	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
+	PYTHONPATH=tests $(BIN)/python -m kit.breaking
+	PYTHONPATH=tests $(BIN)/python -m kit.breaking --steps --runs 12
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 	$(BIN)/python benchmarks/hard_night.py --runs 10000

@@ -1,0 +1,157 @@
+"""A results folder under attack: by a second process, a full disk, a kill at any operation, and hands."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from kit import breaking
+from kit.command import finish, judged, part_count, servobench, start, wait_for
+from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Execution, carry_out
+from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.workers import Bounds
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.studies.tuning.ledger import Ledger
+
+SWEEP = (
+    "sweep", "--controllers", "constant,rls", "--seeds", "60", "--workers", "1", "--set", "random.duration=3",
+)  # fmt: skip
+RESUMERS = 12
+
+linux = pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="the library that breaks files is for Linux")
+
+
+def in_child(work) -> int:
+    child = os.fork()
+    if child:
+        return child
+    try:
+        work()
+    except BaseException as error:  # noqa: BLE001 - the parent judges by the exit code
+        os._exit(2 if isinstance(error, ConfigurationError) and "is being written by process" in str(error) else 3)
+    os._exit(0)
+
+
+def test_a_sweep_that_is_resumed_while_it_runs_is_refused_by_name_and_not_disturbed(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    first = start(*SWEEP, "--out", str(out))
+    wait_for(lambda: part_count(out) > 0)
+    for _ in range(3):
+        assert servobench(monkeypatch, *SWEEP, "--out", str(out), "--resume") == 2
+        error = capsys.readouterr().err
+        assert error.startswith(f"servobench: results folder {out} is being written by process {first.pid} of ")
+        assert error.count("\n") == 1
+    assert servobench(monkeypatch, "collect", str(out)) == 2
+    os.killpg(first.pid, signal.SIGKILL)
+    finish(first)
+    assert servobench(monkeypatch, *SWEEP, "--out", str(out), "--resume") == 0
+    assert f"was left by process {first.pid} of" in "".join(capsys.readouterr().out.split("\n")).replace("  ", " ")
+    runs = results.load_runs(out)
+    assert len(runs) == 120
+    assert runs["run_id"].is_unique
+
+
+def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refused(tmp_path):
+    out, chance = tmp_path / "out", random.Random(1)
+    how = Execution(workers=1, block=4, resume=True, bounds=Bounds(isolate=False))
+    batch = breaking.campaign(False, ("constant",), 40)
+    carry_out(batch, tmp_path / "alone", Execution(workers=1, block=4, bounds=Bounds(isolate=False)))
+    out.mkdir()
+
+    def resume(wait: float) -> None:
+        time.sleep(wait)
+        carry_out(batch, out, how)
+
+    children = [in_child(partial(resume, chance.uniform(0.0, 0.6))) for _ in range(RESUMERS)]
+    codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    assert set(codes) <= {0, 2}
+    assert 0 in codes
+    tables = (judged(results.load_runs(folder)) for folder in (out, tmp_path / "alone"))
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+    assert examine(out).findings == []
+
+
+@linux
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
+@pytest.mark.parametrize("arguments", [("--every", "40"), ("--steps", "--runs", "4", "--every", "40")])
+def test_a_batch_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(tmp_path, arguments):
+    figures = breaking.start(tmp_path, *arguments, timeout=550)
+    assert figures["failed"] == [], figures
+    assert figures["points"] >= 10
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_became_read_only_is_one_line(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert servobench(monkeypatch, *SWEEP[:4], "2", "--workers", "1", "--out", str(out)) == 0
+    out.chmod(0o500)
+    try:
+        assert servobench(monkeypatch, "collect", str(out)) == 2
+        assert "cannot be written: Permission denied" in capsys.readouterr().err
+    finally:
+        out.chmod(0o700)
+
+
+def test_a_folder_that_is_removed_while_it_is_written_is_one_line(tmp_path):
+    out = tmp_path / "out"
+    process = start(*SWEEP, "--out", str(out))
+    wait_for(lambda: part_count(out) > 0)
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.rmtree(out, ignore_errors=True)
+    code, output = finish(process)
+    assert code == 1, output
+    assert "Traceback" not in output
+    assert f"servobench: results folder {out} cannot be written: it was removed" in output
+
+
+def test_what_verify_says_can_be_done(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    sweep = ("sweep", "--controllers", "constant", "--seeds", "3", "--workers", "1", "--set", "random.duration=1")
+    assert servobench(monkeypatch, *sweep, "--out", str(out)) == 0
+    assert servobench(monkeypatch, "verify", str(out)) == 0
+    assert "2 files are what was written, 3 runs" in capsys.readouterr().out
+    (out / results.RUNS).write_bytes((out / results.RUNS).read_bytes()[:-100])
+    assert servobench(monkeypatch, "verify", str(out)) == 1
+    assert "runs.parquet is cut off: repeat the command that made the folder with --resume" in capsys.readouterr().out
+    for command in ("statistics", "report", "collect"):
+        assert servobench(monkeypatch, command, str(out)) == 2
+        error = capsys.readouterr().err
+        assert f"{out / results.RUNS} is cut off; repeat" in error
+        assert error.count("\n") == 1
+    assert servobench(monkeypatch, *sweep, "--out", str(out), "--resume") == 0
+    assert servobench(monkeypatch, "verify", str(out)) == 0
+    assert servobench(monkeypatch, "verify", str(tmp_path / "none")) == 2
+
+
+def test_a_study_that_is_killed_while_it_writes_goes_on_without_waiting(tmp_path):
+    path = tmp_path / "study.jsonl"
+    Ledger(path, {"runs": 1}).add({"gain": 0.5}, [1.0])
+    whole = path.read_bytes()
+    line = b'{"settings": {"gain": 1.5}, "costs": [2.0]}\n'
+    for end in range(len(line)):  # killed after each byte
+        path.write_bytes(whole + line[:end])
+        ledger = Ledger(path, {"runs": 1})
+        assert len(ledger) == 1
+        ledger.add({"gain": 1.5}, [2.0])
+        assert path.read_bytes() == whole + line
+
+
+def test_tuning_that_is_killed_goes_on_at_once(tmp_path):
+    arguments = ("tune", "--controllers", "constant", "--robots", "2", "--studies", "1", "--search", "0",
+                 "--workers", "1", "--trials", "3", "--out", str(tmp_path / "out"))  # fmt: skip
+    process, ledger = start(*arguments), tmp_path / "out" / "constant.jsonl"
+    wait_for(lambda: ledger.exists() and ledger.read_text().count('"costs"') >= 1)
+    os.killpg(process.pid, signal.SIGKILL)
+    finish(process)
+    code, output = finish(start(*arguments))
+    assert code == 0, output
+    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".jsonl", ".jsonl", ".toml"]
