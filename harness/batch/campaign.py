@@ -114,6 +114,8 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     """
     if not how.resume:
         check_empty(folder, can_resume=len(campaign.cells) > 1)
+    elif not is_unused(folder):
+        check_resumable(folder)
     runs = survey(Grid(_request, campaign.cells))
     own = offered([*runs.plants, *runs.controllers])
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
@@ -134,8 +136,6 @@ def _carry_out_at(
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
     resume = how.resume and not is_unused(folder)
-    if resume:
-        check_resumable(folder)
     with locked(folder, new=not resume) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
