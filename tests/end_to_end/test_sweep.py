@@ -114,7 +114,7 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens': did you mean 'links'? valid: camera_move"),
+        (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens': did you mean 'links'? valid: "),
         (("--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
         (("--noise", "loud"), "--noise must be comma-separated numbers, got 'loud'"),
         (("--noise", "-1"), "--noise must be numbers from 0 on, got '-1'"),

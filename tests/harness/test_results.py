@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from servobench.harness.batch import results
+from servobench.harness.batch import parquet, results
 from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.lock import LOCK, locked
 from servobench.harness.config.settings import ConfigurationError
@@ -180,7 +180,7 @@ def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
 
 
 def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, monkeypatch):
-    monkeypatch.setattr(results, "ROW_GROUP", 2)
+    monkeypatch.setattr(parquet, "ROW_GROUP", 2)
     for index in range(5):
         add_part(folder, index)
     assert results.has_steps(folder)
