@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -15,8 +16,8 @@ from matplotlib.figure import Figure
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.measures import MEASURES
 from servobench.harness.pictures.ensembles import Ensembles
-from servobench.harness.pictures.panels import Styles
-from servobench.harness.pictures.style import TEXT, WIDTH
+from servobench.harness.pictures.panels import LETTER, Styles
+from servobench.harness.pictures.style import TEXT, WIDE, Layout, MethodStyle
 from servobench.harness.run.ending import COMPLETED
 from servobench.plant.checks import FloatArray
 
@@ -27,6 +28,11 @@ SMOOTHNESS: Final = ("joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3", "
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
+MAX_RANGE: Final = 1e6  # largest over smallest value that an axis shows
+NAME_LETTERS: Final = 20  # of a controller's name in a line beside an axis, for each column of a layout
+LETTERS: Final = 16.0  # of a label in an inch
+NUMBERS: Final = 0.25  # [in] beside the names
+LEAST_ROWS: Final = 4  # controllers for which a panel has room
 
 
 class _Dots(NamedTuple):
@@ -37,8 +43,10 @@ class _Dots(NamedTuple):
     factor: float
 
 
-def draw_measures(runs: pd.DataFrame, columns: Sequence[str], styles: Styles) -> Figure | None:
+def draw_measures(runs: pd.DataFrame, columns: Sequence[str], styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw measures of every run, a column a task, a row a measure, a line a controller; None without values.
+
+    The measures of a single task are beside each other, on a narrow sheet below each other.
 
     A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
 
@@ -46,34 +54,74 @@ def draw_measures(runs: pd.DataFrame, columns: Sequence[str], styles: Styles) ->
         runs: of one plant and mismatch.
         columns: of the table of runs; those without any value are left out.
         styles: controller -> style.
+        layout: of the figure; a narrow one is for a single task.
     """
     rows = [_dots(name, runs) for name in columns if name in runs and runs[name].notna().any()]
     if not rows:
         return None
+    alone = runs["task"].nunique() == 1
+    figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles)
+    notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
+    notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
+    if rows[0].column == SETTLING and _unsettled(runs).any():
+        notes.append("at the right edge and counted: never settled")
+    if notes:
+        words = textwrap.fill("; ".join(notes), round(LETTERS * layout.width))
+        figure.supxlabel(words, fontsize=TEXT - 0.5)
+    return figure
+
+
+def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -> Figure:
+    """Draw measures of several tasks: a row a measure, a column a task."""
     tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
-    height = 0.55 + LINE * max(4, len(names))
-    figure = Figure(figsize=(WIDTH, 0.65 + len(rows) * height), layout="constrained")
+    height = 0.55 + LINE * max(LEAST_ROWS, len(names))
+    figure = Figure(figsize=(WIDE.width, 0.65 + len(rows) * height), layout="constrained")
     parts = np.atleast_1d(np.array(figure.subfigures(len(rows), 1), dtype=object))
     for part, row in zip(parts, rows, strict=True):
         panels = part.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
         for axes, task in zip(panels, tasks, strict=True):
             _draw_dots(axes, runs[runs["task"] == task], names, styles, row)
             axes.set_title(task)
-        panels[0].set_ylim(len(names) - 0.4, -0.6)
+            _name_rows(axes, names, WIDE)
         part.supxlabel(row.label, fontsize=TEXT)
-    notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
-    notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
-    if rows[0].column == SETTLING and _unsettled(runs).any():
-        notes.append("at the right edge and counted: never settled")
-    if notes:
-        figure.supxlabel("; ".join(notes), fontsize=TEXT - 0.5)
     return figure
 
 
-def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | None:
+def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, layout: Layout) -> Figure:
+    """Draw measures of one task beside each other, as many as the layout has columns."""
+    names = runs["controller"].unique().tolist()
+    rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
+    columns = min(layout.columns, len(rows))
+    lines = -(-len(rows) // columns)
+    height = 0.55 + LINE * max(LEAST_ROWS, len(names))
+    beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
+    letters = round((layout.width - beside) / columns / LETTER)
+    figure = Figure(figsize=(layout.width, 0.35 + lines * height), layout="constrained")
+    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
+    for axes, row in zip(panels, rows, strict=False):
+        _draw_dots(axes, runs, names, styles, row)
+        _name_rows(axes, names, layout)
+        axes.set_xlabel(textwrap.fill(row.label, letters))
+    for axes in panels[len(rows) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _name_rows(axes: Axes, names: Sequence[str], layout: Layout) -> None:
+    axes.set_yticks(range(len(names)), [_short_name(name, layout) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
+
+
+def _short_name(name: str, layout: Layout) -> str:
+    """Return the end of a name, which says more than its begin, in as many letters as there is room for."""
+    letters = NAME_LETTERS * min(2, layout.columns)
+    return name if len(name) <= letters else f"…{name[1 - letters :]}"
+
+
+def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values.
 
-    Steps that take longer than the control period are marked and counted.
+    Steps that take longer than the control period are marked and, on a wide sheet, counted.
     """
     names = list(dict.fromkeys(name for ensembles in tasks.values() for name in ensembles))
     times = {name: np.concatenate([e[name].step_time for e in tasks.values() if name in e]) for name in names}
@@ -82,13 +130,16 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | 
         return None
     periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
     limit = 1e6 * max([period for period in periods if math.isfinite(period)], default=math.nan)
-    figure = Figure(figsize=(WIDTH, 1.15 + 0.24 * max(3, len(known))), layout="constrained")
+    figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout="constrained")
     axes = figure.add_subplot()
     top = 1.4 * max(np.max(values) for values in known.values())
     for i, (name, values) in enumerate(known.items()):
-        _draw_times(axes, i, values, limit, styles, name)
-    axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom", fontsize=TEXT - 0.5,
-                  xytext=(0, 2), textcoords="offset points")  # fmt: skip
+        _draw_times(axes, i, values, limit, styles[name])
+        if layout is WIDE:
+            _write_times(axes, i, values, limit)
+    if layout is WIDE:
+        axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom",
+                      fontsize=TEXT - 0.5, xytext=(0, 2), textcoords="offset points")  # fmt: skip
     if math.isfinite(limit):
         top = max(top, 1.6 * limit)
         axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
@@ -96,23 +147,28 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | 
         axes.annotate(f"control period, {limit / 1000:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
                       ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
                       textcoords="offset points")  # fmt: skip
-    axes.set(xscale="log", yticks=range(len(known)), yticklabels=list(known), xlabel="time of a controller's step [µs]")
+    axes.set(xscale="log", xlabel="time of a controller's step [µs]")
     axes.set_xlim(right=top)
-    axes.set_ylim(len(known) - 0.4, -0.6)
+    _name_rows(axes, list(known), layout)
     axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.0f}"))
     return figure
 
 
-def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, styles: Styles, name: str) -> None:
+def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> None:
     low, first, middle, third, high = np.percentile(values, PERCENTILES)
-    style, largest, late = styles[name], float(values.max()), int(np.count_nonzero(values > limit))
     axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=7)
     axes.plot([first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45)
     axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
               markerfacecolor=style.face)  # fmt: skip
-    words = f"{_short(middle)}, {_short(high)}, {_short(largest)}"
+    if values.max() > limit:
+        axes.plot(values.max(), i, color="black", marker="X", markersize=6.5, linestyle="")
+
+
+def _write_times(axes: Axes, i: int, values: FloatArray, limit: float) -> None:
+    middle, high = np.percentile(values, (50.0, 99.0))
+    late = int(np.count_nonzero(values > limit))
+    words = f"{_short(middle)}, {_short(high)}, {_short(values.max())}"
     if late:
-        axes.plot(largest, i, color="black", marker="X", markersize=6.5, linestyle="")
         words += f"\n{late} of {len(values)} steps too slow"
     axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
                   fontweight="bold" if late else None, linespacing=1.0)  # fmt: skip
@@ -139,9 +195,17 @@ def _unsettled(runs: pd.DataFrame) -> pd.Series[bool]:
     return moves & settling_times(runs).isna()
 
 
+def _applies(runs: pd.DataFrame, row: _Dots) -> bool:
+    """Return whether a measure says something about a task: a curve has no settling time."""
+    moves = runs.reindex(columns=["task_kind"])["task_kind"] != "curve"
+    return bool(runs[row.column].notna().any()) and (row.column != SETTLING or bool(moves.any()))
+
+
 def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, row: _Dots) -> None:
     """Draw a measure of the runs of one task."""
     values = row.factor * runs[row.column].astype(float)
+    floor = values.max() / MAX_RANGE
+    values = values.where(~((values > 0.0) & (values < floor)), floor)
     never = _unsettled(runs) if row.column == SETTLING else pd.Series(False, runs.index)
     values = values.where(~never)
     if row.column == SETTLING:
@@ -171,7 +235,6 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
         if never[own].any():
             axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="right", va="center", xytext=(-5, 0),
                           textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
-    axes.set_yticks(range(len(names)), names)
     if wide:
         axes.set_xscale("log")
         axes.set_xlim(least / (edge / largest), edge)

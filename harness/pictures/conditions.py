@@ -11,18 +11,18 @@ from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.analysis.statistics import NO_ESTIMATE
 from servobench.harness.pictures.panels import Styles, add_legend, label_rows, panel_grid
 from servobench.harness.pictures.places import draw_curves
-from servobench.harness.pictures.style import TEXT
+from servobench.harness.pictures.style import TEXT, WIDE, Layout
 
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
 NUMBERS = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
 
 
-def draw_conditions(runs: pd.DataFrame, styles: Styles) -> Figure | None:
+def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies, if one does."""
     sweeps = _sweeps(runs)
     if not sweeps:
         return None
-    figure, panels = panel_grid(len(sweeps), 2.5)
+    figure, panels = panel_grid(len(sweeps), 2.5, layout)
     for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
         shares = {key: settled_share(own) for key, own in part.groupby(["controller", "size"])}
         names, sizes = part["controller"].unique(), sorted(part["size"].unique())

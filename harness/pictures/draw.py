@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from PIL import Image
 
 from servobench.harness.batch import results
@@ -20,15 +22,14 @@ from servobench.harness.pictures.motion import draw_joint_motion
 from servobench.harness.pictures.panels import Styles
 from servobench.harness.pictures.paper import draw_features, draw_jacobians, draw_moves, draw_tracking
 from servobench.harness.pictures.paths import draw_paths
-from servobench.harness.pictures.style import TEXT, WIDTH, divisions, figure_style, method_styles
+from servobench.harness.pictures.style import NARROW, TEXT, WIDE, Layout, divisions, figure_style, method_styles
 from servobench.harness.pictures.tracks import Group, load_groups
 
 FOLDER = "figures"
 FORMATS = ("png", "pdf")
 RESOLUTION = 150  # dpi of PNG
-SCREEN = 1000.0 / WIDTH  # dpi at which a figure is shown in a page
-DENSITY = 1.5  # pixels of a picture in a page for each that it is shown with
 PALETTE = 64  # colours
+STRIP = 0.04  # [in] above and below what is drawn
 LETTERS = 15.0  # of a title in an inch
 MOVES_A_FIGURE = 4
 TASKS_A_FIGURE = 4
@@ -58,6 +59,7 @@ class NamedFigure(NamedTuple):
     kind: str  # what it shows, one of HEADINGS
     stem: str  # name of its file without ending
     title: str  # the heading and what its runs have in common
+    tasks: tuple[str, ...]  # that it shows
     figure: Figure
 
 
@@ -85,15 +87,24 @@ def save_figure(figure: Figure, stem: Path) -> list[Path]:
     return paths
 
 
-def picture_of(figure: Figure) -> tuple[bytes, int]:
-    """Return a figure as a small, sharp PNG and the width at which it is to be shown, px."""
+def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
+    """Return a figure as a small, sharp PNG, and width and height with which it is to be shown, px.
+
+    The picture is as high as what is drawn: nothing is cut, and there is no empty strip.
+    """
     large, small = io.BytesIO(), io.BytesIO()
     with figure_style(TEXT):
-        figure.savefig(large, dpi=DENSITY * SCREEN)
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)  # once, also for the edges of what is drawn
+            figure.set_layout_engine("none")
+        drawn = figure.get_tightbbox()
+        low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
+        box = Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
+        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
     # A line drawing has few colours; a palette makes half the size of it.
     with Image.open(large) as picture:
         picture.convert("RGB").quantize(PALETTE, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
-    return small.getvalue(), round(SCREEN * figure.get_figwidth())
+    return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
 
 
 def folder_figures(folder: Path) -> Iterator[NamedFigure]:
@@ -102,28 +113,72 @@ def folder_figures(folder: Path) -> Iterator[NamedFigure]:
     Raises:
         ConfigurationError: not a results folder.
     """
+    for place, plan in _plans(folder, moves=MOVES_A_FIGURE, tasks=TASKS_A_FIGURE, blocks=BLOCKS_A_FIGURE):
+        if (named := _carry_out(place, plan, WIDE)) is not None:
+            yield named
+
+
+def page_figures(folder: Path, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
+    """Yield figures of a results folder for a page, of each the wide and the narrow form; of tasks, one by one.
+
+    Args:
+        folder: the results folder.
+        kinds: those that are wanted, keys of `HEADINGS`.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    for place, plan in _plans(folder, moves=1, tasks=1, blocks=1):
+        if plan.kind in kinds:
+            wide, narrow = (_carry_out(place, plan, layout) for layout in (WIDE, NARROW))
+            if wide is not None and narrow is not None:
+                yield wide, narrow
+
+
+class _Plan(NamedTuple):
+    """A figure that can be drawn."""
+
+    kind: str
+    what: str  # of the tasks the group has, where they need more than one figure
+    tasks: tuple[str, ...]
+    draw: Callable[[Layout], Figure | None]
+
+
+class _Place(NamedTuple):
+    """Where the runs of a figure were made."""
+
+    group: Group
+    runs: pd.DataFrame
+
+
+def _plans(folder: Path, *, moves: int, tasks: int, blocks: int) -> Iterator[tuple[_Place, _Plan]]:
+    """Yield the figures of a folder, which at most so many moves, tasks and blocks of paths share."""
     runs = results.load_runs(folder)
     styles = method_styles(runs["controller"].tolist())
     for group in load_groups(folder):
         chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
-        yield from _group_figures(group, chosen, load_ensembles(folder, chosen), styles)
+        ensembles = load_ensembles(folder, chosen)
+        for plan in (
+            *_move_plans(group, ensembles, styles, moves, blocks),
+            *_curve_plans(group, ensembles, styles),
+            *_cost_plans(group, chosen, ensembles, styles, tasks),
+        ):
+            yield _Place(group, chosen), plan
 
 
-def _group_figures(
-    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles
-) -> Iterator[NamedFigure]:
+def _carry_out(place: _Place, plan: _Plan, layout: Layout) -> NamedFigure | None:
+    """Return a figure with its name and heading."""
     with figure_style(TEXT):
-        figures = list(_drawings(group, runs, ensembles, styles))
-    for kind, what, figure in figures:
-        if figure is None:
-            continue
-        place = f"{group.plant}, mismatch {group.mismatch}"
-        details = ", ".join(filter(None, (what, place, _sample(kind, group, runs))))
-        title = f"{HEADINGS[kind]}: {details}"
-        wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
-        figure.suptitle(f"{HEADINGS[kind]}\n{wrapped}", fontsize=TEXT + 1.0)
-        words = "_".join(part for part in (kind, what, group.plant, group.mismatch) if part)
-        yield NamedFigure(kind, re.sub(r"[^A-Za-z0-9.=+_-]", "_", words), title, figure)
+        figure = plan.draw(layout)
+    if figure is None:
+        return None
+    kind, what, plant, mismatch = plan.kind, plan.what, place.group.plant, place.group.mismatch
+    details = ", ".join(filter(None, (what, f"{plant}, mismatch {mismatch}", _sample(kind, place.group, place.runs))))
+    wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
+    figure.suptitle(f"{HEADINGS[kind]}\n{wrapped}", fontsize=TEXT + 1.0)
+    words = "_".join(part for part in (kind, what, plant, mismatch) if part)
+    stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
+    return NamedFigure(kind, stem, f"{HEADINGS[kind]}: {details}", plan.tasks, figure)
 
 
 def _sample(kind: str, group: Group, runs: pd.DataFrame) -> str:
@@ -137,30 +192,40 @@ def _sample(kind: str, group: Group, runs: pd.DataFrame) -> str:
     return f"{words}; features of seed {group.seed}" if kind == "tracking" else words
 
 
-def _drawings(
-    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles
-) -> Iterator[tuple[str, str, Figure | None]]:
-    """Yield kind, what it is of within the group, and the figure."""
-    moves, curves = (group.select(point_to_point=fixed) for fixed in (True, False))
-    for what, part in _parts(moves, MOVES_A_FIGURE):
-        yield "errors", what, draw_moves({task: ensembles[task] for task in part}, styles)
-        yield "features", what, draw_features(part, {task: shown_until(ensembles[task]) for task in part}, styles)
-    for what, part in _parts(
-        moves, BLOCKS_A_FIGURE // len(divisions(name for tracks in moves.values() for name in tracks))
-    ):
-        yield "paths", what, draw_paths(part, styles)
-    for task, tracks in curves.items():
-        yield "tracking", task, draw_tracking(ensembles[task], tracks, styles)
-        yield "tracking_path", task, draw_paths({task: tracks}, styles)
-    yield "jacobian", "", draw_jacobians(ensembles, styles)
+def _move_plans(
+    group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int, blocks: int
+) -> Iterator[_Plan]:
+    moves = group.select(point_to_point=True)
+    for what, part in _parts(moves, size):
+        own = {task: ensembles[task] for task in part}
+        until = {task: shown_until(own[task]) for task in part}
+        yield _Plan("errors", what, tuple(part), partial(draw_moves, own, styles))
+        yield _Plan("features", what, tuple(part), partial(draw_features, part, until, styles))
+    heads = divisions(name for tracks in moves.values() for name in tracks)
+    for what, part in _parts(moves, max(1, blocks // len(heads))):
+        yield _Plan("paths", what, tuple(part), partial(draw_paths, part, styles))
+
+
+def _curve_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles) -> Iterator[_Plan]:
+    for task, tracks in group.select(point_to_point=False).items():
+        yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
+        yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
+
+
+def _cost_plans(
+    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles, size: int
+) -> Iterator[_Plan]:
+    everything = tuple(group.tasks)
+    yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all
-    for what, measured in _parts(dict.fromkeys(runs["task"] if several else ()), TASKS_A_FIGURE):
+    for what, measured in _parts(dict.fromkeys(runs["task"] if several else ()), size):
         chosen = runs[runs["task"].isin(list(measured))]
         for kind, columns in (("settling", ACCURACY), ("effort", EFFORT), ("smoothness", SMOOTHNESS)):
-            yield kind, what, draw_measures(chosen, columns, styles)
-    yield "step_times", "", draw_step_times(ensembles, styles)
+            yield _Plan(kind, what, tuple(measured), partial(draw_measures, chosen, columns, styles))
+    yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
-        yield "joint_speeds", task, draw_joint_motion(tracks, shown_until(ensembles[task]))
+        until = shown_until(ensembles[task])
+        yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until))
 
 
 def _parts(tasks: Mapping[str, T], size: int) -> Iterator[tuple[str, dict[str, T]]]:

@@ -125,9 +125,9 @@ def write_pictures(folder: Path, loops: Sequence[LoopAnalysis], table: pd.DataFr
         f"<p>{escape(legend)}</p>",
     ]
     for name, figure in figures.items():
-        content, width = picture_of(figure)
+        content, width, height = picture_of(figure)
         data = base64.b64encode(content).decode("ascii")
-        parts.append(f'<figure><img alt="{name}" width="{width}" src="data:image/png;base64,{data}">')
+        parts.append(f'<figure><img alt="{name}" width="{width}" height="{height}" src="data:image/png;base64,{data}">')
         parts.append(f"<figcaption>{escape(CAPTIONS[name])}</figcaption></figure>")
     page = folder / PAGE
     text = "\n".join([*parts, "</body></html>", ""])

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from servobench.harness.pictures.panels import add_legend
-from servobench.harness.pictures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, TEXT, VERMILION, WIDTH
+from servobench.harness.pictures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, TEXT, VERMILION, WIDE, Layout
 from servobench.harness.pictures.tracks import Track, Tracks, each, longest
 from servobench.plant.checks import FloatArray
 
@@ -27,19 +27,20 @@ ROW: Final = 0.72  # [in] a controller
 QUANTITIES: Final = ("joint speed [rad/s]", "acceleration [rad/s²]", "jerk [rad/s³]")
 
 
-def draw_joint_motion(tracks: Tracks, until: float) -> Figure | None:
+def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:
     """Draw what one run of each controller asks of the joints; None without commands.
 
     Args:
         tracks: controller -> run.
         until: the time at which the figure ends [s]; a long run is shown at its end.
+        layout: of the figure; three columns need a wide one.
     """
     shown = each(Track.closing, tracks)
     columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)
     if not columns:
         return None
     height = 1.2 + max(ROW, 1.6 / len(shown)) * len(shown)
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(layout.width, height), layout="constrained")
     panels = figure.subplots(len(shown), 3, sharex=True, sharey="col", squeeze=False)
     for line, (name, track) in zip(panels, shown.items(), strict=True):
         for number, column in enumerate(columns):

@@ -13,19 +13,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.pictures.ensembles import BAND, Ensemble, quantile
-from servobench.harness.pictures.style import TEXT, WIDTH, MethodStyle
+from servobench.harness.pictures.style import TEXT, WIDE, Layout, MethodStyle, fitted
 from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
 from servobench.plant.checks import FloatArray
 
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
 NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)  # in a legend
-ROW: Final = 3  # panels
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
 FLOOR: Final = 0.1  # settling bands: the least error that is told apart over time
 OUTSIDE: Final = 1e12  # of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
 LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of the line beside it
+MARGIN: Final = 0.2  # [in] beside the legend
 DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
 END_MARK: dict[str, Any] = {"marker": END, "markersize": 12, "markeredgewidth": 2.0, "linestyle": "", "zorder": 12,
                             "gid": ENDED}  # fmt: skip
@@ -115,16 +115,17 @@ def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> No
     axes.set_ylabel(f"measured\n{label_of(feature)}")
 
 
-def panel_grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure of `ROW` panels a row with a common ordinate, and its `count` panels.
+def panel_grid(count: int, height: float, layout: Layout = WIDE) -> tuple[Figure, list[Axes]]:
+    """Return a figure of panels with a common ordinate, and its `count` panels.
 
     Args:
         count: how many panels, at least one.
         height: of a row, inches.
+        layout: of the figure.
     """
-    columns = min(ROW, count)
+    columns = min(layout.columns, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(WIDTH, 1.0 + height * rows), layout="constrained")
+    figure = Figure(figsize=(layout.width, 1.0 + height * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
     for axes in panels[count:]:
         axes.set_visible(False)
@@ -133,8 +134,9 @@ def panel_grid(count: int, height: float) -> tuple[Figure, list[Axes]]:
 
 def label_rows(panels: list[Axes], text: str) -> None:
     """Label the ordinate of the first panel of each row."""
-    for i, axes in enumerate(panels):
-        axes.set_ylabel(text if i % ROW == 0 else "")
+    for axes in panels:
+        place = axes.get_subplotspec()
+        axes.set_ylabel(text if place is None or place.is_first_col() else "")
 
 
 def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
@@ -149,9 +151,12 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
             entries[gid] = mpl.lines.Line2D([], [], color="0.3", marker=marker, markersize=7, linestyle="")
     entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))
     if entries:
-        fitting = math.floor(figure.get_figwidth() / (SAMPLE + LETTER * max(map(len, entries))))
+        letters = math.floor((figure.get_figwidth() - SAMPLE - MARGIN) / LETTER)
+        labels = [fitted(label, letters) for label in entries]
+        longest_line = max(len(line) for label in labels for line in label.splitlines())
+        fitting = math.floor(figure.get_figwidth() / (SAMPLE + LETTER * longest_line))
         figure.legend(
-            list(entries.values()), list(entries), loc="outside lower center", frameon=False, fontsize=TEXT - 0.5,
+            list(entries.values()), labels, loc="outside lower center", frameon=False, fontsize=TEXT - 0.5,
             ncols=max(1, min(fitting, len(entries))), handlelength=2.6, columnspacing=1.2,
         )  # fmt: skip
 

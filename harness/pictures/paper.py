@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.pictures.ensembles import WINDOW, Ensembles, shown_until
 from servobench.harness.pictures.panels import Styles, add_legend, draw_error, draw_feature, draw_jacobian, error_limits
-from servobench.harness.pictures.style import WIDTH, divisions
+from servobench.harness.pictures.style import WIDE, Layout, divisions
 from servobench.harness.pictures.tracks import Track, Tracks, each, longest
 
 COLUMNS: Final = 2
@@ -30,12 +30,12 @@ LINE: Final = 0.17  # [in] of the legend
 DrawPanel = Callable[[Axes, Ensembles, Styles], None]
 
 
-def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure:
+def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure:
     """Draw the error of each task over time: median and band over seeds, and where runs settled (figure 4).
 
     With aids and as published are beside each other where there are both. The time ends when methods have settled.
     """
-    figure, panels = _draw_tasks(tasks, styles, draw_error)
+    figure, panels = _draw_tasks(tasks, styles, draw_error, layout)
     low, high = error_limits([ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
     if high > 0.0:
         panels[0][0].set_ylim(low if low > 0.0 else None, high)
@@ -47,26 +47,29 @@ def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure:
     return figure
 
 
-def draw_jacobians(tasks: Mapping[str, Ensembles], styles: Styles) -> Figure | None:
+def draw_jacobians(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw how far the estimated Jacobian is from the true one, over seeds; None if no run knows it."""
     known = {
         task: {name: own for name, own in ensembles.items() if np.isfinite(own.jacobian_error).any()}
         for task, ensembles in tasks.items()
     }
     known = {task: ensembles for task, ensembles in known.items() if ensembles}
-    return _draw_tasks(known, styles, draw_jacobian)[0] if known else None
+    return _draw_tasks(known, styles, draw_jacobian, layout)[0] if known else None
 
 
-def draw_features(tasks: Mapping[str, Tracks], until: Mapping[str, float], styles: Styles) -> Figure:
+def draw_features(
+    tasks: Mapping[str, Tracks], until: Mapping[str, float], styles: Styles, layout: Layout = WIDE
+) -> Figure:
     """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
 
     Args:
         tasks: task -> controller -> run.
         until: task -> the time at which its column ends [s].
         styles: controller -> style.
+        layout: of the figure; a narrow one is for a single task.
     """
     features = _features(tasks)
-    figure = Figure(figsize=(WIDTH, 1.1 + 1.3 * len(features)), layout="constrained")
+    figure = Figure(figsize=(layout.width, 1.1 + 1.3 * len(features)), layout="constrained")
     panels = figure.subplots(len(features), len(tasks), sharex="col", sharey="row", squeeze=False)
     for column, (task, whole) in zip(panels.T, tasks.items(), strict=True):
         tracks = each(Track.overview, whole)
@@ -83,14 +86,19 @@ def draw_features(tasks: Mapping[str, Tracks], until: Mapping[str, float], style
     return figure
 
 
-def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles) -> Figure:
+def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: Layout = WIDE) -> Figure:
     """Draw the error along a curve over seeds, and below it the measured features of one run (figure 6).
 
-    Of a long run, features are drawn at its end only.
+    Of a long run, features are drawn at its end only. On a narrow sheet there are errors only.
     """
+    if layout.columns < COLUMNS:
+        figure, drawn = _draw_tasks({"": ensembles}, styles, draw_error, layout)
+        for axes, _ in drawn:
+            axes.set_ylabel(f"{axes.get_ylabel()},\nRMS over {WINDOW:g} s")
+        return figure
     features, long = _features({"": tracks}), any(track.long for track in tracks.values())
     heads = divisions(ensembles)
-    figure = Figure(figsize=(WIDTH, 3.1 + 1.15 * len(features)), layout="constrained")
+    figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
     panels = figure.subplots(
         1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
         height_ratios=[2.2, *[1.0] * len(features)],
@@ -115,7 +123,7 @@ def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles) -> Figur
 
 
 def _draw_tasks(
-    tasks: Mapping[str, Ensembles], styles: Styles, draw: DrawPanel
+    tasks: Mapping[str, Ensembles], styles: Styles, draw: DrawPanel, layout: Layout
 ) -> tuple[Figure, list[tuple[Axes, str]]]:
     """Draw a panel for each task and division of methods; return the figure, and the panels with their tasks."""
     cells = [
@@ -123,11 +131,12 @@ def _draw_tasks(
         for task, ensembles in tasks.items()
         for head, names in divisions(ensembles).items()
     ]
-    columns = min(COLUMNS, len(cells))
+    columns = min(COLUMNS, layout.columns, len(cells))
     rows = -(-len(cells) // columns)
     names = {name for ensembles in tasks.values() for name in ensembles}
-    height = 0.6 + (2.0 if columns > 1 else 2.8) * rows + LINE * (2 + len(names) / 4)
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    panel = 2.8 if columns == 1 and layout is WIDE else 2.0
+    height = 0.6 + panel * rows + LINE * (2 + len(names) * (0.25 if layout is WIDE else 1.0))
+    figure = Figure(figsize=(layout.width, height), layout="constrained")
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     panels = []
     for axes, (task, head, ensembles) in zip(grid.flat, cells, strict=False):

@@ -11,12 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.pictures.panels import DESIRED, END_MARK, Styles, add_legend
-from servobench.harness.pictures.style import WIDTH, divisions
+from servobench.harness.pictures.style import WIDE, Layout, divisions
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
 from servobench.plant.checks import FloatArray
 
 COLUMNS: Final = 2
-PANEL: Final = 2.8  # [in] width of a view
+SINGLE: Final = 3.6  # [in] width of the only view of a wide figure
+BESIDE: Final = 0.8  # [in] for the numbers beside a view
+LINE: Final = 0.17  # [in] of the legend
 SLIMMEST, TALLEST = 0.3, 1.0  # height of a view over its width
 ROOM: Final = 1.16  # of a view over the paths in it
 ARROW: Final = 0.06  # of a curve, from where to where an arrow shows its direction
@@ -43,7 +45,7 @@ class Block(NamedTuple):
     extent: _Extent
 
 
-def draw_paths(tasks: Mapping[str, Tracks], styles: Styles) -> Figure | None:
+def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw the true paths of one run of each controller in two views, to scale; None with fewer than two features.
 
     Start, target and desired path are in black, an arrow shows in which direction a curve is followed.
@@ -52,12 +54,14 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles) -> Figure | None:
     if not views:
         return None
     blocks = _blocks(tasks, views)
-    columns = min(COLUMNS, len(blocks))
+    columns = min(COLUMNS, layout.columns, len(blocks))
     rows = -(-len(blocks) // columns)
     lines = [blocks[first : first + columns] for first in range(0, len(blocks), columns)]
     ratios = [max(block.extent.ratio(i) for block in line) for line in lines for i in range(len(views))]
-    width = PANEL if columns > 1 else 3.6
-    figure = Figure(figsize=(WIDTH, 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views))), layout="constrained")
+    width = SINGLE if layout is WIDE and columns == 1 else layout.width / columns - BESIDE
+    lines_below = LINE * sum(len(block.tracks) for block in blocks) * (0.1 if layout is WIDE else 1.0)
+    height = 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views)) + lines_below
+    figure = Figure(figsize=(layout.width, height), layout="constrained")
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
     for number, block in enumerate(blocks):
         row, column = divmod(number, columns)

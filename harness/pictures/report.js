@@ -44,7 +44,7 @@ function size(cell) {
 
 function compare(a, b) {
   const [x, y] = [size(a), size(b)];
-  if (a.className !== "n" && b.className !== "n") return a.textContent.localeCompare(b.textContent);
+  if (!a.classList.contains("n") && !b.classList.contains("n")) return a.textContent.localeCompare(b.textContent);
   if (x === null || y === null) return (x === null) - (y === null);
   return x === y ? 0 : x - y;
 }

@@ -27,18 +27,34 @@ from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.conditions import draw_conditions
-from servobench.harness.pictures.draw import folder_figures, picture_of
+from servobench.harness.pictures.draw import page_figures, picture_of
 from servobench.harness.pictures.interactive import error_curves, path_views, rounded, swatches
 from servobench.harness.pictures.sheet import breakable, marked, sheet
-from servobench.harness.pictures.style import TEXT, figure_style, method_styles
+from servobench.harness.pictures.style import NARROW, TEXT, WIDE, Layout, figure_style, method_styles
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.plant.files import write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"
-PICTURE_BYTES: Final = 2_000_000  # of all figures in the page; all of them are in the folder itself
+PICTURE_BYTES: Final = 3_000_000  # of all figures in the page
 SHOWN_RUNS: Final = 1000  # rows of the table of runs
-SKIPPED: Final = ("joint_speeds",)  # kinds of figures that are in the folder only
+LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
+KINDS: Final = ("errors", "paths", "settling", "tracking", "tracking_path", "jacobian", "step_times", "smoothness")
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure as a file.
+
+    Attributes:
+        data: the PNG file, base64.
+        width: [px] at which its type has the size of the page's.
+        height: [px], likewise.
+    """
+
+    data: str
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -48,16 +64,16 @@ class Picture:
     Attributes:
         kind: what it shows; see `harness.pictures.draw`.
         title: alternative text.
-        data: the PNG file, base64.
-        width: [px] at which its type has the size of the page's.
-        height: [px], likewise.
+        tasks: that it shows; none if it is of all.
+        wide: for a sheet of paper, a notebook and most screens.
+        narrow: for a phone.
     """
 
     kind: str
     title: str
-    data: str
-    width: int
-    height: int
+    tasks: tuple[str, ...]
+    wide: Drawing
+    narrow: Drawing
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
@@ -86,10 +102,10 @@ def write_report(folder: Path, path: Path | None = None) -> Path:
 
 
 def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
-    """Return the figure of the conditions that a results folder varies, and its first figures of steps."""
+    """Return the figure of the conditions that a results folder varies, and those of its first figures that fit in."""
     pictures, size = [], 0
     for picture in _drawn(folder, runs):
-        size += len(picture.data)
+        size += len(picture.wide.data) + len(picture.narrow.data)
         if size > PICTURE_BYTES:
             break
         pictures.append(picture)
@@ -97,20 +113,21 @@ def report_pictures(folder: Path, runs: pd.DataFrame) -> list[Picture]:
 
 
 def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
+    styles = method_styles(runs["controller"])
     with figure_style(TEXT):
-        overview = draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
-    if overview is not None:
-        yield _picture("conditions", "share of settled runs over what was varied", overview)
-    for named in folder_figures(folder):
-        if named.kind not in SKIPPED:
-            yield _picture(named.kind, named.title, named.figure)
+        wide, narrow = (draw_conditions(split_tasks(runs)[0], styles, layout) for layout in (WIDE, NARROW))
+    if wide is not None and narrow is not None:
+        title = "Share of moves that settle over what was varied; bands are 95 % intervals"
+        yield Picture("conditions", title, (), _drawing(wide, WIDE), _drawing(narrow, NARROW))
+    for named, slim in page_figures(folder, KINDS):
+        drawings = _drawing(named.figure, WIDE), _drawing(slim.figure, NARROW)
+        yield Picture(named.kind, named.title, named.tasks, *drawings)
 
 
-def _picture(kind: str, title: str, figure: Figure) -> Picture:
+def _drawing(figure: Figure, layout: Layout) -> Drawing:
     figure.suptitle("")  # the page has it as a caption
-    content, width = picture_of(figure)
-    height = round(width * figure.get_figheight() / figure.get_figwidth())
-    return Picture(kind, title, base64.b64encode(content).decode("ascii"), width, height)
+    content, width, height = picture_of(figure, layout)
+    return Drawing(base64.b64encode(content).decode("ascii"), width, height)
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
@@ -121,7 +138,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
     moves, curves = groups.move_tables(runs), groups.curve_tables(runs)
     others = [(name, table.map(lambda value: value)) for name, table in other_tables(folder)]
     estimates = any(picture.kind == "jacobian" for picture in pictures)
-    sections = {"result": True, "moves": moves, "curves": curves, "outcomes": True, "space": views,
+    sections = {"result": True, "outcomes": True, "moves": moves, "curves": curves, "space": views,
                 "estimates": estimates, "cost": True, "runs": True, "others": others, "origin": True}  # fmt: skip
     facts = describe_folder(folder, runs)
     return _environment().get_template(TEMPLATE).render(
@@ -132,6 +149,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         sections=[name for name, content in sections.items() if content],
         tasks={name: [] for name in sections} | {"moves": list(moves), "curves": list(curves)},
         sheet=sheet,
+        long_table=LONG_TABLE,
         verdict=judge(runs),
         scope=_scope(runs, facts),
         band=settling_band(runs),

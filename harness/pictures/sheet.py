@@ -131,7 +131,7 @@ def _rows(table: pd.DataFrame, columns: list[tuple[str, str]], *, linked: bool) 
 
 def _cell(text: str) -> Cell:
     match = ESTIMATE.fullmatch(text)
-    if match and set(match.groups()) == {INFINITE}:  # an interval from ∞ to ∞ says nothing
+    if match and {match["value"][0], match["low"], match["high"]} == {INFINITE}:  # an interval from ∞ to ∞ says nothing
         return Cell(INFINITE, number=True)
     if match:
         return Cell(match["value"], f"{match['low']} to {match['high']}", number=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -18,9 +19,36 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E
 SKY, YELLOW, GREY, BLACK = "#56B4E9", "#B8A900", "#7F7F7F", "#000000"
 WINE, INDIGO = "#882255", "#332288"  # of Tol's palette, which goes with it
 MARKS = 8  # on each line
-WIDTH = 7.2  # [in] of a figure: both columns of a paper, or 1,000 px of a page
+WIDTH = 7.2  # [in] of a figure: both columns of a paper
+MOST_LINES = 7  # of methods in a panel, besides those that know the true robot
 TEXT = 8.0  # [pt] of a figure of that width
 FILM_TEXT = 9.0  # [pt]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The sheet on which a figure is laid out; its type has the same size in points on each.
+
+    Attributes:
+        width: [in].
+        columns: panels beside each other, at most.
+        pixels: [px] of a page that the width takes.
+        density: pixels of a picture for each of the page's.
+    """
+
+    width: float
+    columns: int
+    pixels: int
+    density: float
+
+    @property
+    def scale(self) -> float:
+        """Pixels of a page for an inch."""
+        return self.pixels / self.width
+
+
+WIDE = Layout(WIDTH, 3, 1000, 1.5)
+NARROW = Layout(2.9, 1, 350, 2.0)  # of a phone
 
 
 @dataclass(frozen=True)
@@ -100,17 +128,26 @@ def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
 
 
 def divisions(names: Iterable[str]) -> dict[str, list[str]]:
-    """Return the names with aids and those as published, under a heading each; the upper bounds are in both.
+    """Return the names with aids and those as published, under a heading each; the upper bounds are in all.
 
-    Without a method as published, or with no other, there is one division without a heading.
+    Without a method as published, or with no other, there is one division without a heading. A division of more than
+    `MOST_LINES` methods is divided further.
     """
     wanted = list(dict.fromkeys(names))
     published = [name for name in wanted if name.endswith(PUBLISHED)]
     bounds = [name for name in wanted if name in UPPER_BOUNDS]
     others = [name for name in wanted if name not in published]
     if not published or len(others) == len(bounds):
-        return {"": wanted}
-    return {"with aids": others, "as published": published + bounds}
+        return _parts("", wanted, bounds)
+    return _parts("with aids", others, bounds) | _parts("as published", published + bounds, bounds)
+
+
+def fitted(name: str, letters: int) -> str:
+    """Return a name in lines of at most so many letters, broken after `:` or `/` where that is possible."""
+    lines = [""]
+    for part in re.split(r"(?<=[:/])", name):
+        lines[-1:] = [lines[-1] + part] if len(lines[-1] + part) <= letters else [lines[-1], part]
+    return "\n".join(line[i : i + letters] for line in lines for i in range(0, len(line), letters))
 
 
 def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
@@ -130,6 +167,16 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
             "pdf.fonttype": 42,
         }
     )
+
+
+def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[str]]:
+    """Return the names of a division in as few parts of about the same size as are needed, each with the bounds."""
+    own = [name for name in names if name not in bounds]
+    count = -(-len(own) // MOST_LINES)
+    if count <= 1:
+        return {heading: names}
+    size = -(-len(own) // count)
+    return {f"{heading} {i + 1} of {count}".lstrip(): own[i * size : (i + 1) * size] + bounds for i in range(count)}
 
 
 def _other(index: int) -> MethodStyle:

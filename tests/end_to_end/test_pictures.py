@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.text import Text
 
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
@@ -15,10 +16,10 @@ from servobench.harness.batch import results
 from servobench.harness.batch.checksums import write_vouched
 from servobench.harness.config.registry import CONTROLLERS as KNOWN
 from servobench.harness.pictures.conditions import draw_conditions
-from servobench.harness.pictures.draw import HEADINGS, draw_figures, folder_figures, picture_of
+from servobench.harness.pictures.draw import HEADINGS, draw_figures, folder_figures, page_figures, picture_of
 from servobench.harness.pictures.interactive import path_views
 from servobench.harness.pictures.panels import ENDED
-from servobench.harness.pictures.style import method_styles
+from servobench.harness.pictures.style import NARROW, TEXT, WIDE, fitted, method_styles
 from servobench.harness.pictures.tracks import Track, load_groups
 
 OTHERS = [f"method_{i}" for i in range(20)]
@@ -95,6 +96,28 @@ def test_more_than_four_moves_go_into_several_figures(tmp_path):
     assert len({named.stem for named in folder_figures(folder)}) == len(kinds(folder))
 
 
+def test_a_page_has_each_task_apart_for_a_screen_and_for_a_phone_and_nothing_is_cut(tmp_path):
+    names = ("ukf_mfac", "./a_folder/my_own_controller.py:MyVeryOwnController", *OTHERS[:9])
+    figures = list(page_figures(comparison(tmp_path / "out", controllers=names), ("errors", "paths", "settling")))
+    assert [wide.tasks for wide, _ in figures if wide.kind == "errors"] == [("exp1",), ("exp2",)]
+    assert all(wide.tasks == narrow.tasks and len(wide.tasks) == 1 for wide, narrow in figures)
+    for wide, narrow in figures:
+        for figure, layout in ((wide.figure, WIDE), (narrow.figure, NARROW)):
+            assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= TEXT - 2.0
+            figure.suptitle("")
+            _, width, _ = picture_of(figure, layout)
+            assert width <= layout.pixels + 2
+        columns = {round(axes.get_position().x0, 2) for axes in narrow.figure.axes if axes.get_visible()}
+        assert len(columns) <= 2  # panels below each other, differing by the width of their numbers
+
+
+def test_a_long_name_is_broken_where_it_can_be():
+    assert fitted("rbf_pid:published", 20) == "rbf_pid:published"
+    assert fitted("rbf_pid:published", 12) == "rbf_pid:\npublished"
+    assert fitted("./a/b.py:Mine", 6) == "./a/\nb.py:\nMine"
+    assert fitted("x" * 25, 10).splitlines() == ["x" * 10, "x" * 10, "x" * 5]
+
+
 def test_figures_are_files_in_two_formats_and_the_same_each_time(tmp_path):
     folder = comparison(tmp_path / "out", controllers=("ukf_mfac",), tasks=("exp1",))
     paths = draw_figures(folder)
@@ -125,9 +148,9 @@ def test_a_single_period_and_missing_numbers_do_no_harm(tmp_path):
     rows = [made_up_row("a", controller="ukf_mfac"), made_up_row("b", controller="rbf_pid")]
     folder = write_folder(tmp_path / "out", rows, [short, gaps])
     for named in folder_figures(folder):
-        picture, width = picture_of(named.figure)
+        picture, width, height = picture_of(named.figure)
         assert picture.startswith(b"\x89PNG")
-        assert width > 300
+        assert min(width, height) > 100
 
 
 def test_without_any_true_jacobian_there_is_no_figure_of_its_error_and_an_exact_one_is_told(tmp_path):
@@ -171,7 +194,8 @@ def test_half_an_hour_is_drawn_with_few_points(tmp_path):
     kind, run_id = {"task": "endurance", "task_kind": "curve"}, "kinematic-ukf_mfac-endurance-moderate-0"
     steps = made_up_steps(run_id, curve=True, periods=36_000)
     folder = write_folder(tmp_path / "out", [made_up_row(run_id, **kind)], [steps])
-    for _, _, title, figure in folder_figures(folder):
+    for named in folder_figures(folder):
+        title, figure = named.title, named.figure
         lines = [line for axes in figure.axes for line in axes.get_lines()]
         assert all(len(line.get_xdata()) <= 700 for line in lines), title
     assert 100 < str(path_views(folder)).count(",") < 20_000

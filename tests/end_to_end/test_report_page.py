@@ -12,10 +12,12 @@ from kit.browser import browser_page, find_browser
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.batch import results
 from servobench.harness.pictures import report
+from servobench.harness.pictures.style import NARROW, TEXT, WIDE
 
 pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
 
 WIDTHS = (390, 1024, 1600)
+SMALLEST_TYPE = TEXT - 2.0  # [pt]
 HOSTILE = "</script><script>window.pwned=1</script><img src=x onerror=window.pwned=1>\"'`{{7*7}}"
 FOREIGN_WORDS = re.compile(r"\b(inf|None|NaN|nan|NaT|undefined|null)\b")
 SHOWN_TEXT = "document.body.innerText"
@@ -85,6 +87,18 @@ def test_nothing_is_cut_or_wider_than_the_window(browser, pages, name, width):
     assert browser.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)")
     assert browser.complaints() == []
     assert browser.requests() == []
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", ["comparison", "long_names", "sweep"])
+def test_the_smallest_type_of_every_figure_can_be_read(browser, pages, name, width):
+    show(browser, pages[name], width)
+    drawn = "Array.from(document.querySelectorAll('figure img'), i => [i.clientWidth, i.naturalWidth])"
+    layout = NARROW if width < 900 else WIDE
+    shown = browser.evaluate(drawn)
+    assert shown
+    for across, pixels in shown:
+        assert SMALLEST_TYPE / 72.0 * layout.scale * layout.density * across / pixels > 9.9
 
 
 @pytest.mark.parametrize("name", FOLDERS)

@@ -107,6 +107,7 @@ def test_methods_as_published_have_a_panel_of_their_own_beside_the_upper_bounds(
     wanted = {"with aids": ["ukf_mfac", "calibrated"], "as published": ["ukf_mfac:published", "calibrated"]}
     assert divisions(names) == wanted
     assert divisions(names[1:]) == {"": names[1:]}
+
     rows = [made_up_row(name, controller=name) for name in names]
     ensembles = load(tmp_path / "out", rows, [made_up_steps(name) for name in names])
     panels = draw_moves(ensembles, STYLES).axes
@@ -116,6 +117,13 @@ def test_methods_as_published_have_a_panel_of_their_own_beside_the_upper_bounds(
     equipped, published = STYLES["ukf_mfac"], STYLES["ukf_mfac:published"]
     assert equipped.colour == published.colour
     assert (equipped.line, equipped.hollow, published.hollow) == ("-", False, True)
+
+
+def test_many_methods_are_divided_evenly_with_the_bounds_in_each_part():
+    many = [f"method_{i}" for i in range(10)]
+    parts = divisions([*many, "calibrated"])
+    assert parts == {"1 of 2": [*many[:5], "calibrated"], "2 of 2": [*many[5:], "calibrated"]}
+    assert list(divisions([*many, "ukf_mfac:published"])) == ["with aids 1 of 2", "with aids 2 of 2", "as published"]
 
 
 def test_along_a_curve_the_error_is_a_root_mean_square_over_half_a_second(tmp_path):
