@@ -111,3 +111,14 @@ def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
 def test_the_package_is_a_command():
     done = subprocess.run([sys.executable, "-m", "servobench", "--help"], capture_output=True, text=True, check=True)
     assert "compare" in done.stdout
+
+
+def test_the_citation_is_one_of_its_format(tmp_path):
+    check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.citation-file-format"]
+    done = subprocess.run([*check, str(ROOT / "CITATION.cff")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    bad = tmp_path / "CITATION.cff"
+    bad.write_text((ROOT / "CITATION.cff").read_text().replace("type: article", "type: leaflet"))
+    done = subprocess.run([*check, str(bad)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "'leaflet' is not one of" in done.stdout
