@@ -22,11 +22,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+import pandas as pd
+
 import generated_tables
 import stored_tables
 from page_studies import STUDIES
 from page_studies.study import Study
+from servobench.harness.batch import results
 from servobench.harness.batch.results import read_manifest
+from servobench.harness.run.ending import CRASHED
 
 ROOT: Final = Path(__file__).parents[1]
 CODE: Final = ("plant", "controllers", "fmus", "harness")  # what results depend on
@@ -47,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.check:
             problems += check(STUDIES[name], folder)
         else:
+            refuse_crashes(folder)
             store(STUDIES[name], folder, options.into)
     if options.check:
         print("\n".join(problems) or "every stored figure comes out again")  # noqa: T201 - the output of the command
@@ -132,6 +137,20 @@ def code_digest() -> str:
             if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".md":
                 digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+def refuse_crashes(folder: Path) -> None:
+    """Stop before numbers and pictures are stored that hold runs which never were: of a method or of the machine.
+
+    Raises:
+        SystemExit: a run of the study crashed.
+    """
+    for path in sorted(folder.rglob(results.RUNS)):
+        runs = pd.read_parquet(path, columns=["status", "reason"])
+        crashed = runs[runs["status"] == CRASHED]
+        if len(crashed):
+            sys.exit(f"{len(crashed)} of {len(runs)} runs in {path.parent} crashed, nothing is stored: "
+                     f"{crashed['reason'].iloc[0]}")  # fmt: skip
 
 
 def store(study: Study, folder: Path, into: Path) -> None:

@@ -256,3 +256,13 @@ def test_the_command_draws_the_map(monkeypatch, tmp_path, capsys):
     shown = dict(STUDIES["robustness"].files(out.parent))
     assert set(shown) == {"pictures/robustness.png", "pictures/robustness_settling.png"}
     assert all(len(content) < 300e3 for content in shown.values())
+
+
+def test_numbers_of_runs_that_crashed_are_not_stored(toy):
+    assert call(toy) == 0
+    table = next((toy / "runs").rglob(results.RUNS))
+    runs = pd.read_parquet(table)
+    runs.loc[0, ["status", "reason"]] = "crashed", "OSError: no more room"
+    runs.to_parquet(table)
+    with pytest.raises(SystemExit, match=r"1 of 3 runs in .* crashed, nothing is stored: OSError: no more room"):
+        call(toy)
