@@ -147,7 +147,7 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
         axes.annotate(f"control period, {limit / 1000:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
                       ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
                       textcoords="offset points")  # fmt: skip
-    axes.set(xscale="log", xlabel="time of a controller's step [µs]")
+    axes.set(xscale="log", xlabel="time of a controller's step [µs]" if layout is WIDE else "time of a step [µs]")
     axes.set_xlim(right=top)
     _name_rows(axes, list(known), layout)
     axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.0f}"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from typing import Final, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.panels import DESIRED, END_MARK, Styles, add_legend
+from servobench.harness.pictures.panels import DESIRED, END_MARK, LETTER, Styles, add_legend
 from servobench.harness.pictures.style import WIDE, Layout, divisions
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
 from servobench.plant.checks import FloatArray
@@ -69,7 +70,8 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
             axes = grid[row * len(views) + i, column]
             _draw_view(axes, block.tracks, styles, view)
             block.extent.apply(axes, i, ratios[row * len(views) + i])
-            axes.set_title(f"{block.title}: {view.title}" if len(views) > 1 else block.title)
+            title = f"{block.title}: {view.title}" if len(views) > 1 else block.title
+            axes.set_title(textwrap.fill(title, round((layout.width / columns - BESIDE) / LETTER)))
             if i + 1 < len(views):  # the view below has the same abscissa
                 axes.set_xlabel("")
                 axes.tick_params(labelbottom=False)

@@ -48,7 +48,7 @@ class Layout:
 
 
 WIDE = Layout(WIDTH, 3, 1000, 1.5)
-NARROW = Layout(2.9, 1, 350, 2.0)  # of a phone
+NARROW = Layout(2.75, 1, 335, 2.0)  # of a phone of 390 px, with a bar to scroll
 
 
 @dataclass(frozen=True)
