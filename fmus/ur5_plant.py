@@ -68,7 +68,7 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None) -> Path:
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported arm, with the true model of `setup` as its parameters, (..., size)."""
-    model, start = setup.robot()
+    model, start = setup.ball_robot()
     lag, n = config.joint_lags or (config.lag,), model.arm.n
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")

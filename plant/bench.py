@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FeatureLost, RunFault
-from servobench.plant.lanes import take, where
+from servobench.plant.lanes import take
 from servobench.plant.noise.sensor import Sensor
 from servobench.plant.plant import ImageArray, Plant, PlantSetup, TrueModel
 from servobench.plant.seeds import Seeds
@@ -37,12 +37,12 @@ class Frame(NamedTuple):
     Attributes:
         due: number of the sub-step after which it is delivered; with jitter, (...) and no whole number.
         feature: (..., m).
-        arrives: (...), whether it will arrive.
+        valid: (..., m), which features are measured and will arrive.
     """
 
     due: int | FloatArray
     feature: FloatArray
-    arrives: BoolArray
+    valid: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,10 @@ class Bench(Plant):
     def _size_masks(self) -> None:
         """Take the leading axis from the world."""
         self._shape = (*self.world.lead, self.spec.n)
-        self._all_arrive = np.ones(self.world.lead, dtype=np.bool_)[()]
-        self._none_arrives = np.logical_not(self._all_arrive)
+        self._whole = np.ones(self.world.lead, dtype=np.bool_)[()]
         self._all_valid = np.ones((*self.world.lead, self.spec.m), dtype=np.bool_)
-        for mask in (self._all_arrive, self._none_arrives, self._all_valid):
+        self._none_valid = np.logical_not(self._all_valid)
+        for mask in (self._whole, self._all_valid, self._none_valid):
             mask.setflags(write=False)
 
     def reset(self, seed: Seeds) -> Observation:
@@ -120,12 +120,16 @@ class Bench(Plant):
         first = self._expose()
         if first is None:
             raise FeatureLost(self.world.why_unseen())
+        unseen = self._unseen()
+        if unseen is not None:
+            for lane in np.flatnonzero(unseen.any(axis=-1)).tolist():
+                self.world.fail(lane, FeatureLost(self.world.why_unseen()))
         rest = np.zeros(self._shape)
         rest.setflags(write=False)
         self._commands = deque([rest] * self._timing.delays[0])
-        self._frames = deque(Frame(due, first, self._all_arrive) for due in self._timing.under_way())
+        self._frames = deque(Frame(due, first, self._all_valid) for due in self._timing.under_way())
         self._held, self._k = first, 0
-        return self._observation(joints, first, self._all_arrive)
+        return self._observation(joints, first, self._all_valid)
 
     def step(self, command: Command) -> Observation:
         """Apply `command` for one period; see `Plant.step`."""
@@ -147,52 +151,65 @@ class Bench(Plant):
         return self._observation(joints, *self._delivered(self._k * timing.steps))
 
     def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
-        """Return the feature of the newest frame that arrived since the last control instant, and where one did."""
+        """Return the newest features that arrived since the last control instant, and which ones did, (..., m)."""
         if self._sensor.jitters:
             return self._delivered_by_lane(now)
-        feature, arrived = self._held, self._none_arrives
+        feature, valid = self._held, self._none_valid
         while self._frames and self._frames[0].due <= now:
-            _, newer, arrives = self._frames.popleft()
-            if arrives is self._all_arrive:
-                feature, arrived = newer, arrives
+            _, newer, own = self._frames.popleft()
+            if own is self._all_valid:
+                feature, valid = newer, own
             else:
-                feature, arrived = where(arrives, newer, feature), np.logical_or(arrived, arrives)
-        return feature, arrived
+                feature, valid = np.where(own, newer, feature), np.logical_or(valid, own)
+        return feature, valid
 
     def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
         """Return the same where a frame is due at another time in each lane."""
-        feature, arrived, before = self._held, self._none_arrives, now - self._timing.steps
-        for due, newer, arrives in self._frames:
-            fresh = np.logical_and(arrives, np.logical_and(before < due, due <= now))
-            feature, arrived = where(fresh, newer, feature), np.logical_or(arrived, fresh)
+        feature, valid, before = self._held, self._none_valid, now - self._timing.steps
+        for due, newer, own in self._frames:
+            fresh = np.logical_and(own, np.asarray(np.logical_and(before < due, due <= now))[..., None])
+            feature, valid = np.where(fresh, newer, feature), np.logical_or(valid, fresh)
         while self._frames and np.all(self._frames[0].due <= now):
             self._frames.popleft()
-        return feature, arrived
+        return feature, valid
 
-    def _observation(self, joints: FloatArray, feature: FloatArray, arrives: BoolArray) -> Observation:
-        """Return what is seen at the present period, of a feature that is held where nothing arrives."""
-        time, valid = self._k * self._period, self._all_valid
-        if arrives is not self._all_arrive:
-            valid = np.logical_and(valid, arrives[..., None])
+    def _observation(self, joints: FloatArray, feature: FloatArray, valid: BoolArray) -> Observation:
+        """Return what is seen at the present period, of features that are held where they do not arrive."""
+        time, whole = self._k * self._period, self._whole
+        if valid is not self._all_valid:
+            whole = np.logical_and.reduce(valid, axis=-1)
             valid.setflags(write=False)
         joints.setflags(write=False)
         feature.setflags(write=False)
         self._held = feature
-        return trusted_observation(time, joints, feature, arrives, valid)
+        return trusted_observation(time, joints, feature, whole, valid)
 
     def _expose(self) -> FloatArray | None:
         """Return the feature as seen now, (..., m), with what the sensor adds; None if it is not found."""
-        feature = self.world.see()
-        return None if feature is None else self._sensor.measured(feature)
+        feature, unit = self.world.see(), self.world.noise_unit
+        if feature is None or unit == 1.0:
+            return None if feature is None else self._sensor.measured(feature)
+        return unit * self._sensor.measured(feature / unit)
+
+    def _unseen(self) -> BoolArray | None:
+        """Return which features cannot be seen now, (..., m); None for none of them."""
+        seen = self.world.visible()
+        return None if seen is None or seen.all() else np.logical_not(seen)
 
     def _sent(self, step: int) -> Frame:
-        """Return the frame that is exposed after a sub-step, with whether it will arrive."""
-        feature, missing = self._expose(), self._sensor.missing(step * self._step)
-        arrives = self._all_arrive if missing is None else np.logical_not(missing)
+        """Return the frame that is exposed after a sub-step, with which of its features will arrive."""
+        feature, missing, valid = self._expose(), self._sensor.missing(step * self._step), self._all_valid
+        if feature is None:
+            feature, valid = self._held, self._none_valid
+        if missing is not None:
+            valid = np.logical_and(valid, np.logical_not(missing)[..., None])
+        unseen = self._unseen()
+        if unseen is not None:
+            valid = np.logical_and(valid, np.logical_not(unseen))
         due: int | FloatArray = step + self._timing.latency
         if self._sensor.jitters:
             due = self._sensor.due(step + self._timing.latency, self._step)
-        return Frame(due, self._held, self._none_arrives) if feature is None else Frame(due, feature, arrives)
+        return Frame(due, feature, valid)
 
     def truth(self) -> Truth:
         """See `Plant.truth`."""

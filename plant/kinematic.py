@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import ClassVar, NamedTuple
 
@@ -23,11 +22,12 @@ from servobench.plant.checks import FloatArray, is_finite
 from servobench.plant.faults import PlantDiverged
 from servobench.plant.lanes import take, where
 from servobench.plant.plant import PlantEntry, PlantSetup
-from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
+from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.seeds import Seeds
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import NonNegative, Positive, nested, settings
-from servobench.plant.signals import Truth
+from servobench.plant.signals import BoolArray, Truth
 from servobench.plant.timing import RENAMED_DELAY
 from servobench.plant.world import World
 
@@ -76,13 +76,13 @@ class KinematicState(NamedTuple):
         v: (..., n), rad/s.
     """
 
-    model: HandEyeModel
+    model: SensedArm
     q: FloatArray
     v: FloatArray
 
 
 class KinematicWorld(World):
-    """A serial arm under a fixed camera, in closed form: [q, v]₊ = A [q, v] + B u, y = h(q)."""
+    """A serial arm and its cameras, in closed form: [q, v]₊ = A [q, v] + B u, y = h(q)."""
 
     def __init__(self, config: KinematicConfig, setup: PlantSetup) -> None:
         """Build the world.
@@ -95,7 +95,8 @@ class KinematicWorld(World):
         self.lead, self._first = model.lead, KinematicState(model, start, np.zeros(start.shape))
         self._model, self._q, self._v = self._first
         self._truth: Truth | None = None
-        self.lag = config.lag
+        self._seen: BoolArray | None = None
+        self.lag, self.noise_unit = config.lag, model.noise_unit
         A, B = discretise_lag(config.lag, setup.period)
         self._coefficients = float(A[0, 1]), float(A[1, 1]), float(B[0]), float(B[1])
 
@@ -120,15 +121,21 @@ class KinematicWorld(World):
         """Return the true feature."""
         return self.truth().feature
 
+    def visible(self) -> BoolArray | None:
+        """Return which features the cameras see; see `World.visible`."""
+        self.truth()
+        return self._seen
+
     def truth(self) -> Truth:
         """Return feature and Jacobian of the true model, computed once a period."""
         if self._truth is None:
-            self._truth = Truth(*self._model.feature_and_jacobian(self._q))
+            feature, jacobian, self._seen = self._model.look(self._q)
+            self._truth = Truth(feature, jacobian)
         return self._truth
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
-        self._model, self._truth = replace(self._model, X_BC=X_BC), None
+        self._model, self._truth = self._model.with_camera(X_BC), None
 
     def save(self) -> KinematicState:
         """See `Plant.save`."""
@@ -171,4 +178,5 @@ ENTRY = PlantEntry(
     config=KinematicConfig,
     build=build_kinematic,
     side_by_side=True,
+    any_sensing=True,
 )

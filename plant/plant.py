@@ -22,6 +22,7 @@ from servobench.plant.faults import RunFault
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.limits import JointLimits
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -164,7 +165,7 @@ class PlantSetup:
     """The arguments with which the harness builds a plant.
 
     Attributes:
-        model: the true arm and camera, mismatch included; None for a plant that brings a robot of its own. For runs
+        model: the true arm and cameras, mismatch included; None for a plant that brings a robot of its own. For runs
             side by side its arrays have a leading axis.
         start: (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
         period: control period, s.
@@ -172,7 +173,7 @@ class PlantSetup:
             or where only the model is known.
     """
 
-    model: HandEyeModel | None
+    model: SensedArm | None
     start: FloatArray | None
     period: float
     nominal: Robot | None = None
@@ -182,7 +183,7 @@ class PlantSetup:
         """The maker's joint limits, where they are known."""
         return None if self.nominal is None else self.nominal.limits
 
-    def robot(self) -> tuple[HandEyeModel, FloatArray]:
+    def robot(self) -> tuple[SensedArm, FloatArray]:
         """Return model and start, (..., n), for a plant that needs them.
 
         Raises:
@@ -191,6 +192,13 @@ class PlantSetup:
         if self.model is None or self.start is None:
             raise ValueError("model and start must be given for this plant, got None")
         return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
+
+    def ball_robot(self) -> tuple[HandEyeModel, FloatArray]:
+        """Return model and start for a plant that sees the ball in 3-D by a fixed camera only; errors as in `robot`."""
+        model, start = self.robot()
+        if not isinstance(model, HandEyeModel):
+            raise ValueError("model must be of a ball that is seen in 3-D by a fixed camera for this plant")  # noqa: TRY004
+        return model, start
 
 
 @dataclass(frozen=True)
@@ -209,6 +217,7 @@ class PlantEntry:
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
         engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
+        any_sensing: it takes every sensing set-up; else only the ball that a fixed camera sees in 3-D.
     """
 
     name: str
@@ -220,3 +229,4 @@ class PlantEntry:
     needs: tuple[str, ...] = ()
     engine: Callable[[], str] | None = None
     config_for: Callable[[Robot], Any] | None = None
+    any_sensing: bool = False

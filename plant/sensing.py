@@ -24,7 +24,7 @@ class SensingConfig:
     """Settings of the path from the true feature to the observation."""
 
     feature_noise: NonNegative = 0.001
-    """[unit of the feature] standard deviation σ of the noise of each component."""
+    """[m] standard deviation σ of the noise of each component; of pixels, what it is in the planned image."""
     latency: NonNegative = 0.0
     """[s] between exposure and delivery of a frame; a multiple of the control period, or whole milliseconds."""
     drop_probability: ShareBelowOne = 0.0

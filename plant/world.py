@@ -8,6 +8,7 @@ from typing import Any
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import RunFault
 from servobench.plant.plant import Abilities
+from servobench.plant.signals import BoolArray
 
 
 class World(Abilities):
@@ -28,6 +29,9 @@ class World(Abilities):
         if not self.lead:
             raise fault
         self.faults = {lane: fault, **self.faults}
+
+    noise_unit: float = 1.0
+    """What a metre of noise is in the unit of the features."""
 
     @abstractmethod
     def reset(self, seed: Any) -> FloatArray:  # noqa: ANN401 - narrowed by worlds that carry out one run only
@@ -57,6 +61,10 @@ class World(Abilities):
     @abstractmethod
     def see(self) -> FloatArray | None:
         """Return the feature as the sensor sees it now, (..., m); None if a single run's is not found."""
+
+    def visible(self) -> BoolArray | None:
+        """Return which features of what was seen last are measured, (..., m); None for all of them."""
+        return None
 
     def why_unseen(self) -> str:
         """Return why `see` found nothing, with evidence, for an error message."""

@@ -151,7 +151,7 @@ class BulletWorld(World):
         from servobench.plant.bullet.mechanics import Mechanics  # noqa: PLC0415
         from servobench.plant.bullet.scene import Scene  # noqa: PLC0415
 
-        model, start = setup.robot()
+        model, start = setup.ball_robot()
         self._config, self._model, arm = config, model, model.arm
         self.lag = config.lag
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)

@@ -7,7 +7,8 @@ The robots of many runs side by side are one model, whose arrays have leading ax
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.limits import JointLimits, narrowed
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.signals import Channel, PlantSpec
 
 FEATURE_NAMES = ("x", "y", "z")
@@ -23,7 +25,7 @@ ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
 
 
 @dataclass(frozen=True, eq=False)
-class HandEyeModel:
+class HandEyeModel(SensedArm):
     """A serial arm seen by a fixed camera.
 
     Attributes:
@@ -45,9 +47,22 @@ class HandEyeModel:
         object.__setattr__(self, "X_BC", pose)
 
     @property
-    def lead(self) -> tuple[int, ...]:
-        """Sizes of the leading axes; () for a single robot."""
-        return self.arm.tool.shape[:-1]
+    def channel(self) -> Channel:
+        """Names, unit and natural size of the ball's coordinates."""
+        return FEATURE
+
+    @property
+    def camera(self) -> FloatArray:
+        """The pose of the camera in the base frame, X_BC."""
+        return self.X_BC
+
+    def with_camera(self, pose: FloatArray) -> Self:
+        """Return this model with the camera at another pose, (..., 4, 4)."""
+        return replace(self, X_BC=pose)
+
+    def pivot(self, centre: npt.ArrayLike) -> FloatArray:
+        """Return the middle of the workspace, about which the camera is turned."""
+        return np.asarray(centre, dtype=np.float64)
 
     def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the ball centre in the camera frame, (..., 3) m, for joint positions (..., n) in rad."""
@@ -87,15 +102,15 @@ class TrueJacobian:
         model: arm and camera.
     """
 
-    model: HandEyeModel
+    model: SensedArm
 
     def __call__(self, joint_position: npt.ArrayLike) -> FloatArray:
-        """Return ∂feature/∂(joint position), (..., 3, n) m/rad, for joint positions (..., n) in rad."""
+        """Return ∂feature/∂(joint position), (..., m, n), for joint positions (..., n) in rad."""
         return self.model.jacobian(joint_position)
 
 
 def hand_eye_spec(
-    model: HandEyeModel, period: float, max_joint_speed: float, joint_range: float, limits: JointLimits | None = None
+    model: SensedArm, period: float, max_joint_speed: float, joint_range: float, limits: JointLimits | None = None
 ) -> PlantSpec:
     """Return the spec of a plant built on `model`.
 
@@ -110,4 +125,5 @@ def hand_eye_spec(
         ValueError: a period, speed or range that is not positive.
     """
     both = narrowed(limits, model.arm.n, max_joint_speed, joint_range)
-    return PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, both.speed, both.lower, both.upper, period)
+    spec = PlantSpec.of_joints(model.arm.joint_names, FEATURE_NAMES, both.speed, both.lower, both.upper, period)
+    return replace(spec, feature=model.channel)

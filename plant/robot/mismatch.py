@@ -2,9 +2,11 @@
 
 A mismatch is written as words joined by `+`: a profile (`none`, `factory`, `moderate`, `severe`), single axes with a
 magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20mm`, `gear_ratio=5%`,
-`camera_move=90deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file
-(`factory=FILE`; without a file, that of one real UR5). Words for the sensor (`outliers=40%`; see
-`servobench.plant.noise.axes`) stand among the axes; they change settings of the plant and draw no robot.
+`camera_move=90deg`; of cameras that see pixels `focal=10%`, `centre=10px`, `distortion=10%`; of cameras on the hand
+`mount=5deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file (`factory=FILE`;
+without a file, that of one real UR5).
+Words for the sensor (`outliers=40%`; see `servobench.plant.noise.axes`) stand among the axes; they change settings of
+the plant and draw no robot.
 
 Links, joint offsets, gear ratios and the three components of the tool offset are each drawn uniformly from plus or
 minus the magnitude. The camera turns about an axis drawn at random; by an angle drawn from plus or minus the
@@ -12,7 +14,8 @@ magnitude in a profile, and by exactly the magnitude as a single axis. It turns 
 which therefore stays where it was in the image, and the axis is drawn among those that tilt the optical axis by at
 most 45°: a camera tilted further would look from below the table. `camera_move` turns the camera in the same way, by
 exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a random
-stream of its own, so the same seed gives the same directions at all magnitudes.
+stream of its own, so the same seed gives the same directions at all magnitudes. The axes of cameras that see pixels are
+drawn by `servobench.plant.eyes.draws`.
 """
 
 from __future__ import annotations
@@ -24,13 +27,13 @@ from math import radians
 from typing import Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from servobench.plant.checks import FloatArray, check_number
 from servobench.plant.noise.axes import SENSOR_AXES, disturbed
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.measured import measured_arm
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.sensed import SensedArm, turn_about
 from servobench.plant.seeds import named_generator
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import nearest, suggest
@@ -42,6 +45,8 @@ MAX_MOVE_TILT = radians(30.0)
 ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
 LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 SHARE = {"%": 1e-2, "": 1.0}
+PIXELS = {"px": 1.0}
+MAX_SIZE = {"deg": math.pi, "mm": 1.0, "px": 1000.0}  # [rad, m, px] by the first unit of each kind
 AXES = {
     "links": (SHARE, "10%"),
     "joint_offsets": (ANGLE, "3deg"),
@@ -49,16 +54,38 @@ AXES = {
     "tool": (LENGTH, "20mm"),
     "gear_ratio": (SHARE, "5%"),
     "camera_move": (ANGLE, "90deg"),
+    "focal": (SHARE, "10%"),
+    "centre": (PIXELS, "10px"),
+    "distortion": (SHARE, "10%"),
+    "mount": (ANGLE, "5deg"),
     **{name: (axis.units, axis.example) for name, axis in SENSOR_AXES.items()},
 }
 RANGES = {
-    "%": "0:30:10%", "deg": "0:180:30deg", "mm": "0:60:20mm", "ms": "0:200:50ms", "": "1:2:0.5",
+    "%": "0:30:10%", "deg": "0:180:30deg", "mm": "0:60:20mm", "px": "0:20:5px", "ms": "0:200:50ms", "": "1:2:0.5",
 }  # fmt: skip
 PROFILES: dict[str, dict[str, float]] = {
     "none": {},
     "factory": {},
-    "moderate": {"links": 0.05, "joint_offsets": radians(3.0), "camera_rotation": radians(15.0), "tool": 0.02},
-    "severe": {"links": 0.1, "joint_offsets": radians(6.0), "camera_rotation": radians(45.0), "tool": 0.04},
+    "moderate": {
+        "links": 0.05,
+        "joint_offsets": radians(3.0),
+        "camera_rotation": radians(15.0),
+        "tool": 0.02,
+        "focal": 0.05,
+        "centre": 5.0,
+        "distortion": 0.05,
+        "mount": radians(3.0),
+    },
+    "severe": {
+        "links": 0.1,
+        "joint_offsets": radians(6.0),
+        "camera_rotation": radians(45.0),
+        "tool": 0.04,
+        "focal": 0.1,
+        "centre": 10.0,
+        "distortion": 0.1,
+        "mount": radians(6.0),
+    },
 }
 
 
@@ -90,7 +117,7 @@ class Magnitude:
         return magnitude
 
     def size(self, axis: str) -> float:
-        """Return the magnitude in SI units [rad, m or 1].
+        """Return the magnitude in SI units [rad, m or 1], or in pixels.
 
         Raises:
             ValueError: the unit is none of the axis.
@@ -151,7 +178,7 @@ class Mismatch:
             if AXES[axis][0] is SHARE:
                 check_number(axis, size, at_least=0.0, below=1.0)
             else:
-                check_number(axis, size, at_least=0.0, at_most=1.0 if AXES[axis][0] is LENGTH else math.pi)
+                check_number(axis, size, at_least=0.0, at_most=MAX_SIZE.get(next(iter(AXES[axis][0])), math.pi))
         self.disturbed(SensingConfig())
 
     @classmethod
@@ -190,7 +217,7 @@ class Mismatch:
         return replace(self, profile=profile, axes=(*self.axes, (axis, magnitude)))
 
     def size(self, axis: str) -> float:
-        """Return the magnitude of an axis in SI units [rad, m or 1]; 0 where it is not given."""
+        """Return the magnitude of an axis in SI units [rad, m or 1] or in pixels; 0 where it is not given."""
         given = dict(self.axes)
         return given[axis].size(axis) if axis in given else PROFILES.get(self.profile, {}).get(axis, 0.0)
 
@@ -272,12 +299,11 @@ class MismatchSample:
     move_axis: FloatArray
     move_angle: float
 
-    def moved(self, model: HandEyeModel, robot: Robot) -> HandEyeModel | None:
+    def moved(self, model: SensedArm, robot: Robot) -> SensedArm | None:
         """Return the true `robot`, `model`, after its camera was moved in the middle of the run; None if it is not."""
         if self.move_angle == 0.0:
             return None
-        centre = robot.workspace.centre
-        return replace(model, X_BC=_turn_camera(model.X_BC, self.move_angle * self.move_axis, centre))
+        return model.turned(self.move_angle * self.move_axis, robot.workspace.centre)
 
     def as_record(self) -> dict[str, object]:
         """Return the values as plain lists and floats, for JSON."""
@@ -314,9 +340,9 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
         joint_offset=size("joint_offsets") * draw("joint_offsets", n),
         gear_ratio=factors("gear_ratio", n),
         tool_offset=size("tool") * draw("tool", 3),
-        camera_axis=_draw_camera_axis(angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")),
+        camera_axis=draw_camera_axis(angle, MAX_TILT, named_generator(seed, "mismatch.camera_axis")),
         camera_angle=angle if mismatch.camera_exact else float(angle * draw("camera_angle", 1)[0]),
-        move_axis=_draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
+        move_axis=draw_camera_axis(move, MAX_MOVE_TILT, named_generator(seed, "mismatch.move_axis")),
         move_angle=move,
     )
     arm = nominal.arm if robot.measured is None else robot.measured
@@ -329,11 +355,11 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
         gear_ratio=arm.gear_ratio * sample.gear_ratio,
         tool=arm.tool + sample.tool_offset,
     )
-    turned = _turn_camera(nominal.X_BC, sample.camera_angle * sample.camera_axis, robot.workspace.centre)
-    return HandEyeModel(true, turned), sample
+    turn, centre = sample.camera_angle * sample.camera_axis, np.asarray(robot.workspace.centre)
+    return HandEyeModel(true, turn_about(nominal.X_BC, turn, centre)), sample
 
 
-def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
+def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
     """Draw an axis about which a turn by up to `angle` tilts the optical axis by at most `max_tilt`.
 
     A turn by φ about an axis at γ from the optical axis tilts that by τ with sin(τ/2) = sin(φ/2) sin γ.
@@ -344,12 +370,3 @@ def _draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Genera
     turn = generator.uniform(0.0, 2 * math.pi)
     sign = (-1.0, 1.0)[generator.integers(2)]
     return np.array([sin_gamma * math.cos(turn), sin_gamma * math.sin(turn), sign * cos_gamma])
-
-
-def _turn_camera(X_BC: FloatArray, rotation: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the pose X_BC (4, 4) turned by a rotation vector, (3,) rad, about the workspace's `centre` (3,) m."""
-    centre_C = X_BC[:3, :3].T @ (centre - X_BC[:3, 3])
-    turned = np.eye(4)
-    turned[:3, :3] = X_BC[:3, :3] @ Rotation.from_rotvec(rotation).as_matrix()
-    turned[:3, 3] = centre - turned[:3, :3] @ centre_C
-    return turned

@@ -9,13 +9,35 @@ numbers and a function (or generated C code) whose geometry is a parameter.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, Self, TypeAlias
 
 import casadi
 
+from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
+
+
+class ArmGeometry(NamedTuple):
+    """Everything that describes an arm without its ball, as CasADi symbols or constants.
+
+    Attributes:
+        translation: (n+1, 3), m; see `servobench.plant.robot.arm.SerialArm`.
+        rpy: (n+1, 3), rad.
+        joint_offset: o, (n,), rad.
+        gear_ratio: g, (n,).
+    """
+
+    translation: SX
+    rpy: SX
+    joint_offset: SX
+    gear_ratio: SX
+
+    @classmethod
+    def of(cls, arm: SerialArm) -> Self:
+        """Return the geometry of `arm` as constants."""
+        return cls(*map(casadi.SX, (arm.translation, arm.rpy, arm.joint_offset, arm.gear_ratio)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +62,11 @@ class HandEyeGeometry:
     R_BC: SX
     p_BC: SX
 
+    @property
+    def arm(self) -> ArmGeometry:
+        """What describes the arm."""
+        return ArmGeometry(self.translation, self.rpy, self.joint_offset, self.gear_ratio)
+
 
 def geometry_of(model: HandEyeModel) -> HandEyeGeometry:
     """Return the geometry of `model` as constants."""
@@ -58,19 +85,32 @@ def feature_and_jacobian(joint_position: SX, geometry: HandEyeGeometry) -> tuple
     Returns:
         y, (3, 1), m, and ∂y/∂q, (3, n), m/rad.
     """
-    n = joint_position.numel()
+    axes, origins, rotation, position = arm_frames(joint_position, geometry.arm)
+    ball = position + rotation @ geometry.tool
+    columns = [
+        geometry.gear_ratio[i] * casadi.cross(axis, ball - origin)
+        for i, (axis, origin) in enumerate(zip(axes, origins, strict=True))
+    ]
+    return geometry.R_BC.T @ (ball - geometry.p_BC), geometry.R_BC.T @ casadi.horzcat(*columns)
+
+
+def arm_frames(joint_position: SX, geometry: ArmGeometry) -> tuple[list[SX], list[SX], SX, SX]:
+    """Return the axes z_i and origins p_i of the joints, and rotation and position of the flange, as expressions.
+
+    Args:
+        joint_position: q, (n, 1), rad, as reported.
+        geometry: symbols or constants for n joints.
+    """
     rotation, position = _rotation(geometry.rpy[0, :]), geometry.translation[0, :].T
     axes, origins = [], []
-    for i in range(n):
+    for i in range(joint_position.numel()):
         theta = geometry.gear_ratio[i] * joint_position[i] + geometry.joint_offset[i]
         axes.append(rotation[:, 2])
         origins.append(position)
         rotation = rotation @ _turn_z(theta)
         position = position + rotation @ geometry.translation[i + 1, :].T
         rotation = rotation @ _rotation(geometry.rpy[i + 1, :])
-    ball = position + rotation @ geometry.tool
-    columns = [geometry.gear_ratio[i] * casadi.cross(axes[i], ball - origins[i]) for i in range(n)]
-    return geometry.R_BC.T @ (ball - geometry.p_BC), geometry.R_BC.T @ casadi.horzcat(*columns)
+    return axes, origins, rotation, position
 
 
 def symbolic_feature(model: HandEyeModel) -> casadi.Function:

@@ -1,0 +1,252 @@
+"""Sensing set-ups: their features and Jacobians against OpenCV, CasADi, finite differences and geometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from kit.robots import FOUR_JOINTS
+from servobench.plant.eyes.draws import draw_cameras
+from servobench.plant.eyes.eye import Eye
+from servobench.plant.eyes.model import EyeModel
+from servobench.plant.eyes.optics import Optics, in_image, project
+from servobench.plant.eyes.placing import CAMERA, HAND_DISTANCE
+from servobench.plant.eyes.registry import EYES, FIXED, HAND, Sensing
+from servobench.plant.eyes.symbolic import symbolic_feature
+from servobench.plant.lanes import stack
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+
+WORDS = [str(Sensing(eye, mount)) for eye in EYES.values() for mount in (FIXED, HAND)]
+MODELS = WORDS[1:]  # the first one is the arm's own model, which has tests of its own
+SEVERE = Mismatch.parse("severe+gear_ratio=5%")
+
+
+def true_model(word: str, seed: int = 0, mismatch: Mismatch = SEVERE, robot: str = "ur5") -> EyeModel:
+    arm = find_robot(robot)
+    true, sample = sample_mismatch(mismatch, arm, seed)
+    model, _ = Sensing.parse(word).true(arm, true, sample, mismatch, seed)
+    assert isinstance(model, EyeModel)
+    return model
+
+
+def postures(count: int, robot: str = "ur5", seed: int = 1) -> np.ndarray:
+    work = find_robot(robot).workspace
+    return np.random.default_rng(seed).uniform(work.lower, work.upper, (count, len(work.home)))
+
+
+@pytest.mark.parametrize("word", MODELS)
+def test_the_jacobian_is_that_of_casadi_and_of_finite_differences(word):
+    casadi = pytest.importorskip("casadi")
+    model = true_model(word)
+    function = symbolic_feature(model)
+    q = casadi.SX.sym("q", 6)
+    derivative = casadi.Function("J", [q], [casadi.jacobian(function(q), q)])
+    checked = 0
+    for posture in postures(40):
+        y, J, seen = model.look(posture)
+        if not seen.all():
+            continue
+        checked += 1
+        np.testing.assert_allclose(np.asarray(function(posture))[:, 0], y, rtol=1e-12, atol=1e-10)
+        np.testing.assert_allclose(np.asarray(derivative(posture)), J, rtol=1e-10, atol=1e-9 * model.channel.scale)
+        h = 1e-6
+        columns = [(model.feature(posture + h * e) - model.feature(posture - h * e)) / (2 * h) for e in np.eye(6)]
+        np.testing.assert_allclose(np.stack(columns, axis=-1), J, atol=1e-6 * model.channel.scale)
+    assert checked >= 1
+
+
+@pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])
+def test_pixels_are_those_of_opencv(word):
+    model = true_model(word)
+    for posture in postures(5):
+        points = model.points(posture)
+        wanted = []
+        for c, camera in enumerate(model.cameras):
+            f, centre, k = (value[c] for value in (model.optics.focal, model.optics.centre, model.optics.distortion))
+            R = camera[:3, :3].T
+            if ((points - camera[:3, 3]) @ camera[:3, 2] < 0.1).any():
+                break
+            K = np.array([[f, 0.0, centre[0]], [0.0, f, centre[1]], [0.0, 0.0, 1.0]])
+            pixels, _ = cv2.projectPoints(points, cv2.Rodrigues(R)[0], -R @ camera[:3, 3], K, np.array([k, 0.0, 0, 0]))
+            wanted.append(pixels.reshape(-1))
+        else:
+            np.testing.assert_allclose(model.feature(posture), np.concatenate(wanted), rtol=1e-9, atol=1e-8)
+
+
+def test_position_by_a_fixed_camera_is_the_arms_own_model():
+    robot = find_robot("ur5")
+    true, sample = sample_mismatch(SEVERE, robot, 3)
+    assert Sensing().true(robot, true, sample, SEVERE, 3) == (true, None)
+    assert Sensing().nominal(robot) is robot.nominal
+
+
+def test_the_first_fixed_camera_sees_the_ball_of_position():
+    robot = find_robot("ur5")
+    mismatch = Mismatch.parse("camera_rotation=40deg+tool=20mm+links=5%")
+    true, _ = sample_mismatch(mismatch, robot, 5)
+    model = true_model("pixel", 5, mismatch)
+    for posture in postures(10):
+        x, y, z = true.feature(posture)
+        wanted = CAMERA.width / 2 + CAMERA.focal * x / z, CAMERA.height / 2 + CAMERA.focal * y / z
+        np.testing.assert_allclose(model.feature(posture), wanted, rtol=1e-10)
+
+
+@pytest.mark.parametrize("word", MODELS)
+@pytest.mark.parametrize("robot", ["ur5", "ur10e", "panda"])
+def test_the_planned_cameras_see_the_target_in_the_middle_at_home(word, robot):
+    arm = find_robot(robot)
+    model = Sensing.parse(word).nominal(arm)
+    home = arm.workspace.home
+    assert model.visible(home).all()
+    middle = model.points(home).mean(axis=0)
+    for pose in model.cameras:
+        ahead = (middle - pose[:3, 3]) @ pose[:3, :3]
+        assert np.hypot(*ahead[:2]) < 0.15 * ahead[2]
+        np.testing.assert_allclose(ahead[2], model.distance, rtol=0.15)
+    if word.endswith(HAND):
+        np.testing.assert_allclose(model.distance, HAND_DISTANCE * arm.workspace.scale)
+
+
+@pytest.mark.parametrize("word", ["pixel", "stereo:hand", "plate:hand"])
+def test_a_metre_across_the_sight_changes_a_pixel_by_the_scale(word):
+    model = Sensing.parse(word).nominal(find_robot("ur5"))
+    pose, step = model.cameras[0], 1e-6
+    ahead = pose[:3, 3] + model.distance * pose[:3, 2]
+    there, here = (model.seen((ahead + side * pose[:3, 0])[None].repeat(len(model.target), 0)) for side in (step, 0.0))
+    np.testing.assert_allclose((there - here)[0] / step, model.channel.scale, rtol=1e-6)
+
+
+def test_cameras_on_the_hand_do_not_see_how_the_base_stands():
+    """A target that is carried along with the base turned under the arm looks the same."""
+    model = true_model("plate:hand")
+    q = find_robot("ur5").workspace.home
+    turn = 0.4
+    R = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    turned = replace(model, target=model.target @ R.T)
+    moved = q + turn / model.arm.gear_ratio * (np.arange(6) == 0)
+    np.testing.assert_allclose(turned.feature(moved), model.feature(q), rtol=1e-10)
+
+
+@pytest.mark.parametrize("word", MODELS)
+def test_a_lane_has_the_bits_of_a_single_run(word):
+    models = [true_model(word, seed) for seed in range(3)]
+    q = postures(3)
+    together = stack(models).look(q)
+    for lane, (model, posture) in enumerate(zip(models, q, strict=True)):
+        for many, one in zip(together, model.look(posture), strict=True):
+            np.testing.assert_array_equal(many[lane], one)
+
+
+def test_what_is_behind_the_camera_or_out_of_the_image_is_not_seen():
+    optics = Optics(np.array([200.0]), np.array([[160.0, 120.0]]), np.zeros(1), (320.0, 240.0))
+    points = np.array([[[0, 0, 1], [0, 0, -1.0], [0.79, 0, 1], [0.81, 0, 1], [0, 0.61, 1]]], dtype=float)
+    assert in_image(points, optics).tolist() == [[True, False, True, False, False]]
+    assert np.isfinite(project(points, optics)).all()
+
+
+def test_only_the_disc_that_leaves_the_image_is_lost_and_none_is_seen_from_behind():
+    model = Sensing.parse("plate").nominal(find_robot("ur5"))
+    pose = model.cameras[0]
+
+    def seen(points: np.ndarray) -> list[bool]:
+        return model.in_view(points @ pose[:3, :3].T + pose[:3, 3]).tolist()
+
+    square = np.array([[-0.1, -0.1, 0.65], [0.1, -0.1, 0.65], [0.1, 0.1, 0.65], [-0.1, 0.1, 0.65]])
+    assert all(seen(square))
+    half = 0.65 * CAMERA.width / (2 * CAMERA.focal)
+    assert seen(square + [half - 0.05, 0, 0]) == [True, True, False, False, False, False, True, True]
+    assert not any(seen(square[::-1]))
+
+
+def test_a_camera_that_loses_the_ball_makes_its_own_features_invalid_only():
+    model = Sensing.parse("stereo").nominal(find_robot("ur5"))
+    pose = model.cameras[0]
+    high = pose[:3, 3] - 0.3 * pose[:3, 2]  # behind the camera above, before the one in front
+    assert model.in_view(high[None])[:2].tolist() == [False, False]
+
+
+def test_draws_of_the_optics_stay_within_their_magnitudes_and_do_not_depend_on_the_number_of_cameras():
+    mismatch = Mismatch.parse("focal=10%+centre=8px+distortion=5%+mount=4deg+camera_rotation=30deg")
+    two = [draw_cameras(mismatch, 2, seed) for seed in range(200)]
+    focal = np.array([each.focal for each in two])
+    centre = np.array([each.centre for each in two])
+    mount = np.linalg.norm([each.mount for each in two], axis=-1)
+    assert (np.abs(focal - 1) <= 0.1).all()
+    assert np.abs(focal - 1).max() > 0.095
+    assert (np.abs(centre) <= 8).all()
+    assert np.abs(centre).max() > 7.8
+    assert (mount <= np.radians(4)).all()
+    assert mount.max() > np.radians(3.9)
+    np.testing.assert_allclose(np.linalg.norm([each.turn[1] for each in two], axis=-1), np.radians(30))
+    one = draw_cameras(mismatch, 1, 7)
+    assert one.focal[0] == two[7].focal[0]
+    np.testing.assert_array_equal(one.centre[0], two[7].centre[0])
+
+
+def test_the_same_seed_gives_the_same_arm_under_every_sensing():
+    robot = find_robot("ur5")
+    arms = [true_model(word, 4).arm for word in MODELS]
+    true, _ = sample_mismatch(SEVERE, robot, 4)
+    for arm in arms:
+        np.testing.assert_array_equal(arm.translation, true.arm.translation)
+        np.testing.assert_array_equal(arm.joint_offset, true.arm.joint_offset)
+
+
+@pytest.mark.parametrize("word", ["pixel", "pixel:hand", "stereo"])
+def test_a_camera_that_is_moved_turns_about_what_it_looks_at(word):
+    robot = find_robot("ur5")
+    model = Sensing.parse(word).nominal(robot)
+    moved = model.turned(np.array([0.0, 0.0, 0.7]), robot.workspace.centre)
+    pivot = model.pivot(robot.workspace.centre)
+    np.testing.assert_allclose(moved.seen(pivot[None])[:2], model.seen(pivot[None])[:2], rtol=1e-9)
+    np.testing.assert_array_equal(moved.cameras[1:], model.cameras[1:])
+    assert not np.allclose(moved.camera, model.camera)
+
+
+def test_words_of_sensing_are_read_and_written():
+    assert [str(Sensing.parse(word)) for word in WORDS] == WORDS
+    assert str(Sensing.parse(" stereo:fixed ")) == "stereo"
+    with pytest.raises(ValueError, match="unknown sensing 'pixle': did you mean 'pixel'"):
+        Sensing.parse("pixle")
+    with pytest.raises(ValueError, match="unknown sensing 'pixel:head'"):
+        Sensing.parse("pixel:head")
+
+
+def test_an_axis_that_the_cameras_do_not_have_is_refused():
+    robot = find_robot("ur5")
+    for text, word, wanted in (
+        ("focal=10%", "position", "focal needs a camera that sees pixels"),
+        ("mount=5deg", "pixel", "mount needs a camera on the hand"),
+    ):
+        mismatch = Mismatch.parse(text)
+        true, sample = sample_mismatch(mismatch, robot, 0)
+        with pytest.raises(ValueError, match=wanted):
+            Sensing.parse(word).true(robot, true, sample, mismatch, 0)
+
+
+def test_a_plate_needs_six_joints(tmp_path):
+    file = tmp_path / "four.toml"
+    file.write_text(FOUR_JOINTS)
+    with pytest.raises(ValueError, match="sensing plate needs an arm of 6 joints or more, and .* has 4"):
+        Sensing.parse("plate").nominal(find_robot(str(file)))
+
+
+def test_features_without_a_derivative_are_differentiated():
+    exact = EYES["pixel"]
+    numeric = replace(exact, rates=None)
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4, 1, 1, 3)) * 0.2 + [0.0, 0.0, 1.0]
+    motions = rng.normal(size=(4, 1, 1, 3, 6))
+    optics = Optics(np.array([200.0]), np.array([[160.0, 120.0]]), np.array([0.05]), (320.0, 240.0))
+    np.testing.assert_allclose(
+        numeric.change(points, motions, optics), exact.change(points, motions, optics), rtol=1e-6, atol=1e-5
+    )
+
+
+def test_a_set_up_is_a_value_that_can_be_compared():
+    assert Eye("pixel", "", ("u",), "px", project) != EYES["pixel"]
+    assert Sensing.parse("pixel") == Sensing(EYES["pixel"])
