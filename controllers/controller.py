@@ -58,6 +58,7 @@ class RobotKnowledge:
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
             needs the training defines both types. None: it is run when the controller is built.
+        unit: what one of the features here is in the unit of the plant's; see `servobench.controllers.units`.
     """
 
     spec: PlantSpec
@@ -68,6 +69,7 @@ class RobotKnowledge:
     true_delays: Delays | None = None
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
+    unit: float = 1.0
 
     def check(self, observation: Observation, reference: FloatArray | None = None) -> None:
         """Check what a controller is given.

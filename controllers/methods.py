@@ -18,6 +18,7 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.controllers.servo import Servo, ServoController
+from servobench.controllers.units import in_natural_units
 from servobench.plant.settings import did_you_mean
 
 Kind = TypeVar("Kind")
@@ -101,8 +102,9 @@ class Method:
         return MethodConfig(*settings)
 
     def build(self, config: MethodConfig, knowledge: RobotKnowledge) -> ServoController:
-        """Return the controller for these settings and this robot."""
+        """Return the controller for these settings and this robot; its parts see features in natural units."""
         law, estimator = self._parts()
+        knowledge = in_natural_units(knowledge)
         networks = [obtain_networks(config.training, knowledge)] if isinstance(config, TrainedMethodConfig) else []
         servo = Servo(
             estimator.make(config.estimator, knowledge, *(networks if estimator.trained else ())),

@@ -15,6 +15,7 @@ from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targ
 from servobench.controllers.laws.mpc.limits import joint_bounds
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver
 from servobench.controllers.laws.preview import check_preview, sampled
+from servobench.controllers.units import in_natural_units
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import SolverFailed
 from servobench.plant.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
@@ -86,6 +87,7 @@ class NmpcCalibrated(Controller):
         Raises:
             ValueError: the symbolic kinematics is not known or has another size, or the preview is too short.
         """
+        knowledge = in_natural_units(knowledge)
         period = knowledge.spec.period
         blocks = Blocks.of(config.horizon_time, config.moves, period)
         reach = blocks.count * blocks.length + config.delay
@@ -140,9 +142,10 @@ class NmpcCalibrated(Controller):
         present = observation.joint_position
         feature, self._jacobian = self._evaluate(present)
         if observation.feature_valid:
-            self._b = self._b + self._disturbance_share * (observation.feature - feature - self._b)
+            seen = observation.feature / self._knowledge.unit
+            self._b = self._b + self._disturbance_share * (seen - feature - self._b)
         start = present + self._to_come @ self._sent
-        rows = sampled(reference, self._places)
+        rows = sampled(reference / self._knowledge.unit, self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b
         wanted = rows[0] - error + decay_targets(error, rows[1:] - rows[0], self._shares) - self._b
         plan, success = self._improve(start, wanted)
@@ -161,7 +164,7 @@ class NmpcCalibrated(Controller):
 
     def estimated_jacobian(self) -> FloatArray | None:
         """Return the true Jacobian (m, n) at the last observation, or None before there was one."""
-        return None if self._jacobian is None else self._jacobian.copy()
+        return None if self._jacobian is None else self._knowledge.unit * self._jacobian
 
     def _shared(self) -> Iterable[object]:
         return self._knowledge, self._model, self._along_plan, self._shape, self._program

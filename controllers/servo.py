@@ -50,7 +50,7 @@ class ServoState(NamedTuple):
 
     @property
     def jacobian(self) -> FloatArray:
-        """Ĵ of the last step, (..., m, n), m/rad; NaN before."""
+        """Ĵ of the last step, (..., m, n), in the units of the parts; NaN before."""
         return self.estimation.jacobian
 
 
@@ -78,7 +78,8 @@ class Servo:
             estimator: estimates the Jacobian.
             law: commands by the estimate.
             initial: provides the first Jacobian.
-            knowledge: of the robot; it has the true delays where they are to be used instead of those of the aids.
+            knowledge: of the robot, in the units of the parts (`servobench.controllers.units`); it has the true delays
+                where they are to be used instead of those of the aids.
             aids: the stages around estimator and law; None for none.
 
         Raises:
@@ -95,9 +96,11 @@ class Servo:
         self.finish = Finish(aids, knowledge, type(law).__name__, law.owns)
         self._feeds_forward, self._turns = aids.feedforward, law.in_model_frame and aids.model == "map"
         self._rows = 1 + knowledge.preview if "preview" in law.owns else 1 + int(aids.feedforward)
+        self._unit = knowledge.unit
 
     def start(self, observation: Observation) -> ServoState:
-        """Return the state at the start of a run that begins with `observation`."""
+        """Return the state at the start of a run that begins with `observation`, in the unit of the plant."""
+        observation = self._natural(observation)
         initial = self.initial.start(observation)
         lead, (m, n) = observation.feature.shape[:-1], (self.knowledge.spec.m, self.knowledge.spec.n)
         known = self.initial.immediate
@@ -112,11 +115,22 @@ class Servo:
             ControllerDiverged: the estimate, or what the law asked for, is not finite in at least one lane.
             RunFault: a part cannot go on in at least one lane.
         """
+        if self._unit != 1.0:
+            observation, reference = self._natural(observation), reference / self._unit
         if self.initial.immediate:
             return self._act((state, observation.joint_position), observation, reference)
         both = state, np.zeros_like(observation.joint_position)
         both = branch(np.logical_not(state.ready), self._probe, both, observation)
         return branch(both[0].ready, self._act, both, observation, reference)
+
+    def jacobian(self, state: ServoState) -> FloatArray:
+        """Return Ĵ of the last step, (..., m, n), in the unit of the plant per rad; NaN before."""
+        return state.jacobian if self._unit == 1.0 else self._unit * state.jacobian
+
+    def _natural(self, observation: Observation) -> Observation:
+        if self._unit == 1.0:
+            return observation
+        return observation.seen_as(observation.joint_position, observation.feature / self._unit)
 
     def _probe(self, both: tuple[ServoState, FloatArray], observation: Observation) -> tuple[ServoState, FloatArray]:
         initial, velocity, done = self.initial.step(both[0].initial, observation)
@@ -244,7 +258,7 @@ class ServoController(Controller):
         """Return the Jacobian (m, n) that the last step used, or None before there is one."""
         if self.state is None or np.isnan(self.state.jacobian).any():
             return None
-        return self.state.jacobian.copy()
+        return self.servo.jacobian(self.state).copy()
 
     def save(self) -> ServoState | None:
         """Return the state, a value that never changes."""

@@ -13,6 +13,7 @@ from servobench.controllers.networks.rbf import information_vector
 from servobench.plant.checks import FloatArray
 from servobench.plant.signals import PlantSpec
 
+WEAKEST = 0.1  # singular value of J over its largest below which a direction is left out of the inverse
 CLUSTERING_POOL = 20  # samples a centre when centres come from k-means
 
 
@@ -62,7 +63,7 @@ class ControllerSamples:
         xi: ξ, (S, p), m and rad.
         error: e(k), (S, m), m.
         position: q(k−1), (S, n), rad.
-        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m.
+        gain: K_p s J⁺ at q(k−1), (S, n, m), rad/m; without the directions in which the joints hardly move the feature.
         posture_step: K_n s (I − J⁺J)(q_c − q), (S, n), rad, towards the region's middle without moving y.
     """
 
@@ -108,7 +109,7 @@ def controller_samples(
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
     positions = q[:, None, :] - back[:, : plan.position_history]
-    pinv = np.asarray(np.linalg.pinv(J), dtype=np.float64)
+    pinv = np.asarray(np.linalg.pinv(J, rcond=WEAKEST), dtype=np.float64)
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant

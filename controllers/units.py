@@ -1,0 +1,64 @@
+"""Natural units: laws and estimators see features divided by their natural size, so that one set of values serves all.
+
+    y' = y / s,   J' = J / s          s the scale of the feature's channel: 1 m of a place, pixels per metre of a pixel
+
+With s = 1 nothing is changed. Settings in metres are therefore metres of a ball that moves across the camera's sight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from servobench.controllers.controller import JacobianFunction, RobotKnowledge, SymbolicFeature
+from servobench.plant.checks import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class NaturalJacobian:
+    """A Jacobian in natural units; its lanes are those of the function, where that has some.
+
+    Attributes:
+        function: (..., n) rad -> (..., m, n), in the unit of the feature.
+        scale: s, in that unit.
+    """
+
+    function: JacobianFunction
+    scale: float
+
+    def __call__(self, joint_position: FloatArray) -> FloatArray:
+        """Return J / s, (..., m, n)."""
+        return np.asarray(self.function(joint_position) / self.scale)
+
+
+def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
+    """Return what is known of a robot with its features in natural units; `unit` says what one of them is."""
+    feature = knowledge.spec.feature
+    scale = feature.scale
+    if scale == 1.0:
+        return knowledge
+    natural = replace(feature, scale=1.0, lower=feature.lower / scale, upper=feature.upper / scale)
+    return replace(
+        knowledge,
+        spec=replace(knowledge.spec, feature=natural),
+        nominal_jacobian=_divided(knowledge.nominal_jacobian, scale),
+        true_jacobian=_divided(knowledge.true_jacobian, scale),
+        true_symbolic=_divided_expression(knowledge.true_symbolic, scale),
+        unit=scale * knowledge.unit,
+    )
+
+
+def _divided(function: JacobianFunction | None, scale: float) -> JacobianFunction | None:
+    return None if function is None else NaturalJacobian(function, scale)
+
+
+def _divided_expression(function: SymbolicFeature | None, scale: float) -> SymbolicFeature | None:
+    if function is None:
+        return None
+
+    def divided(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
+        return function(joint_position) / scale
+
+    return divided
