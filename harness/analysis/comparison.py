@@ -32,9 +32,10 @@ from servobench.harness.analysis.statistics import (
 from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
 from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
-CONDITION: Final = ("plant", "task", "mismatch", "noise_factor", "latency_s", "period_s")
+CONDITION: Final = ("plant", "sensing", "task", "mismatch", "noise_factor", "latency_s", "period_s")
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
 
 
@@ -63,7 +64,7 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     found = []
     for key, group in runs.groupby(known, sort=False, dropna=False):
         values: dict[str, Any] = dict(zip(known, key, strict=True))
-        words = f"{values['task']} on {values['plant']}, {values['mismatch']}"
+        words = f"{values['task']} on {place_name(values['plant'], values.get('sensing'))}, {values['mismatch']}"
         if values.get("noise_factor", 1.0) != 1.0:
             words += f", noise × {values['noise_factor']:g}"
         for name in ("latency", "period"):
@@ -72,6 +73,18 @@ def split_conditions(runs: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
                 words += f", {name} {1e3 * time:g} ms"
         found.append((words, group))
     return found
+
+
+def place_name(plant: Any, sensing: Any) -> str:  # noqa: ANN401 - cells of the table of runs
+    """Return a plant's name for a title, with the sensing set-up where it is not the usual one."""
+    return f"{plant}" if sensing in (None, DEFAULT_SENSING) or pd.isna(sensing) else f"{plant} {sensing}"
+
+
+def with_places(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return runs whose plants are named as in titles, so that runs in other units are at other places."""
+    if "sensing" not in runs or (runs["sensing"] == DEFAULT_SENSING).all():
+        return runs
+    return runs.assign(plant=list(map(place_name, runs["plant"], runs["sensing"])))
 
 
 def split_tasks(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:

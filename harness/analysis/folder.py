@@ -11,7 +11,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.run.ending import COMPLETED
 
-DESCRIBED: Final = ("plant", "controller", "task", "mismatch", "noise_factor", "latency_s", "period_s")
+DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch", "noise_factor", "latency_s", "period_s")
 MAX_LISTED: Final = 15  # values of a column
 
 

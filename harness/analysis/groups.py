@@ -32,6 +32,7 @@ WHICH: Final = ""  # the group of columns that say which runs a row is about
 CONDITIONS: Final = {
     "plant": ("plant", 1.0),
     "robot": ("robot", 1.0),
+    "sensing": ("sensing", 1.0),
     "mismatch": ("mismatch", 1.0),
     "noise_factor": ("noise factor", 1.0),
     "latency_s": ("latency [ms]", 1e3),
@@ -39,7 +40,7 @@ CONDITIONS: Final = {
 }  # column -> heading and factor
 MOVE_GROUPS: Final = {
     "Time": ("settling_time_s", "overshoot"),
-    "Error": ("steady_state_error",),
+    "Error": ("steady_state_error", "pose_error_mm", "pose_error_deg"),
     "Motion": ("path_length_ratio", "command_switches"),
 }
 CURVE_GROUPS: Final = {

@@ -21,7 +21,7 @@ def settling_band(runs: pd.DataFrame, factor: float = 1.0) -> str:
         return "the settling band" if factor == 1.0 else f"{factor:g} settling bands"
     (band,), (unit,) = known["settling_band"], known["feature_unit"]
     name, handy = handy_unit(str(unit))
-    return f"{factor * handy * float(band):g} {name}"
+    return f"{factor * handy * float(band):.3g} {name}"
 
 
 class Measure(NamedTuple):
@@ -47,6 +47,8 @@ MEASURES: Final = {
     "rms_error_second_lap": Measure("RMS of the second lap", 2),
     "rms_error_evaluated": Measure("RMS of the evaluated part", 2),
     "max_error": Measure("largest error", 1),
+    "pose_error_mm": Measure("pose error, last second", 1, "mm"),
+    "pose_error_deg": Measure("angle error, last second", 2, "deg"),
     "path_length_ratio": Measure("path ratio", 3, "1"),
     "jacobian_error_mean": Measure("mean Jacobian error", 1, "%", 100.0),
     "max_joint_position_rad": Measure("largest joint position", 2, "rad"),

@@ -7,7 +7,7 @@ from typing import Final
 
 import pandas as pd
 
-from servobench.harness.analysis.comparison import achievement, column_of, outcomes, split_tasks
+from servobench.harness.analysis.comparison import achievement, column_of, outcomes, split_tasks, with_places
 from servobench.harness.analysis.measures import MEASURES, settling_band
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.analysis.tables import CONDITIONS, Tables
@@ -16,6 +16,7 @@ from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, 
 BAND: Final = ("settling_band", "feature_unit")
 SWEEP_COLUMNS: Final = (
     *CONDITIONS,
+    "sensing",
     "task",
     "controller",
     "status",
@@ -52,7 +53,7 @@ def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
 
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
-    for (plant, mismatch, task), place in runs.groupby(["plant", "mismatch", "task"], sort=False):
+    for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
         rows = []
         for name, own in place.groupby("controller", sort=False):
             unit, factor = MEASURES["rms_error_evaluated"].scale(place)
@@ -121,7 +122,7 @@ def _percent(value: float) -> str:
 
 def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
     """Return how many runs of each condition had which outcome."""
-    runs = runs.assign(
+    runs = with_places(runs).assign(
         outcome=outcomes(runs),
         noise=runs["noise_factor"].map("{:g}".format),
         latency=_milliseconds(runs["latency_s"]),

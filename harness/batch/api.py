@@ -27,6 +27,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import check_settings
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.plant import Plant, PlantEntry
 from servobench.plant.world import World
 
@@ -53,6 +54,7 @@ def run(
     task: str = "exp1",
     mismatch: str = "moderate",
     robot: str = DEFAULT_ROBOT,
+    sensing: str = DEFAULT_SENSING,
     seed: int = 0,
     settings: Sections | None = None,
 ) -> RunResult:
@@ -69,6 +71,7 @@ def run(
         task: name of the task.
         mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
         robot: name such as "ur10e" or "panda", or the path of a file: a factory calibration, a DH table or a URDF.
+        sensing: set-up such as "pixel", "stereo:hand" or "./polar.py", where the plant has it.
         seed: of everything random in the run.
         settings: section -> key -> value, such as {"kinematic": {"lag": 0.1}}.
 
@@ -79,7 +82,8 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        request = RunRequest(_plant_name(plant), _name(controller), task, read_mismatch(mismatch), seed, robot=robot)
+        place = _plant_name(plant), _name(controller), task, read_mismatch(mismatch), seed
+        request = RunRequest(*place, robot=robot, sensing=sensing)
         given = Settings(settings or {})
         check_settings(given, [request.plant, request.controller, request.task])
         return run_experiment(request, given)
@@ -93,6 +97,7 @@ def compare(
     mismatches: Sequence[str] = ("moderate",),
     seeds: int | Iterable[int] = 1,
     robot: str = DEFAULT_ROBOT,
+    sensings: Sequence[str] = (DEFAULT_SENSING,),
     settings: Sections | None = None,
     out: Path | str | None = None,
     workers: int = 1,
@@ -113,6 +118,7 @@ def compare(
         mismatches: such as "moderate".
         seeds: a number of seeds from 0 on, or the seeds.
         robot: see `run`.
+        sensings: see `run`.
         settings: section -> key -> value.
         out: new folder for tables, steps and manifest; None keeps nothing but the table that is returned.
         workers: number of processes.
@@ -129,13 +135,13 @@ def compare(
     """
     chosen = range(seeds) if isinstance(seeds, int) else tuple(seeds)
     for what, values in (("controllers", controllers), ("plants", plants), ("tasks", tasks), ("mismatches", mismatches),
-                         ("seeds", chosen)):  # fmt: skip
+                         ("sensings", sensings), ("seeds", chosen)):  # fmt: skip
         if not len(values):
             raise ConfigurationError(f"{what} must name at least one, got none")
     with offering():
         names = tuple(_name(each) for each in controllers)
         worlds = tuple(_plant_name(each) for each in plants)
-        batch = Batch(worlds, names, tuple(tasks), tuple(mismatches), chosen, robot)
+        batch = Batch(worlds, names, tuple(tasks), tuple(mismatches), chosen, robot, tuple(sensings))
         if not _can_travel(offered([*worlds, *names])):
             workers, run_timeout, run_memory, isolate = 1, None, None, False
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)

@@ -236,7 +236,8 @@ class _Jobs:
     def _resolve(self, request: RunRequest) -> tuple[ResolvedRun, Hashable | None]:
         """Return a run with its settings, and its kind if it may advance with others."""
         names = request.plant, request.controller, request.task
-        known = *names, request.mismatch, request.noise_factor, request.latency, request.period, request.robot
+        sensor = request.noise_factor, request.latency, request.sensing
+        known = (*names, request.mismatch, *sensor, request.period, request.robot)
         if known not in self._known:
             first = select(request, self._sections)
             settings = first.run, first.plant, first.controller, first.task

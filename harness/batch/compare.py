@@ -17,6 +17,7 @@ from servobench.harness.batch.grid import Grid
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.robot.mismatch import Mismatch
 
 MAX_SEEDS: Final = 1_000_000  # of a batch
@@ -36,19 +37,22 @@ class Batch:
     seeds: Sequence[int]
     robot: str = DEFAULT_ROBOT
     """a name or the path of a file; all runs of a batch have one"""
+    sensings: tuple[str, ...] = (DEFAULT_SENSING,)
 
     def requests(self) -> Grid[RunRequest]:
         """Return the runs, seeds varying fastest."""
         return Grid(partial(_request, self.robot), *self.axes())
 
     def axes(self) -> tuple[Sequence[Any], ...]:
-        """Return plants, tasks, mismatches, controllers and seeds."""
+        """Return sensing set-ups, plants, tasks, mismatches, controllers and seeds."""
         mismatches = [read_mismatch(text) for text in self.mismatches]
-        return self.plants, self.tasks, mismatches, self.controllers, self.seeds
+        return self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
 
 
-def _request(robot: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int) -> RunRequest:
-    return RunRequest(plant, controller, task, mismatch, seed, robot=robot)
+def _request(
+    robot: str, sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
+) -> RunRequest:
+    return RunRequest(plant, controller, task, mismatch, seed, robot=robot, sensing=sensing)
 
 
 def parse_seeds(text: str) -> Sequence[int]:

@@ -46,7 +46,8 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
         digest.update(f"{run_id}\n".encode())
         names.append(hash(run_id))
         seeds.add(request.seed)
-        condition = (request.mismatch, request.noise_factor, request.latency, request.period, request.robot)
+        times = request.latency, request.period
+        condition = (request.mismatch, request.noise_factor, *times, request.robot, request.sensing)
         last, kind = kind, (request.plant, request.controller, request.task, condition)
         if kind == last:
             continue

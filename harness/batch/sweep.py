@@ -89,6 +89,7 @@ def _cell(
     period: float | None,
     *names: Any,  # noqa: ANN401 - as `Batch.axes`
 ) -> Cell:
-    plant, task, mismatch, controller, seed = names
-    request = RunRequest(plant, controller, task, place.vary(mismatch), seed, noise, latency, period, robot)
+    sensing, plant, task, mismatch, controller, seed = names
+    varied = place.vary(mismatch)
+    request = RunRequest(plant, controller, task, varied, seed, noise, latency, period, robot, sensing)
     return Cell(request, place.columns)

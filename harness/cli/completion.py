@@ -70,6 +70,13 @@ def tasks(incomplete: str) -> list[str]:
     return _matching(incomplete, TASKS)
 
 
+def sensings(incomplete: str) -> list[str]:
+    """Return the sensing set-ups whose names begin so."""
+    from servobench.harness.config.sensing import sensing_names
+
+    return _matching(incomplete, sensing_names())
+
+
 def estimators(incomplete: str) -> list[str]:
     """Return the estimators whose names begin so."""
     from servobench.controllers.parts import ESTIMATORS

@@ -1,4 +1,4 @@
-"""The commands that show what there is, `plants | controllers | tasks`."""
+"""The commands that show what there is, `plants | controllers | tasks | sensing`."""
 
 from __future__ import annotations
 
@@ -75,6 +75,15 @@ def tasks(
         raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
         _show_names(list(TASKS), find_task, [], as_json=as_json)
+
+
+def sensing(as_json: JsonOption = False) -> None:
+    """List the sensing set-ups: what cameras measure of the arm."""
+    from servobench.plant.eyes.registry import EYES
+
+    _show_names(list(EYES), EYES.__getitem__, [], as_json=as_json)
+    if not as_json:
+        console.print("\nEach with fixed cameras or with cameras on the hand, as pixel:hand; or a file of your own.")
 
 
 def _show_names(

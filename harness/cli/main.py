@@ -34,7 +34,7 @@ ROBOTLESS = {  # why a command has no --robot
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
     "Your own controller": (new, check),
-    "What there is": (lists.plants, lists.controllers, lists.tasks, init),
+    "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, init),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
     "Tools": (runs.train, runs.collect, verify),
 }

@@ -71,6 +71,19 @@ RobotOption = Annotated[
         autocompletion=completion.robots,
     ),
 ]
+SensingOption = Annotated[
+    str,
+    typer.Option(
+        help="position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
+        autocompletion=completion.sensings,
+    ),
+]
+SensingsOption = Annotated[
+    str,
+    typer.Option(
+        help="Comma-separated sensing set-ups, or 'all'.", autocompletion=completion.listed(completion.sensings)
+    ),
+]
 SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
 DebugOption = Annotated[bool, typer.Option("--debug", help="Stop at the first crash, in this process, with its trace.")]
@@ -254,6 +267,13 @@ def split_mismatches(text: str) -> tuple[str, ...]:
     from servobench.plant.robot.mismatch import PROFILES
 
     return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
+
+
+def split_sensings(text: str) -> tuple[str, ...]:
+    """Return the sensing set-ups that a user named; each is looked up, so that a mistyped one is refused at once."""
+    from servobench.harness.config.sensing import find_sensing, sensing_names
+
+    return split_names("sensing", text, sensing_names(), find_sensing)
 
 
 def default_plant() -> str:

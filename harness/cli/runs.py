@@ -57,6 +57,7 @@ def run(
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = "moderate",
     robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
     seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
     overrides: options.Overrides = options.OVERRIDES,
     view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
@@ -85,7 +86,15 @@ def run(
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
     options.tell_unused(ControllerEntry, [name])
     options.tell_unused(PlantEntry, [plant])
-    batch = Batch((plant,), (name,), (task,), (mismatch,), parse_seeds(f"{seed},"), options.known_robot(robot))
+    batch = Batch(
+        (plant,),
+        (name,),
+        (task,),
+        (mismatch,),
+        parse_seeds(f"{seed},"),
+        options.known_robot(robot),
+        options.split_sensings(sensing),
+    )
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     folder = _carry_out(
         campaign, out, Execution(workers=1, bounds=limited.bounds(), debug=debug), with_report=with_report
@@ -99,6 +108,7 @@ def compare(
     tasks: options.TasksOption = "exp1,exp2,exp3,exp4,circle",
     mismatch: options.MismatchesOption = "moderate",
     robot: options.RobotOption = "ur5",
+    sensing: options.SensingsOption = "position",
     seeds: options.SeedsOption = "1",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
@@ -118,6 +128,7 @@ def compare(
         options.split_mismatches(mismatch),
         parse_seeds(seeds),
         options.known_robot(robot),
+        options.split_sensings(sensing),
     )
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")

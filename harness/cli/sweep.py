@@ -19,6 +19,7 @@ def sweep(
     tasks: options.TasksOption = "random",
     mismatch: options.MismatchesOption = "moderate",
     robot: options.RobotOption = "ur5",
+    sensing: options.SensingsOption = "position",
     vary: Annotated[
         list[str] | None,
         typer.Option(help="Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg."),
@@ -50,6 +51,7 @@ def sweep(
             options.split_mismatches(mismatch),
             parse_seeds(seeds),
             options.known_robot(robot),
+            options.split_sensings(sensing),
         ),
         tuple(parse_variation(text) for text in vary or []),
         tuple(_numbers("noise", noise)),

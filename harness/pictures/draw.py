@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
+from servobench.harness.analysis.comparison import with_places
 from servobench.harness.batch import results
 from servobench.harness.pictures.batch import ACCURACY, EFFORT, SMOOTHNESS, draw_measures, draw_step_times
 from servobench.harness.pictures.ensembles import Ensembles, load_ensembles, shown_until
@@ -153,7 +154,7 @@ class _Place(NamedTuple):
 
 def _plans(folder: Path, *, moves: int, tasks: int, blocks: int) -> Iterator[tuple[_Place, _Plan]]:
     """Yield the figures of a folder, which at most so many moves, tasks and blocks of paths share."""
-    runs = results.load_runs(folder)
+    runs = with_places(results.load_runs(folder))
     styles = method_styles(runs["controller"].tolist())
     for group in load_groups(folder):
         chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]

@@ -28,6 +28,7 @@ CAMERA_FRAME: Final = {
     "y_m": "y, downwards [m]",
     "z_m": "z, depth [m]",
 }  # of a feature in the frame of the camera
+PIXELS: Final = "_px"  # at the end of a feature in an image, where the second one of a pair points down
 
 
 class View(NamedTuple):
@@ -72,7 +73,7 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
             block.extent.apply(axes, i, ratios[row * len(views) + i])
             title = f"{block.title}: {view.title}" if len(views) > 1 else block.title
             axes.set_title(textwrap.fill(title, round((layout.width / columns - BESIDE) / LETTER)))
-            if i + 1 < len(views):  # the view below has the same abscissa
+            if i + 1 < len(views) and views[i + 1].across == view.across:  # the view below has the same abscissa
                 axes.set_xlabel("")
                 axes.tick_params(labelbottom=False)
     for axes in grid.reshape(rows, len(views), columns).transpose(0, 2, 1).reshape(-1, len(views))[len(blocks) :].flat:
@@ -98,6 +99,8 @@ def _views(tracks: Tracks) -> list[View]:
     if features[:3] == list(CAMERA_FRAME):
         return [View("as the camera sees it", 0, 1), View("from above", 0, 2)]
     names = [name.rpartition("_")[0] for name in features]
+    if features[0].endswith(PIXELS) and len(names) % 2 == 0:
+        return [View(f"{names[i + 1]} over {names[i]}", i, i + 1) for i in range(0, min(4, len(names)), 2)]
     return [View(f"{names[i]} over {names[0]}", 0, i) for i in range(1, min(3, len(names)))]
 
 
@@ -110,10 +113,11 @@ class _Extent:
         names = longest(tracks).features
         self._views = views
         self._to_scale = [names[v.across].rpartition("_")[2] == names[v.upright].rpartition("_")[2] for v in views]
+        self._in_image = names[0].endswith(PIXELS)
         self._middle = (points.max(axis=0) + points.min(axis=0)) / 2
         self._size = np.maximum(ROOM * np.ptp(points, axis=0), 1e-6)
         scaled = [self._size[v.upright] / TALLEST for v, scale in zip(views, self._to_scale, strict=True) if scale]
-        self._across = max([float(self._size[views[0].across]), *scaled])
+        self._across = max([*(float(self._size[view.across]) for view in views), *scaled])
 
     def ratio(self, i: int) -> float:
         """Return height over width that a view needs."""
@@ -131,7 +135,7 @@ class _Extent:
         axes.set_ylim(middle - half, middle + half)
         if self._to_scale[i]:
             axes.set_aspect("equal", adjustable="box")
-        if axes.get_ylabel() == CAMERA_FRAME["y_m"]:
+        if axes.get_ylabel() == CAMERA_FRAME["y_m"] or self._in_image:
             axes.invert_yaxis()
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
         axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
@@ -177,6 +181,6 @@ def _draw_direction(axes: Axes, reference: FloatArray) -> None:
 
 
 def _points(track: Track, kind: str) -> FloatArray:
-    """Return those rows of the first three features that are known throughout, (k, 3 or fewer)."""
-    points = track.vectors(kind)[:, :3]
+    """Return those rows of the features that are known throughout, (k, m)."""
+    points = track.vectors(kind)
     return np.asarray(points[np.isfinite(points).all(axis=1)])

@@ -23,6 +23,7 @@ from servobench.harness.pictures.tracks import Track
 from servobench.plant.bullet.bullet_plant import BulletConfig
 from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -88,6 +89,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
     run_id = row["run_id"]
     if find_plant(row["plant"]).own_robot:
         raise ConfigurationError(f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own")
+    sensing = row.get("sensing", DEFAULT_SENSING)
+    if sensing != DEFAULT_SENSING:
+        raise ConfigurationError(f"run {run_id} cannot be shown: films have the sensing position, not {sensing}")
     if steps is None or steps.empty:
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
     track = Track(row, steps.reset_index(drop=True))
@@ -227,7 +231,8 @@ def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEy
             f"run {row['run_id']} was made on another robot than mismatch {row['mismatch']} and seed {row['seed']} "
             "give now; record it with the version of servobench that made it"
         )
-    return model, sample.moved(model, robot)
+    moved = sample.moved(model, robot)
+    return model, moved if isinstance(moved, HandEyeModel) else None
 
 
 def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feature: FloatArray) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from servobench.harness.analysis.comparison import with_places
 from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
@@ -141,7 +142,7 @@ def load_groups(folder: Path) -> Iterator[Group]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    runs = results.load_runs(folder)
+    runs = with_places(results.load_runs(folder))
     for (plant, mismatch), group in runs.groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         try:

@@ -16,11 +16,12 @@ from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.ending import COMPLETED, Ending, ends_batch, is_defect
-from servobench.harness.run.experiment import Drawn, build, draw
+from servobench.harness.run.experiment import Drawn, Experiment, build, draw
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import run_loop
-from servobench.harness.run.metrics import SETTLING_BAND, judge_run
+from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.outcome import find_outcome
+from servobench.harness.run.pose_error import final_pose_error, pose_errors
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.side_by_side import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
@@ -98,8 +99,17 @@ def carry_out(
         image = plant.picture() if picture and len(logged) else None
         plant.close()
     row = _row(experiment.drawn, resolved.request, ending, _numbers(_judge(logged, scenario)), logged)
-    table = logged.table(resolved.request.run_id, full_jacobian=experiment.run.full_jacobian) if steps else None
+    table = _table(experiment, resolved.request, logged) if steps else None
     return RunResult(row, table, image, ending.trace)
+
+
+def _table(experiment: Experiment, request: RunRequest, logged: Steps) -> pd.DataFrame:
+    """Return the table of steps, with the true pose error where the sensing set-up is judged by it."""
+    table = logged.table(request.run_id, full_jacobian=experiment.run.full_jacobian)
+    errors = pose_errors(experiment.drawn.true, experiment.scenario.reference, logged)
+    if errors is not None:
+        table["pose_error_mm"], table["pose_error_deg"] = errors
+    return table
 
 
 def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None) -> list[RunResult]:
@@ -172,14 +182,21 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
         "robot": OWN_ROBOT if drawn.true is None else request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
-        "settling_band": SETTLING_BAND * spec.feature.scale,
+        "settling_band": spec.feature.band,
         "status": status,
         "outcome": outcome,
         **metrics,
+        **_pose_metrics(drawn, logged),
         "periods": len(logged),
         "reason": ending.reason,
-        "mismatch_values": json.dumps(drawn.sample.as_record() if drawn.sample else {}),
+        "mismatch_values": json.dumps(drawn.as_record()),
     }
+
+
+def _pose_metrics(drawn: Drawn, logged: Steps) -> dict[str, float]:
+    """Return the true pose error at the end of a run, where the sensing set-up is judged by it."""
+    errors = pose_errors(drawn.true, drawn.scenario.reference, logged) if len(logged) else None
+    return {} if errors is None else final_pose_error(*errors, logged.spec.period)
 
 
 def _outcome(drawn: Drawn, metrics: dict[str, float], logged: Steps) -> str:

@@ -11,9 +11,11 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
+from servobench.controllers.units import in_natural_units
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.ending import ends_batch
 from servobench.harness.run.loop import CameraMove, LoopSettings
@@ -23,12 +25,15 @@ from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.draws import CameraDraws
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
-from servobench.plant.robot.hand_eye import FEATURE, HandEyeModel, TrueJacobian, hand_eye_spec
+from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import PlantSpec
 
@@ -38,14 +43,20 @@ class Drawn:
     """What is drawn for one run."""
 
     scenario: Scenario
-    true: HandEyeModel | None = None  # the true robot; None for a plant that brings its own
+    true: SensedArm | None = None  # the true robot and its cameras; None for a plant that brings its own
     sample: MismatchSample | None = None  # how it differs from the nominal one
-    moved: HandEyeModel | None = None  # the true robot after its camera was moved; None if it is not
+    moved: SensedArm | None = None  # the true robot after its camera was moved; None if it is not
+    cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
 
     @property
-    def final(self) -> HandEyeModel | None:
+    def final(self) -> SensedArm | None:
         """The true robot with the camera as it is at the end of the run."""
         return self.moved or self.true
+
+    def as_record(self) -> dict[str, object]:
+        """Return all values drawn for robot and cameras, for JSON."""
+        parts = (self.sample, self.cameras)
+        return {name: value for part in parts if part is not None for name, value in part.as_record().items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +77,7 @@ class Experiment:
     def loop(self) -> LoopSettings:
         """The settings of the loop."""
         moved = self.drawn.moved
-        return loop_settings(self.run, self.scenario.duration, None if moved is None else moved.X_BC)
+        return loop_settings(self.run, self.scenario.duration, None if moved is None else moved.camera)
 
     @property
     def periods(self) -> int:
@@ -113,18 +124,21 @@ def draw(resolved: ResolvedRun) -> Drawn:
         ConfigurationError: a mismatch or a task that cannot be used.
     """
     request, robot = resolved.request, find_robot(resolved.request.robot)
+    sensing, seed = find_sensing(request.sensing), named_seed(request.seed, "mismatch")
     try:
-        true, sample = sample_mismatch(request.mismatch, robot, named_seed(request.seed, "mismatch"))
+        arm, sample = sample_mismatch(request.mismatch, robot, seed)
+        true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
     moved = sample.moved(true, robot)
-    setting = TaskSetting(true, true.arm.n, FEATURE, named_seed(request.seed, "task"), moved, robot)
-    return Drawn(_build_scenario(resolved, setting), true, sample, moved)
+    task_seed = named_seed(request.seed, "task")
+    setting = TaskSetting(true, true.arm.n, true.channel, task_seed, moved, robot, sensing.nominal(robot))
+    return Drawn(_build_scenario(resolved, setting), true, sample, moved, cameras)
 
 
 def assemble(
     resolved: ResolvedRun,
-    true: HandEyeModel | None,
+    true: SensedArm | None,
     start: FloatArray | None,
     keep: Path | None = None,
     progress: Progress | None = None,
@@ -142,11 +156,14 @@ def assemble(
         ConfigurationError: a setting that cannot be used.
     """
     request, run = resolved.request, resolved.run
-    robot = find_robot(request.robot)
-    plant = _build_plant(resolved, find_plant(request.plant), PlantSetup(true, start, run.period, robot))
+    robot, entry = find_robot(request.robot), find_plant(request.plant)
+    if request.sensing != DEFAULT_SENSING and not entry.any_sensing:
+        raise ConfigurationError(f"plant {entry.name} has the sensing position only, got --sensing {request.sensing}")
+    nominal = find_sensing(request.sensing).nominal(robot)
+    plant = _build_plant(resolved, entry, PlantSetup(true, start, run.period, robot))
     try:
-        source = network_source(robot.nominal.jacobian, plant.spec, keep, progress)
-        knowledge = replace(_nominal_knowledge(robot, plant.spec, run), train=source)
+        knowledge = _nominal_knowledge(robot, nominal, plant.spec, run)
+        knowledge = replace(knowledge, train=_network_source(_in_view(knowledge, nominal, robot), keep, progress))
         controller = _build_controller(
             request.controller, resolved.controller, knowledge, lambda: plant.with_delays(_equations(true))
         )
@@ -189,8 +206,8 @@ def train_networks(
     robot = find_robot(robot_name)
     nominal, limits = robot.nominal, robot.limits
     spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
-    knowledge = _nominal_knowledge(robot, spec, run)
-    source = network_source(nominal.jacobian, knowledge.spec, progress=progress)
+    knowledge = _nominal_knowledge(robot, nominal, spec, run)
+    source = _network_source(knowledge, None, progress)
 
     def obtain(config: TrainingConfig) -> TrainedNetworks:
         trained.append(source(config))
@@ -203,14 +220,31 @@ def train_networks(
     return trained[-1]
 
 
-def _nominal_knowledge(robot: Robot, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
+def _nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     """Return what every controller may know."""
     return RobotKnowledge(
         spec=spec,
         preview=run.preview_rows,
-        nominal_jacobian=robot.nominal.jacobian,
+        nominal_jacobian=nominal.jacobian,
         region=(robot.workspace.lower, robot.workspace.upper),
     )
+
+
+def _in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:
+    """Return what networks are trained on: a Jacobian that says nothing about what the cameras do not see."""
+    if nominal is robot.nominal:
+        return knowledge
+    return replace(knowledge, nominal_jacobian=lambda q: nominal.jacobian_in_view(q, robot.workspace.home))
+
+
+def _network_source(
+    knowledge: RobotKnowledge, keep: Path | None, progress: Progress | None
+) -> Callable[[TrainingConfig], TrainedNetworks]:
+    """Return where a controller that knows a nominal model gets networks that are trained on it, in natural units."""
+    natural = in_natural_units(knowledge)
+    if natural.nominal_jacobian is None:
+        raise ValueError("nominal_jacobian must be known for networks that are trained on it, got None")
+    return network_source(natural.nominal_jacobian, natural.spec, keep, progress)
 
 
 def _build_with_own_robot(
@@ -222,14 +256,19 @@ def _build_with_own_robot(
         raise ConfigurationError(
             f"plant {request.plant} brings a robot of its own, to which mismatches do not apply; use --mismatch none"
         )
+    if request.sensing != DEFAULT_SENSING:
+        raise ConfigurationError(
+            f"plant {request.plant} brings a sensor of its own, so --sensing {request.sensing} does not apply"
+        )
     plant = _build_plant(resolved, entry, PlantSetup(None, None, run.period))
     try:
         spec = plant.spec
         setting = TaskSetting(None, spec.n, spec.feature, named_seed(request.seed, "task"))
         scenario = _build_scenario(resolved, setting)
         nominal = plant.nominal_jacobian()
-        source = None if nominal is None else network_source(nominal, spec, keep, progress)
-        knowledge = RobotKnowledge(spec, run.preview_rows, nominal, train=source)
+        knowledge = RobotKnowledge(spec, run.preview_rows, nominal)
+        if nominal is not None:
+            knowledge = replace(knowledge, train=_network_source(knowledge, keep, progress))
         controller = _build_controller(request.controller, resolved.controller, knowledge, plant.true_model)
     except BaseException:
         plant.close()
@@ -237,12 +276,12 @@ def _build_with_own_robot(
     return Experiment(plant, controller, Drawn(scenario), run)
 
 
-def _equations(model: HandEyeModel | None) -> TrueModel:
+def _equations(model: SensedArm | None) -> TrueModel:
     if model is None:
         raise ValueError("model must be given for a controller that needs the truth, got None")
 
     def symbolic(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
-        from servobench.plant.robot.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
+        from servobench.plant.eyes.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
 
         return symbolic_feature(model)(joint_position)
 

@@ -34,7 +34,6 @@ from servobench.harness.run.references import TaskKind
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import norm, transposed
 
-SETTLING_BAND = 0.005  # share of the feature's natural size: 5 mm on the UR5
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
@@ -147,7 +146,7 @@ def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: floa
     with np.errstate(divide="ignore", invalid="ignore"):
         path_length_ratio = np.where(way > 0.0, path_length(feature) / way, np.nan)
     return {
-        "settling_time_s": settling_time(error, SETTLING_BAND * spec.feature.scale, spec.period),
+        "settling_time_s": settling_time(error, spec.feature.band, spec.period),
         "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[..., 0], spec.period),
         "overshoot": overshoot(feature, reference[..., 0]) if fixed else unknown,
         "steady_state_error": final.mean(axis=-1),

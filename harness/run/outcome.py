@@ -22,11 +22,11 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.run.log import Steps
-from servobench.harness.run.metrics import SETTLING_BAND
 from servobench.harness.run.tasks import Scenario
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.inverse import closest_distance
+from servobench.plant.robot.sensed import SensedArm
 
 SETTLED, NOT_SETTLED = "settled", "not_settled"
 FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"
@@ -41,7 +41,7 @@ CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
 
 
 def find_outcome(
-    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: HandEyeModel | None
+    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: SensedArm | None
 ) -> str:
     """Return what came of a run that completed.
 
@@ -50,13 +50,14 @@ def find_outcome(
         scenario: its task.
         settling_time: [s]; NaN if it never settled.
         rms_error_evaluated: of the judged part [unit of the feature].
-        robot: the true arm with the camera as it is at the end of the run; None if only the plant knows it.
+        robot: the true arm with the camera as it is at the end of the run; None if only the plant knows it. Reach is
+            looked at where the features are places.
     """
     move = scenario.kind == "point_to_point"
-    band = (1.0 if move else FOLLOWING_BANDS) * SETTLING_BAND * steps.spec.feature.scale
+    band = (1.0 if move else FOLLOWING_BANDS) * steps.spec.feature.band
     if not math.isnan(settling_time) if move else rms_error_evaluated <= band:
         return SETTLED if move else FOLLOWED
-    if robot is not None and _is_out_of_reach(steps, robot, scenario.evaluate_from, band):
+    if isinstance(robot, HandEyeModel) and _is_out_of_reach(steps, robot, scenario.evaluate_from, band):
         return TARGET_UNREACHABLE
     if joint_rests_at_limit(steps, band):
         return JOINT_AT_LIMIT

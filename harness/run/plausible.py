@@ -17,6 +17,7 @@ from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolved import ResolvedRun
 from servobench.harness.run.tasks import PointTask, Scenario, find_task
 from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch
@@ -65,6 +66,8 @@ def check_reach(resolved: ResolvedRun, scenario: Scenario, robot: Robot, spec: P
     """
     task = resolved.request.task
     if task == ON_PURPOSE or not find_task(task).any_robot:  # other targets are taught on the true robot
+        return
+    if resolved.request.sensing != DEFAULT_SENSING:  # the features are no places
         return
     nominal, times = robot.nominal, np.linspace(0.0, scenario.duration, POINTS)
     points = np.unique(scenario.reference.at(times), axis=0)

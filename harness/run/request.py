@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 from servobench.harness.config.registry import FORMER_NAMES, engine_of
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.eyes.registry import DEFAULT_SENSING, FIXED
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.settings import NonNegative, Positive, ShareBelowOne, settings
 
@@ -74,6 +75,7 @@ class RunRequest:
     latency: float | None = None  # [s] of the camera; None for what the plant is configured with
     period: float | None = None  # [s] of control; None for that of the section `run`
     robot: str = DEFAULT_ROBOT  # a name, or the path of a file
+    sensing: str = DEFAULT_SENSING  # a set-up, or the path of a file with one; with `:hand` for cameras on the hand
 
     def __post_init__(self) -> None:
         """Read a mismatch that came as text, and a former name of a controller."""
@@ -81,6 +83,7 @@ class RunRequest:
         given: object = self.mismatch
         if isinstance(given, str):
             object.__setattr__(self, "mismatch", read_mismatch(given))
+        object.__setattr__(self, "sensing", self.sensing.strip().removesuffix(f":{FIXED}"))
 
     @property
     def run_id(self) -> str:
@@ -91,7 +94,8 @@ class RunRequest:
         noise = "" if self.noise_factor == 1.0 else f"-noise{self.noise_factor:g}"
         times = "".join(f"-{name}{1e3 * value:g}ms" for name in TIMES if (value := getattr(self, name)) is not None)
         robot = "" if self.robot == DEFAULT_ROBOT else f"{UNFIT_FOR_FILES.sub('_', Path(self.robot).name)}-"
-        return f"{plant}-{robot}{controller}-{self.task}-{mismatch}{noise}{times}-{self.seed}"
+        sensing = "" if self.sensing == DEFAULT_SENSING else f"{UNFIT_FOR_FILES.sub('_', Path(self.sensing).name)}-"
+        return f"{plant}-{robot}{sensing}{controller}-{self.task}-{mismatch}{noise}{times}-{self.seed}"
 
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""

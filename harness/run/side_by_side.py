@@ -157,7 +157,7 @@ class ManyServos(Controller):
         """See `Controller.reset`; no part of a servo draws random numbers."""
         self._state = self._servo.start(observation)
         self._u = np.zeros_like(observation.joint_position)
-        self._jacobian = self._state.jacobian
+        self._jacobian = self._servo.jacobian(self._state)
 
     def step(self, observation: Observation, reference: FloatArray) -> Command:
         """See `Controller.step`; a run whose controller fails ends.
@@ -182,7 +182,7 @@ class ManyServos(Controller):
             return self.step(observation, reference)
         self._k += 1
         self._u = self._ends.spread(u, self._u)
-        self._jacobian = self._ends.spread(self._state.jacobian, self._jacobian)
+        self._jacobian = self._ends.spread(self._servo.jacobian(self._state), self._jacobian)
         return Command(self._u)
 
     def estimated_jacobian(self) -> FloatArray:

@@ -2,7 +2,8 @@
 
 Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
 feature. A target given as joint positions is therefore seen through the true robot, and is always in reach. Curves are
-given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch. The numbers
+given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch; where cameras
+see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.views`). The numbers
 here are those of the UR5's bench; `servobench.harness.run.teaching` moves them to that of another arm.
 """
 
@@ -16,12 +17,17 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.pose_tasks import PoseTask, pose_start
 from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskKind, line, read_waypoints
+from servobench.harness.run.sampling import Box, draw_in_view, drawn_together
+from servobench.harness.run.views import TaughtView, in_space
 from servobench.plant.checks import FloatArray, as_vector, check_number
+from servobench.plant.eyes.model import EyeModel
 from servobench.plant.files import user_path
 from servobench.plant.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.seeds import named_generator
 from servobench.plant.settings import Count, NonNegative, Number, Positive, settings, suggest
@@ -54,6 +60,8 @@ class PointTask:
     """[rad] joint positions at which the target was taught"""
     duration: Positive = 10.0
     """[s] length of the run"""
+    into_view: bool = True
+    """where cameras see pixels, draw start and target together towards the arm's home until both are in view"""
 
 
 @settings
@@ -157,19 +165,37 @@ class TargetTask:
 class TaskSetting:
     """Where a task is to be done."""
 
-    model: HandEyeModel | None  # the true robot, or None for a plant that brings its own
+    model: SensedArm | None  # the true robot, or None for a plant that brings its own
     n: int  # number of joints
     feature: Channel  # names and unit of the m features
     seed: int  # for tasks that draw random numbers
-    moved: HandEyeModel | None = None  # the true robot once its camera was moved; None if it is not
+    moved: SensedArm | None = None  # the true robot once its camera was moved; None if it is not
     robot: Robot | None = None  # by its maker's description; None for a plant that brings its own
+    nominal: SensedArm | None = None  # the same with its cameras as planned
 
     @property
     def m(self) -> int:
-        """Number of features."""
-        return len(self.feature.names)
+        """How many numbers a place has, in which tasks give targets and curves."""
+        return len(self.feature.names) if self.model is None else 3
 
-    def taught_on(self) -> tuple[Robot, HandEyeModel]:
+    def followed(self, curve: Reference) -> Reference:
+        """Return what the features should be for a ball on a curve of places."""
+        return in_space(curve, self.model, self.robot)
+
+    def taught(self, joint_position: FloatArray) -> Reference:
+        """Return the target that is taught with the arm at a joint position, (n,) rad.
+
+        Raises:
+            ValueError: the plant brings a robot of its own.
+        """
+        model = self.taught_on()[1]
+        return (
+            TaughtView(model, joint_position)
+            if isinstance(model, EyeModel)
+            else FixedPoint(model.feature(joint_position))
+        )
+
+    def taught_on(self) -> tuple[Robot, SensedArm]:
         """Return the robot and the true one, for a target that is taught on it.
 
         Raises:
@@ -197,16 +223,19 @@ class TaskEntry:
 
 
 def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
-    target = as_vector("target", config.target, setting.n)
-    return _move(config.start, FixedPoint(setting.taught_on()[1].feature(target)), config.duration, setting)
+    start, target = (as_vector(name, getattr(config, name), setting.n) for name in ("start", "target"))
+    robot, true = setting.taught_on()
+    if config.into_view and isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+        start, target = drawn_together(start, target, robot, setting.nominal, true)
+    return _move(start, setting.taught(target), config.duration, setting)
 
 
 def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
     target = as_vector("target", config.target, setting.m)
-    return _move(config.start, FixedPoint(target), config.duration, setting)
+    return _move(config.start, setting.followed(FixedPoint(target)), config.duration, setting)
 
 
-def _move(start: Vector | FloatArray, reference: FixedPoint, duration: float, setting: TaskSetting) -> Scenario:
+def _move(start: Vector | FloatArray, reference: Reference, duration: float, setting: TaskSetting) -> Scenario:
     return Scenario(setting.start(start), reference, duration, 0.75 * duration, "point_to_point")
 
 
@@ -217,6 +246,10 @@ def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
     if not (lower < upper).all():
         raise ValueError("lower must be below upper for every joint")
     generator = named_generator(setting.seed, "start_and_target")
+    if isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+        box = Box(lower, upper, config.shortest, config.lowest)
+        start, target = draw_in_view(box, robot, setting.nominal, true, generator)
+        return _move(start, setting.taught(target), config.duration, setting)
     for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
         pairs = generator.uniform(lower, upper, (DRAWN_AT_ONCE, 2, n))
         balls = robot.arm.ball_position(pairs)
@@ -233,15 +266,23 @@ def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
 
 def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, robot: Robot) -> bool:
     """Return whether a target (m,) that was taught before the camera's move is in easy reach after it."""
-    if setting.moved is None:
+    if not isinstance(setting.moved, HandEyeModel):
         return True
     point, (nearest, farthest) = setting.moved.to_base(target), robot.workspace.reach
     return bool(point[2] >= lowest and nearest <= np.linalg.norm(point - robot.workspace.shoulder) <= farthest)
 
 
+def _build_pose(config: PoseTask, setting: TaskSetting) -> Scenario:
+    robot, true = setting.taught_on()
+    if not (isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel) and true.eye.judges_pose):
+        raise ValueError("it needs a target with a pose; use --sensing plate or plate:hand")
+    start = pose_start(config, robot, setting.nominal)
+    return _move(start, setting.taught(robot.workspace.home), config.duration, setting)
+
+
 def _build_laps(config: CircleTask, setting: TaskSetting) -> Scenario:
     centre, eight = as_vector("centre", config.centre, setting.m), isinstance(config, LemniscateTask)
-    reference = Laps(centre, config.radius, config.lap_time, eight)
+    reference = setting.followed(Laps(centre, config.radius, config.lap_time, eight))
     laps, lap_time = config.laps, config.lap_time
     start, judged_from = setting.start(config.start), (laps - 1) * lap_time
     return Scenario(start, reference, laps * lap_time, judged_from, lap_time=lap_time)
@@ -258,7 +299,8 @@ def _build_endurance(config: EnduranceTask, setting: TaskSetting) -> Scenario:
 
 def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
     m = setting.m
-    reference = line(as_vector("begin", config.begin, m), as_vector("end", config.end, m), config.moving)
+    straight = line(as_vector("begin", config.begin, m), as_vector("end", config.end, m), config.moving)
+    reference = setting.followed(straight)
     return Scenario(setting.start(config.start), reference, config.duration, 0.5 * config.duration)
 
 
@@ -290,6 +332,14 @@ _ENTRIES = (
     ),
     TaskEntry("unreachable", "a target 1.5 m away, out of the arm's reach", UNREACHABLE, _build_target, any_robot=True),
     TaskEntry("singular_start", "a move that starts with the arm stretched", SINGULAR, _build_point),
+    TaskEntry("axis_turn", "of a plate: a turn about the optical axis by 45°", PoseTask("axis_turn"), _build_pose),
+    TaskEntry("retreat", "of a plate: away along the optical axis", PoseTask("retreat"), _build_pose),
+    TaskEntry(
+        "camera_turn", "of a plate: a turn about the camera's y axis by 15°", PoseTask("camera_turn", 15.0), _build_pose
+    ),
+    TaskEntry(
+        "plane_turn", "of a plate: a turn about an axis in its plane by 30°", PoseTask("plane_turn", 30.0), _build_pose
+    ),
     TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),
 )
 TASKS = {entry.name: entry for entry in _ENTRIES}

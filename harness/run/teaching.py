@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.run.pose_tasks import PoseTask
 from servobench.harness.run.tasks import (
     CircleTask,
     LineTask,
@@ -33,6 +34,8 @@ def taught(entry: TaskEntry, robot: Robot) -> Any:  # noqa: ANN401 - the setting
     work, default = robot.workspace, entry.default
     home = _numbers(work.home)
     match default:
+        case PoseTask():  # its start and its goal are the arm's own
+            return default
         case PointTask():
             start, target = work.moves.get(entry.name, (work.stretched, work.home))
             return replace(default, start=_numbers(start), target=_numbers(target))

@@ -37,7 +37,7 @@ def side_by_side_key(run: ResolvedRun) -> Hashable | None:
         return None
     moved = request.mismatch.size("camera_move") > 0.0
     names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved, request.robot
-    return (*names, request.mismatch.sensor, id(run.run), id(run.controller), id(run.task))
+    return (*names, request.mismatch.sensor, request.sensing, id(run.run), id(run.controller), id(run.task))
 
 
 def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Together:
@@ -47,7 +47,7 @@ def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Tog
         Exception: whatever a run alone would raise, or runs that cannot advance together.
     """
     first, drawn = runs[0], tuple(draw(run) for run in runs)
-    moved = [each.moved.X_BC for each in drawn if each.moved is not None]
+    moved = [each.moved.camera for each in drawn if each.moved is not None]
     loop = loop_settings(first.run, drawn[0].scenario.duration, np.stack(moved) if moved else None)
     rows = loop.periods + loop.preview
     desired = np.stack([each.scenario.reference.sampled(first.run.period, rows) for each in drawn])

@@ -80,7 +80,7 @@ def completed(*words):
         (("run", "--mismatch", "mod"), ["moderate"]),
         (("run", "--mismatch", "moderate+camera_m"), ["moderate+camera_move="]),
         (("compare", "--controllers", "rls,ukf_mp"), ["rls,ukf_mpc", "rls,ukf_mpc:published"]),
-        (("compare", "--tasks", "a"), ["all"]),
+        (("compare", "--tasks", "al"), ["all"]),
         (("sweep", "--plants", "kinematic,b"), ["kinematic,bullet"]),
         (("plants", "k"), ["kinematic"]),
         (("record", "--controller", "calib"), ["calibrated"]),

@@ -60,7 +60,7 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
     observation = _run(experiment, run.periods(duration), resolved.request.seed)
     truth, model = plant.truth(), experiment.drawn.true
-    if truth.jacobian is None or model is None:
+    if truth.jacobian is None or not isinstance(model, HandEyeModel):
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
     rest = Rest(observation.joint_position, truth.feature, observation.time, run.preview_rows)

@@ -1,0 +1,51 @@
+"""Sensing set-ups by the word that a user gives: those of this package, or one in a file of the user's own."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from servobench.harness.config.own import PLACE
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import SourceFile
+from servobench.plant.eyes.eye import Eye
+from servobench.plant.eyes.registry import EYES, FIXED, HAND, Sensing
+
+
+def sensing_names() -> list[str]:
+    """Return the words of all sensing set-ups of this package, each with fixed cameras and with cameras on the hand."""
+    return [str(Sensing(eye, mount)) for eye in EYES.values() for mount in (FIXED, HAND)]
+
+
+@lru_cache(maxsize=64)
+def find_sensing(word: str) -> Sensing:
+    """Return the sensing that a word stands for, such as `pixel`, `stereo:hand` or `./polar.py:hand`.
+
+    Raises:
+        ConfigurationError: an unknown word, or a file that cannot be used.
+    """
+    place, _, mount = word.rpartition(":")
+    place = place if mount in (FIXED, HAND) else word
+    found = PLACE.fullmatch(place)
+    own = {}
+    if found is not None and found["file"]:
+        own = {place: _read_eye(found["file"], found["name"])}
+    try:
+        return Sensing.parse(word, {**EYES, **own})
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+
+
+def _read_eye(file: str, name: str | None) -> Eye:
+    """Return the set-up called `name` that a file defines, or without a name its only one."""
+    module = SourceFile.read(file).load()
+    known = EYES.values()
+    found = {key: value for key, value in vars(module).items() if isinstance(value, Eye) and value not in known}
+    if name is None and len(found) == 1:
+        return next(iter(found.values()))
+    if name in found:
+        return found[name]
+    if not found:
+        raise ConfigurationError(f"{file} defines no sensing set-up: no object of servobench.plant.eyes.eye.Eye")
+    first, *_ = found
+    wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
+    raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")

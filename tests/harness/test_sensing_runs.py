@@ -1,0 +1,303 @@
+"""Runs under sensing set-ups: units, tasks, views, pose errors, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from kit.robots import FOUR_JOINTS
+from servobench.controllers.methods import METHODS
+from servobench.controllers.units import in_natural_units
+from servobench.harness.config.registry import find_plant
+from servobench.harness.config.sensing import find_sensing, sensing_names
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import carry_out_together, run_experiment
+from servobench.harness.run.experiment import build, build_experiment
+from servobench.harness.run.pose_error import pose_error
+from servobench.harness.run.pose_tasks import PoseTask, displaced, pose_start
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve
+from servobench.harness.run.views import View
+from servobench.plant.bench import Bench
+from servobench.plant.eyes.model import EyeModel
+from servobench.plant.plant import PlantSetup
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.inverse import closest_distance
+from servobench.plant.robot.pose_inverse import reach_pose
+from servobench.plant.signals import Command
+
+PIXEL_WORDS = ["pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand"]
+
+
+def request(
+    sensing: str, task: str = "random", controller: str = "ukf_mfac", seed: int = 0, **more: object
+) -> RunRequest:
+    return RunRequest("kinematic", controller, task, "moderate", seed, sensing=sensing, **more)
+
+
+def drawn(sensing: str, task: str, seed: int = 0, **more: object):
+    return build_experiment(request(sensing, task, seed=seed, **more), Settings({})).drawn
+
+
+# --- units
+
+
+def test_laws_and_estimators_see_a_metre_whatever_the_unit():
+    """A plant in millimetres is controlled, joint for joint, as the same plant in metres."""
+    experiment = build_experiment(request("position"), Settings({}))
+    knowledge = experiment.controller.servo.knowledge
+    feature = knowledge.spec.feature
+    in_mm = replace(
+        knowledge,
+        spec=replace(knowledge.spec, feature=replace(feature, unit="mm", scale=1000.0)),
+        nominal_jacobian=lambda q: 1000.0 * knowledge.nominal_jacobian(q),
+    )
+    entry = METHODS["ukf_mfac"]
+    pair = [entry.build(entry.config(), each) for each in (knowledge, in_mm)]
+    plant = experiment.plant
+    seen = plant.reset(3)
+    desired = experiment.scenario.reference.sampled(0.05, 100)
+    for controller, unit in zip(pair, (1.0, 1000.0), strict=True):
+        controller.reset(seen.seen_as(seen.joint_position, unit * seen.feature), 0)
+    for k in range(40):
+        commands = [
+            controller.step(seen.seen_as(seen.joint_position, unit * seen.feature), unit * desired[k : k + 11])
+            for controller, unit in zip(pair, (1.0, 1000.0), strict=True)
+        ]
+        np.testing.assert_allclose(commands[1].joint_velocity, commands[0].joint_velocity, rtol=1e-6, atol=1e-9)
+        jacobians = [controller.estimated_jacobian() for controller in pair]
+        np.testing.assert_allclose(jacobians[1], 1000.0 * jacobians[0], rtol=1e-6, atol=1e-6)
+        seen = plant.step(commands[0])
+
+
+def test_natural_units_of_metres_are_the_same_knowledge():
+    knowledge = build_experiment(request("position"), Settings({})).controller.servo.knowledge
+    assert in_natural_units(knowledge) is knowledge
+    pixels = build_experiment(request("pixel"), Settings({})).controller.servo.knowledge
+    assert pixels.spec.feature.scale == 1.0
+    assert pixels.unit == pytest.approx(207.85 / 1.3, rel=1e-3)
+
+
+def test_noise_of_pixels_is_the_same_from_everywhere_and_that_of_the_ball_in_the_planned_image():
+    for word in ("pixel", "pixel:hand", "plate"):
+        robot = find_robot("ur5")
+        model = find_sensing(word).nominal(robot)
+        entry = find_plant("kinematic")
+        plant = entry.build(entry.config(), PlantSetup(model, robot.workspace.home, 0.05, robot))
+        assert isinstance(plant, Bench)
+        still, seen = Command(np.zeros(6)), []
+        plant.reset(0)
+        for _ in range(1000):
+            seen.append(plant.step(still).feature)
+        np.testing.assert_allclose(np.std(seen, axis=0), 0.001 * 207.85 / 1.3, rtol=0.1)
+
+
+# --- tasks
+
+
+@pytest.mark.parametrize("word", PIXEL_WORDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_starts_and_targets_are_in_view_and_taught_on_the_true_robot(word, seed):
+    run = drawn(word, "random", seed)
+    model, reference = run.true, run.scenario.reference
+    assert isinstance(model, EyeModel)
+    assert model.visible(run.scenario.start).all()
+    assert model.in_view(reference.points(0.0)).all()
+    np.testing.assert_array_equal(reference.at(3.0), model.feature(reference.joint_position))
+
+
+@pytest.mark.parametrize("word", ["pixel", "stereo"])
+@pytest.mark.parametrize("task", ["circle", "line", "lemniscate", "target"])
+def test_curves_are_the_image_of_the_ball_on_the_curve_of_position(word, task):
+    here, there = drawn(word, task, 2), drawn("position", task, 2)
+    times = np.linspace(0.0, 9.0, 7)
+    place = there.scenario.reference.at(times)
+    at = there.true.to_base(place)
+    np.testing.assert_allclose(here.scenario.reference.points(times)[:, 0], at, atol=1e-12)
+    camera, f = here.true.optics, here.true.optics.focal[0]
+    a = place[:, :2] / place[:, 2:]
+    bent = a * (1.0 + camera.distortion[0] * (a**2).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(here.scenario.reference.at(times)[:, :2], camera.centre[0] + f * bent, rtol=1e-10)
+
+
+def test_a_circle_of_a_plate_keeps_its_orientation_and_is_in_reach_of_the_arm():
+    run, robot = drawn("plate", "circle"), find_robot("ur5")
+    reference, model = run.scenario.reference, run.true
+    assert isinstance(reference, View)
+    home, limit = model.points(robot.workspace.home), np.full(6, 2 * np.pi)
+    q = robot.workspace.home
+    for time in np.linspace(0.0, 10.0, 21):
+        points = reference.points(time)
+        distance, angle = pose_error(home, points)
+        assert angle == pytest.approx(0.0, abs=1e-6)
+        assert distance < 0.3
+        pose = model.arm.frames(robot.workspace.home)[-1].copy()
+        pose[:3, 3] += points.mean(axis=0) - home.mean(axis=0)
+        q, left = reach_pose(model.arm, pose, q, -limit, limit)
+        assert left < 1e-6
+        np.testing.assert_allclose(model.points(q), points, atol=1e-5)
+
+
+@pytest.mark.parametrize("word", ["pixel:hand", "stereo:hand"])
+def test_a_circle_before_the_hand_is_in_view(word):
+    run = drawn(word, "circle", 1)
+    model, times = run.true, np.linspace(0.0, 10.0, 16)
+    assert model.in_view(run.scenario.reference.points(times)).all()
+
+
+@pytest.mark.parametrize("word", ["plate", "plate:hand"])
+@pytest.mark.parametrize("task", ["axis_turn", "retreat", "camera_turn", "plane_turn"])
+def test_the_canonical_tasks_displace_the_target_before_the_camera_as_they_say(word, task):
+    robot = find_robot("ur5")
+    model = find_sensing(word).nominal(robot)
+    config = resolve(request(word, task), Settings({})).task
+    assert isinstance(config, PoseTask)
+    start = pose_start(config, robot, model)
+    assert model.visible(start).all()
+    pose = np.linalg.inv(model.camera)
+    home, away = (model.points(q) @ pose[:3, :3].T + pose[:3, 3] for q in (robot.workspace.home, start))
+    D = displaced(config, home.mean(axis=0))
+    np.testing.assert_allclose(away, home @ D[:3, :3].T + D[:3, 3], atol=1e-5)
+    distance, angle = pose_error(away, home)
+    turned = {"axis_turn": 45.0, "retreat": 0.0, "camera_turn": 15.0, "plane_turn": 30.0}[task]
+    assert np.degrees(angle) == pytest.approx(turned, abs=1e-3)
+    if task == "plane_turn":
+        assert distance == pytest.approx(0.0, abs=1e-5)
+    if task == "retreat":
+        np.testing.assert_allclose(away.mean(axis=0)[2], 0.75 * home.mean(axis=0)[2], rtol=1e-5)
+
+
+def test_a_canonical_task_needs_a_target_with_a_pose():
+    with pytest.raises(ConfigurationError, match="task axis_turn: it needs a target with a pose; use --sensing plate"):
+        build_experiment(request("pixel", "axis_turn"), Settings({}))
+
+
+def test_a_pose_is_reached_or_not_by_the_length_of_the_arm():
+    robot = find_robot("ur5")
+    rng, limit = np.random.default_rng(0), np.full(6, 2 * np.pi)
+    for _ in range(10):
+        q = rng.uniform(robot.workspace.lower, robot.workspace.upper)
+        pose = robot.arm.frames(q)[-1]
+        found, left = reach_pose(robot.arm, pose, q + 0.2 * rng.standard_normal(6), -limit, limit)
+        assert left < 1e-8
+        np.testing.assert_allclose(robot.arm.frames(found)[-1], pose, atol=1e-8)
+    far = robot.arm.frames(robot.workspace.home)[-1].copy()
+    far[:3, 3] = 3.0
+    assert reach_pose(robot.arm, far, robot.workspace.home, -limit, limit)[1] > 0.1
+    assert closest_distance(robot.arm, far[:3, 3], -limit, limit) > 1.0
+
+
+def test_the_pose_error_is_the_motion_between_two_places():
+    rng = np.random.default_rng(2)
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
+    for angle in (0.0, 0.3, 2.0, 3.1):
+        axis = rng.standard_normal(3)
+        R = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+        distance, found = pose_error(square @ R.T + [0.0, 0.0, 0.4], square)
+        assert distance == pytest.approx(0.4)
+        assert found == pytest.approx(angle, abs=1e-7)
+
+
+# --- runs
+
+
+def test_a_run_of_a_plate_has_its_true_pose_error_in_both_tables():
+    result = run_experiment(request("plate", "plane_turn"), Settings({}))
+    assert result.steps is not None
+    assert {"pose_error_mm", "pose_error_deg", "true_feature_u3_px"} <= set(result.steps)
+    assert result.steps["pose_error_deg"].iloc[0] == pytest.approx(30.0, abs=12.0)  # the true arm is another one
+    assert result.row["pose_error_deg"] == pytest.approx(result.steps["pose_error_deg"].iloc[-20:].mean())
+    assert result.row["pose_error_deg"] < 6.0
+    assert result.row["feature_unit"] == "px"
+    assert result.row["sensing"] == "plate"
+    assert "camera_focal" in result.row["mismatch_values"]
+    assert "pose_error_mm" not in run_experiment(request("position"), Settings({})).row
+
+
+@pytest.mark.parametrize("word", PIXEL_WORDS[1:4])
+def test_runs_side_by_side_are_those_of_single_runs(word):
+    runs = [resolve(request(word, seed=seed), Settings({})) for seed in (0, 1)]
+    settings = runs[0]
+    runs = [replace(run, run=settings.run, controller=settings.controller, task=settings.task) for run in runs]
+    together = carry_out_together(runs)
+    for run, many in zip(runs, together, strict=True):
+        one = run_experiment(run.request, Settings({})).row
+        same = {name for name in one if "time_median" not in name and "p99" not in name and "overruns" not in name}
+        for name in same:
+            assert many.row[name] == one[name] or (many.row[name] != many.row[name] and one[name] != one[name]), name
+
+
+@pytest.mark.parametrize("word", PIXEL_WORDS)
+@pytest.mark.parametrize("task", ["exp1", "exp4", "singular_start"])
+def test_moves_are_drawn_together_until_both_ends_are_in_view(word, task):
+    run, robot = drawn(word, task), find_robot("ur5")
+    assert run.true.visible(run.scenario.start).all()
+    assert run.true.in_view(run.scenario.reference.points(0.0)).all()
+    config, home = resolve(request(word, task), Settings({})).task, robot.workspace.home
+    pairs = (run.scenario.start, config.start), (run.scenario.reference.joint_position, config.target)
+    ways = [(q - home, given - home) for q, given in pairs if np.any(np.asarray(given) != home)]
+    share = [way @ whole / (whole @ whole) for way, whole in ways]
+    np.testing.assert_allclose(share, share[0])
+    assert round(10 * share[0]) in range(1, 11)
+
+
+def test_a_start_out_of_view_is_a_run_without_a_feature():
+    settings = Settings({"exp1": {"start": [2.0, -1.69, -2.34, 0.89, 1.22, 0.0], "into_view": False}})
+    row = run_experiment(request("pixel:hand", "exp1"), settings).row
+    assert row["status"] == "feature_lost"
+    assert "not visible at the start" in row["reason"]
+
+
+def test_other_plants_have_the_position_only():
+    with pytest.raises(ConfigurationError, match="plant fmu has the sensing position only, got --sensing pixel"):
+        build(resolve(replace(request("pixel"), plant="fmu"), Settings({})))
+
+
+def test_a_plate_is_refused_for_an_arm_of_four_joints(tmp_path):
+    file = tmp_path / "four.toml"
+    file.write_text(FOUR_JOINTS)
+    with pytest.raises(ConfigurationError, match="sensing plate needs an arm of 6 joints or more"):
+        build_experiment(request("plate", robot=str(file)), Settings({}))
+
+
+def test_an_arm_of_four_joints_sees_with_the_others(tmp_path):
+    file = tmp_path / "four.toml"
+    file.write_text(FOUR_JOINTS)
+    for word in ("pixel", "stereo"):
+        assert run_experiment(request(word, robot=str(file)), Settings({})).row["outcome"] == "settled"
+
+
+OWN = """
+import numpy as np
+from servobench.plant.eyes.eye import Eye
+
+
+def measure(points, optics):
+    x, y, z = np.moveaxis(points[..., 0, 0, :], -1, 0)
+    return np.stack([np.sqrt((x + 1.0) ** 2 + y**2), y, z], axis=-1)
+
+
+FROM_THE_SIDE = Eye("side", "distance from a pole", ("r", "y", "z"), "m", measure)
+"""
+
+
+def test_a_file_can_bring_a_set_up(tmp_path):
+    file = tmp_path / "side.py"
+    file.write_text(OWN)
+    row = run_experiment(request(f"{file}:hand"), Settings({})).row
+    assert row["outcome"] == "settled"
+    assert row["sensing"] == f"{file}:hand"
+    with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
+        find_sensing(f"{file}:OTHER")
+    (tmp_path / "none.py").write_text("x = 1\n")
+    with pytest.raises(ConfigurationError, match="defines no sensing set-up"):
+        find_sensing(str(tmp_path / "none.py"))
+    with pytest.raises(ConfigurationError, match="unknown sensing 'pixle': did you mean 'pixel'"):
+        find_sensing("pixle")
+
+
+def test_names_of_all_set_ups_are_found():
+    assert [str(find_sensing(word)) for word in sensing_names()] == sensing_names()
