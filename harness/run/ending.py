@@ -20,6 +20,7 @@ from types import FrameType
 from typing import Any, Final, NamedTuple
 
 from servobench.harness.config.registry import plugin_packages
+from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.faults import RunFault
 
 COMPLETED = "completed"
@@ -53,6 +54,7 @@ class Ending:
     @classmethod
     def of(cls, error: BaseException) -> Ending:
         """Return how a run ended that an error ended."""
+        error = _behind(error)
         place = _place(error)
         where = f" ({place})" if place else ""
         trace = _trace(error) if place else ""
@@ -99,6 +101,14 @@ class _Place(NamedTuple):
 
     def __str__(self) -> str:
         return f"{Path(self.file).name}:{self.line} in {self.function}"
+
+
+def _behind(error: BaseException) -> BaseException:
+    """Return the error in code of users of which a line for the command line was made, or the error itself."""
+    behind = error
+    while isinstance(behind, ConfigurationError) and behind.__cause__ is not None:
+        behind = behind.__cause__
+    return behind if any(_is_users(frame) for frame, _ in traceback.walk_tb(behind.__traceback__)) else error
 
 
 def _place(error: BaseException) -> _Place | None:

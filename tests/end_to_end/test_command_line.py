@@ -103,9 +103,8 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
     code, output = finish(process)
     assert code == 130, output
     assert "Traceback" not in output
-    runs = pd.read_parquet(out / "runs.parquet")
-    assert 3 <= len(runs) < 100
-    assert set(pd.read_parquet(out / "steps.parquet")["run_id"]) == set(runs["run_id"])
+    assert "--resume" in output
+    assert 3 <= len(results.load_runs(out)) < 100
 
 
 def test_a_killed_batch_keeps_every_finished_run_and_can_be_resumed(monkeypatch, capsys, tmp_path):
@@ -113,7 +112,7 @@ def test_a_killed_batch_keeps_every_finished_run_and_can_be_resumed(monkeypatch,
     process = start(*BATCH, "--out", str(out))
     wait_for(lambda: part_count(out) >= 3)
     assert servobench(monkeypatch, *BATCH, "--out", str(out), "--resume") == 2
-    assert "is being written by another process" in capsys.readouterr().err
+    assert "is being written by process" in capsys.readouterr().err
     os.killpg(process.pid, signal.SIGKILL)
     finish(process)
     finished = results.load_runs(out)

@@ -21,7 +21,7 @@ SHOWN = re.compile(r"^ {4,6}(?:\$ )?servobench (.*)$", re.MULTILINE)
 REMARK = re.compile(r"\s+#\s.*$|\s{2,}\S.*$")
 CONTINUED = re.compile(r"\s*\\\n\s+")
 BATCHES = ("run", "compare", "sweep", "robustness", "claims")  # carried out up to the first worker
-QUICK = ("plants", "controllers", "tasks", "init", "new", "check")  # carried out whole
+QUICK = ("plants", "controllers", "tasks", "sensing", "init", "new", "check")  # carried out whole
 ONLY_READ = {
     "fmu": "compiles a model, which test_fmu_commands.py does",
     "record": "renders a film, which test_record.py does",
@@ -30,6 +30,7 @@ ONLY_READ = {
     "analyse": "logs runs of each method, which test_analyse.py does",
     "report": "needs the folder of a run, which test_report.py makes",
     "statistics": "needs the folder of a run; docs/five_minutes.md carries it out",
+    "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
 OWN = ("my_ur10e.yaml", "my_arm.urdf", "mine.toml", "crane.toml", "planar", "nominal_rate")  # of the reader

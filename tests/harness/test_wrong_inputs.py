@@ -125,7 +125,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--seed", "10000"), "seed 10000 cannot be used to judge: 10000:20000 are kept for tuning"),
     ((*RUN, "--seed", "two"), "invalid value for '--seed'"),
     ((*RUN, "--view"), "--view shows the plant bullet only, got --plant kinematic"),
-    ((*RUN, "--out", "file/new"), "cannot be made"),
+    ((*RUN, "--out", "file/new"), "cannot be written: Not a directory"),
     ((*RUN, "--out", "full"), "results folder full exists already; name another one with --out"),
     (("compare", "--controllers", "constant,constant"), "--controllers names constant twice"),
     (("compare", "--controllers", "constant,cnstant"), "unknown controller 'cnstant': did you mean 'constant'?"),
