@@ -1,4 +1,4 @@
-"""Numpy errors raise in tests, examples stay the same and have no deadline, and no test writes to the cache of the user."""
+"""Numpy errors raise in tests, examples stay the same and have no deadline, and the user's cache is not touched."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-# A busy machine is slow, which is no failure; and a change is judged by itself, not by new examples (`make nightly` has those).
+# A busy machine is slow, which is no failure; and a change is judged by itself, not by examples that are new each time.
 settings.register_profile("servobench", deadline=None, derandomize=True)
 settings.load_profile("servobench")
 
