@@ -193,7 +193,7 @@ NOISE_STUDIES: Final = tuple(
     Study(
         "noise" if setup.name == "position" else f"noise_{setup.name}",
         "filters of the Jacobian under noise of five families, 100 episodes a level, as Leite and others did it",
-        15,
+        1,
         {family: family_sweep(setup, family) for family in LEVELS},
         tables,
         pictures,
