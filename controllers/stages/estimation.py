@@ -117,12 +117,16 @@ class Estimation:
             desired: y_ref, (..., m), of this period.
         """
         learned, seen, q = state.learned, state.seen, observation.joint_position
-        if self.pairing is not None:
-            learned = learned._replace(pair=self.pairing.advance(learned.pair, q))
+        pairing = self.pairing
+        if pairing is not None:
+            learned = learned._replace(pair=pairing.advance(learned.pair, q))
         duration = observation.time - seen.time
         due = observation.feature_valid & ~(duration < self._shortest)  # also the first one, of unknown duration
         known = due & (duration > 0.0) & (duration < self._longest)
         learned = branch(known, self._learn, learned, seen, observation, desired)
+        if pairing is not None:
+            pair = branch(due & np.logical_not(known), pairing.interrupt, learned.pair)
+            learned = learned._replace(pair=pair)
         pair, own = learned.pair, self.estimator.jacobian(learned.estimator, q)
         jacobian = own
         if pair is not None:

@@ -1,13 +1,18 @@
 """How what is seen relates to what a model says: a linear map and a delay, both estimated online.
 
-For each candidate delay d = 0 … D−1 a filter of its own holds a map M, (m, m), and a covariance P, (m, m), that the
-rows of M share. x_d is the feature step that the model predicts for the joint motion d periods ago:
+For each candidate delay d = 0 … D−1 a filter of its own holds a map M, (m, m), and the noise e, (m,), of the last
+frame, with a covariance P, (m+1, m+1), that the rows of [M e] share. x_d is the feature step that the model predicts
+for the joint motion d periods ago. A step Δy holds the noise of both its frames, of the new one e₊ ~ N(0, σ² I):
 
-    Δy = M x_d + v,   v ~ N(0, r I),   r = 2σ² + c² ‖x_d‖²             noise of two frames, and error of the model
-    ν = Δy − M x_d,   s = r + x_dᵀ P x_d
-    M ← M + ν (P x_d)ᵀ / s,   P ← P − (P x_d)(P x_d)ᵀ / s
+    Δy = M x_d + e₊ − e + v,   v ~ N(0, c² ‖x_d‖² I)                   v the error of the model
+    h = [x_d; −1],   ν = Δy − [M e] h,   s = σ² + c² ‖x_d‖² + hᵀ P h
+    [M e] ← [M e] + ν (P h)ᵀ / s,   P ← P − (P h)(P h)ᵀ / s
+    e ← ν σ²/s,   P_ee ← σ² (1 − σ²/s),   P_Me ← −(P h)_M σ²/s          e₊ takes the place of e
 
-This is recursive least squares; with P⁻¹ = 0 at first, constant r and no walk of P it is batch least squares. The
+Without e the filter would be biased: a closed loop turns the noise of a frame into joint motion, which at a shorter
+delay than the true one seems to explain that this noise is gone from the next frame.
+
+This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. The
 candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
 
     ℓ_d = Σ ‖ν‖² / s + m ln s
@@ -25,27 +30,50 @@ from servobench.plant.faults import FilterDiverged
 from servobench.plant.lanes import outer, plus_diagonal
 
 
+def fresh_bank(M: FloatArray, P_M: FloatArray, frame: FloatArray | float) -> FloatArray:
+    """Return a bank, [M e] above P, in which nothing is known of the last frame.
+
+    Args:
+        M: (..., m, m).
+        P_M: covariance of a row of M, (m, m).
+        frame: σ², (...), m².
+
+    Returns:
+        (..., 2m+1, m+1).
+    """
+    m = M.shape[-1]
+    bank = np.zeros((*M.shape[:-2], 2 * m + 1, m + 1))
+    bank[..., :m, :m], bank[..., m:-1, :m], bank[..., -1, -1] = M, P_M, frame
+    return bank
+
+
 def map_update(
-    bank: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
+    bank: FloatArray, x: FloatArray, feature_step: FloatArray, frame: FloatArray, model: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Learn from one motion under every candidate delay.
 
     Args:
-        bank: each map M above its covariance P, (..., D, 2m, m): what multiplies x in both is one product.
+        bank: each [M e] above its P, (..., D, 2m+1, m+1): what multiplies h in both is one product.
         x: feature steps that the model predicts, (..., D, m), m.
         feature_step: Δy, (..., m), m.
-        variance: r, (..., D), m², positive.
+        frame: σ², (..., 1), m², positive.
+        model: c² ‖x_d‖², (..., D), m².
 
     Returns:
         The new bank; ‖ν‖²/s, (..., D), what was seen against what was expected; and s, (..., D), m².
     """
     m = feature_step.shape[-1]
-    known = np.matvec(bank, x)
-    Px = known[..., m:]
-    s = variance + np.vecdot(x, Px)
-    known[..., :m] -= feature_step[..., None, :]  # −ν above P x: minus their products with the gain is the change
-    nu = known[..., :m]
-    return bank - outer(known, Px / s[..., None]), np.vecdot(nu, nu) / s, s
+    h = np.concatenate([x, np.full((*x.shape[:-1], 1), -1.0)], axis=-1)
+    known = np.matvec(bank, h)
+    Ph = known[..., m:]
+    s = frame + model + np.vecdot(h, Ph)
+    known[..., :m] -= feature_step[..., None, :]  # −ν above P h: minus their products with the gain is the change
+    nu, share = known[..., :m], frame / s
+    learned = bank - outer(known, Ph / s[..., None])
+    learned[..., -1] = -share[..., None] * known
+    learned[..., -1, :-1] = learned[..., m:-1, -1]
+    learned[..., -1, -1] = frame * (1.0 - share)
+    return learned, np.vecdot(nu, nu) / s, s
 
 
 def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:

@@ -51,7 +51,7 @@ class NoiseLevel(NamedTuple):
         deviation: FloatArray = np.sqrt(self.variance)
         return deviation
 
-    def learn(self, square: FloatArray, multiple: float, other: FloatArray) -> NoiseLevel:
+    def learn(self, square: FloatArray, multiple: float | FloatArray, other: FloatArray) -> NoiseLevel:
         """Return the state after an innovation; one of exactly 0 is that of the same frame and holds no information.
 
         Args:
@@ -62,7 +62,7 @@ class NoiseLevel(NamedTuple):
         return branch(square != 0.0, _learned, self, square, multiple, other)
 
 
-def _learned(level: NoiseLevel, square: FloatArray, multiple: float, other: FloatArray) -> NoiseLevel:
+def _learned(level: NoiseLevel, square: FloatArray, multiple: float | FloatArray, other: FloatArray) -> NoiseLevel:
     variance, weight_sum, sample_sum, floor = level
     own = multiple * variance
     share = own / (own + other)

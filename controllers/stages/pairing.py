@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.estimators.estimator import MOTION_TIME
-from servobench.controllers.stages.map_bank import map_update, near_rotation
+from servobench.controllers.stages.map_bank import fresh_bank, map_update, near_rotation
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm, pick
@@ -51,7 +51,7 @@ class PairState(NamedTuple):
     Attributes:
         past: [q, Σ x] of the last periods, (..., H, n + m), the newest first.
         base: J_b, (..., m, n), of the last period.
-        bank: each candidate's map M above its covariance P, (..., D, 2m, m).
+        bank: each candidate's map M and noise e of the last frame above their covariance P, (..., D, 2m+1, m+1).
         scores: ℓ_d, (..., D).
         noise: σ².
         candidate: index of the delay, (...).
@@ -119,7 +119,6 @@ class Pairing:
         self._aligns = aids.model == "map"
         self.learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
         self._eye = np.eye(spec.m)
-        self._walk = np.concatenate([np.zeros_like(self._eye), self._eye])  # of a bank: M stays, P grows
         self._P0 = aids.map_deviation**2 * self._eye
 
     def start(self, observation: Observation, base: FloatArray) -> PairState:
@@ -127,7 +126,10 @@ class Pairing:
         q, lead = observation.joint_position, observation.feature.shape[:-1]
         none = np.zeros(lead, dtype=np.int_)
         row = np.concatenate([q, np.zeros((*lead, self._m))], axis=-1)
-        bank, eye = np.concatenate([self._eye, self._P0]), np.broadcast_to(self._eye, (*lead, self._m, self._m))
+        bank, eye = (
+            self._any_map(self._eye, self._aids.feature_noise**2),
+            np.broadcast_to(self._eye, (*lead, self._m, self._m)),
+        )
         return PairState(
             past=np.repeat(row[..., None, :], self._rows, axis=-2),
             base=base,
@@ -182,13 +184,20 @@ class Pairing:
         passed = pick(passed, state.candidate)
         return state, Paired(pick(begin, state.candidate)[..., :n], passed[..., :n], passed[..., n:])
 
+    def interrupt(self, state: PairState) -> PairState:
+        """Return the state after a frame in which no motion ended: nothing is known of its noise."""
+        bank = state.bank.copy()
+        bank[..., -1], bank[..., -1, :] = 0.0, 0.0
+        bank[..., -1, -1] = state.noise.variance[..., None]
+        return state._replace(bank=bank)
+
     def is_known(self, state: PairState) -> bool | BoolArray:
         """Return whether the map, where there is one, is known well enough to learn with it, (...)."""
         return not self._aligns or self.deviation(state) < self._aids.confidence
 
     def deviation(self, state: PairState) -> FloatArray:
         """Return the deviation of an entry of the map, (...)."""
-        P = pick(state.bank, state.candidate)[..., self._m :, :]
+        P = pick(state.bank, state.candidate)[..., self._m : -1, :-1]
         deviation: FloatArray = np.sqrt(P.trace(axis1=-2, axis2=-1) / self._m)
         return deviation
 
@@ -216,26 +225,30 @@ class Pairing:
         noise, zero = state.noise, np.zeros_like(state.cusum)
         if self._aids.noise == "identified":
             noise = noise.learn(np.vecdot(feature_step, feature_step) / self._m, 2.0, zero)
-        return state._replace(bank=self._any_map(state.bank), cusum=zero, moves=state.moves + 1, noise=noise)
+        bank = self._any_map(self._maps(state.bank), noise.variance[..., None])
+        return state._replace(bank=bank, cusum=zero, moves=state.moves + 1, noise=noise)
 
-    def _any_map(self, bank: FloatArray) -> FloatArray:
-        """Return the bank with P₀ for all P."""
-        unknown = np.broadcast_to(self._P0, (*bank.shape[:-2], self._m, self._m))
-        return np.concatenate([bank[..., : self._m, :], unknown], axis=-2)
+    def _maps(self, bank: FloatArray) -> FloatArray:
+        return bank[..., : self._m, :-1]
+
+    def _any_map(self, maps: FloatArray, frame: FloatArray | float) -> FloatArray:
+        """Return a bank with M (..., m, m), P₀ for its covariance, and σ² (...) for that of the last frame."""
+        return fresh_bank(maps, self._P0, frame)
 
     def _learn_map(self, state: PairState, x: FloatArray, lengths: FloatArray, feature_step: FloatArray) -> PairState:
         """Update map, covariance and score of every delay, and choose among them."""
         aids, m, noise, candidate = self._aids, self._m, state.noise, state.candidate
-        variance = 2.0 * noise.variance[..., None] + aids.map_error**2 * (lengths * lengths)
+        frame, model = noise.variance[..., None], aids.map_error**2 * (lengths * lengths)
         before = self._walked(state.bank, lengths)
-        bank, nis, s = map_update(before, x, feature_step, variance)
+        bank, nis, s = map_update(before, x, feature_step, frame, model)
         surprise, expected = pick(nis, candidate) / m, pick(s, candidate)
         if aids.noise == "identified":
-            noise = noise.learn(surprise * expected, 2.0, expected - 2.0 * noise.variance)
+            frames = 1.0 + np.minimum(pick(before, candidate)[..., -1, -1] / noise.variance, 1.0)  # σ² in s
+            noise = noise.learn(surprise * expected, frames, expected - frames * noise.variance)
         cusum, moves = np.maximum(0.0, state.cusum + np.minimum(surprise, CUSUM_CAP) - CUSUM_DRIFT), state.moves
         if aids.detect_moves:
             moved = cusum > aids.move_gate
-            bank = branch(moved, self._learn_any_map, bank, before, x, feature_step, variance)
+            bank = branch(moved, self._learn_any_map, bank, before, x, feature_step, frame, model)
             cusum, moves = cusum * ~moved, moves + moved
         scores = aids.score_memory * state.scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
         best = scores.argmin(axis=-1)
@@ -247,18 +260,27 @@ class Pairing:
         if not self._aligns:
             return state
         now = pick(bank, candidate)
-        nearest, rotation = near_rotation(now[..., :m, :], now[..., m:, :], aids.rotation_deviation)
+        nearest, rotation = near_rotation(self._maps(now), now[..., m:-1, :-1], aids.rotation_deviation)
         return state._replace(map=nearest, rotation=rotation)
 
     def _walked(self, bank: FloatArray, lengths: FloatArray) -> FloatArray:
-        """Return the bank with P ← P + w² ‖x_d‖ I, no larger than P₀."""
-        aids, m = self._aids, self._m
-        walked = bank + (aids.map_walk**2 * lengths)[..., None, None] * self._walk
+        """Return the bank with P_M ← P_M + w² ‖x_d‖ I, no larger than P₀."""
+        aids, m, walked = self._aids, self._m, bank.copy()
         P = walked[..., m:, :]
-        P /= np.maximum(P.trace(axis1=-2, axis2=-1) / (m * aids.map_deviation**2), 1.0)[..., None, None]
-        return np.asarray(walked)
+        P[..., :-1, :-1] += (aids.map_walk**2 * lengths)[..., None, None] * self._eye
+        larger = np.maximum(P[..., :-1, :-1].trace(axis1=-2, axis2=-1) / (m * aids.map_deviation**2), 1.0)
+        shrink = 1.0 / np.sqrt(larger)[..., None, None]  # of M in P = E[M; e][M; e]ᵀ
+        P[..., :-1, :] *= shrink
+        P[..., :-1] *= shrink
+        return walked
 
     def _learn_any_map(
-        self, bank: FloatArray, before: FloatArray, x: FloatArray, feature_step: FloatArray, variance: FloatArray
+        self,
+        bank: FloatArray,
+        before: FloatArray,
+        x: FloatArray,
+        feature_step: FloatArray,
+        frame: FloatArray,
+        model: FloatArray,
     ) -> FloatArray:
-        return map_update(self._any_map(before), x, feature_step, variance)[0]
+        return map_update(self._any_map(self._maps(before), frame), x, feature_step, frame, model)[0]

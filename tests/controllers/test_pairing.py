@@ -54,7 +54,7 @@ class Following:
     def bank(self):
         """Return map and covariance of the present delay."""
         bank = self.pair.bank[self.pair.candidate]
-        return bank[:M], bank[M:]
+        return bank[:M, :M], bank[M:-1, :M]
 
 
 def path(duration, period=PERIOD, seed=1):
@@ -112,16 +112,18 @@ def test_a_given_delay_is_used_as_it_is(latency):
     np.testing.assert_array_equal(before, q[len(q) - 1 - d] - q[len(q) - 2 - d])
 
 
-def test_the_map_is_that_of_batch_least_squares():
-    """With P⁻¹ = I and M = I at first, constant r = 2σ² and no walk."""
+def test_the_map_is_that_of_generalised_least_squares():
+    """With P⁻¹ = I and M = I at first, motions that share the noise of frames, and no walk."""
     q, sigma = path(2.0), 0.003
     y = features(q, TURN, 1) + sigma * np.random.default_rng(4).normal(size=(len(q), M))
     plain = {"noise": "given", "delay": "given", "map_walk": 0.0, "map_error": 0.0, "detect_moves": False}
     made = Following(latency=0.05, feature_noise=sigma, **plain).follow(q, y)
     X, Y = np.diff(features(q, np.eye(M), 1), axis=0), np.diff(y, axis=0)
-    normal = X.T @ X / (2.0 * sigma**2) + np.eye(M)
+    count = len(X)
+    weight = np.linalg.inv(sigma**2 * (2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)))
+    normal = X.T @ weight @ X + np.eye(M)
     map_, P = made.bank
-    np.testing.assert_allclose(map_, np.linalg.solve(normal, X.T @ Y / (2.0 * sigma**2) + np.eye(M)).T, rtol=1e-7)
+    np.testing.assert_allclose(map_, np.linalg.solve(normal, X.T @ weight @ Y + np.eye(M)).T, rtol=1e-7)
     np.testing.assert_allclose(P, np.linalg.inv(normal), rtol=1e-7, atol=1e-12)
 
 
@@ -166,7 +168,9 @@ def test_after_a_gap_that_is_longer_than_the_memory_nothing_is_learned_from_it(p
     made = Following(period).follow(q[: lost.stop], y[: lost.stop], valid)
     before = made.pair
     made.see(q[lost.stop], y[lost.stop])
-    np.testing.assert_array_equal(made.pair.bank, before.bank)
+    np.testing.assert_array_equal(made.pair.bank[:, :M, :M], before.bank[:, :M, :M])
+    np.testing.assert_array_equal(made.pair.bank[:, M:-1, :M], before.bank[:, M:-1, :M])
+    assert not made.pair.bank[:, :M, -1].any()  # the noise of the frame before the gap is in no motion
     np.testing.assert_array_equal(made.pair.moves, before.moves)
     made.follow(q[lost.stop + 1 :], y[lost.stop + 1 :])
     assert made.found["camera_moves"] == 0
@@ -213,14 +217,15 @@ def test_without_the_map_the_delay_is_still_found():
 
 
 def test_the_weighted_error_of_the_map_falls_by_each_innovation():
-    """V = tr(M̃ P⁻¹ M̃ᵀ) with P as it is, its walk and bound included: V(k+1) ≤ V(k) − ‖ν‖²/s."""
+    """V = tr([M̃ ẽ] P⁻¹ [M̃ ẽ]ᵀ) with P as it is, its walk and bound included: V(k+1) ≤ V(k) − ‖ν‖²/s."""
     q = path(4.0)
     y, made, moved = features(q, TURN, 0), Following(delay="given"), 0.0
     made.see(q[0], y[0])
 
     def weighted():
-        map_, P = made.bank
-        return float(np.trace((TURN - map_) @ np.linalg.solve(P, (TURN - map_).T)))
+        bank = made.pair.bank[made.pair.candidate]
+        wrong = np.column_stack([TURN, np.zeros(M)]) - bank[:M]
+        return float(np.trace(wrong @ np.linalg.solve(bank[M:], wrong.T)))
 
     for k in range(1, 80):
         before, moves = weighted(), made.found["camera_moves"]
