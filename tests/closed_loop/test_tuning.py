@@ -142,10 +142,10 @@ def test_every_run_has_a_robot_of_its_own_and_every_condition_plain_and_turned_c
         of_condition = runs[4 * index : 4 * index + 4]
         turned = [run.mismatch.size("camera_rotation") for run in of_condition]
         assert turned[0] == turned[2] < turned[3] < turned[1]
-        assert len({(run.task, run.noise_factor, run.latency) for run in of_condition}) == 1
+        assert len({(run.task, run.noise_factor, run.latency, run.command_delay) for run in of_condition}) == 1
     twice = TuningSet(("kinematic", "bullet"), 2).runs()
-    assert [run.plant for run in twice] == ["kinematic"] * 12 + ["bullet"] * 12
-    assert twice[0].seed == twice[12].seed
+    assert [run.plant for run in twice] == ["kinematic"] * 14 + ["bullet"] * 14
+    assert twice[0].seed == twice[14].seed
 
 
 def test_conditions_cover_latencies_up_to_150_ms_noise_and_curves_and_moves_weigh_like_curves():
@@ -153,7 +153,14 @@ def test_conditions_cover_latencies_up_to_150_ms_noise_and_curves_and_moves_weig
     assert {condition.noise_factor for condition in CONDITIONS} == {1.0, 4.0}
     assert {condition.task for condition in CONDITIONS} == {MOVE, "circle", "lemniscate"}
     weights = [sum(each.weight for each in CONDITIONS if (each.task == MOVE) == moves) for moves in (True, False)]
-    assert weights == [0.5 * len(CONDITIONS)] * 2
+    assert weights == pytest.approx([0.5 * len(CONDITIONS)] * 2)
+
+
+def test_on_one_circle_commands_take_effect_at_once_and_on_the_others_with_the_delay_of_the_plant():
+    entry = find_tunable("constant")
+    circles = [run for run in SMALL.runs() if run.task == "circle"]
+    plants = [run.plant for run in Trial("constant", default_config(entry)).resolved(circles)]
+    assert [(plant.command_delay, plant.sensing.latency) for plant in plants] == [(0.05, 0.0)] * 2 + [(0.0, 0.05)] * 2
 
 
 def test_the_second_set_is_larger_and_shares_no_robot_with_the_first():

@@ -1,13 +1,13 @@
 """What tuning minimises, and the runs that it is measured on.
 
-For each plant, `robots` runs under each of six conditions: latencies of 0 to 150 ms, usual and fourfold noise, four
-times moves (the task `random`, cut to 6 s), once a circle and once a figure of eight, both smaller and shorter than
-those of the tasks. Every run is another robot of `moderate` mismatch; of each second one the camera is turned by 30° or
-60°.
+For each plant, `robots` runs under each of seven conditions: latencies of 0 to 150 ms, usual and fourfold noise, four
+times moves (the task `random`, cut to 6 s), twice a circle and once a figure of eight, both smaller and shorter than
+those of the tasks. On one circle the whole delay is that of the camera and commands take effect at once. Every run is
+another robot of `moderate` mismatch; of each second one the camera is turned by 30° or 60°.
 
     score = mean over the runs of weight · cost                              (0 is perfect, 2 the worst)
 
-    weight: 3/4 of each of the many moves, 3/2 of each of the few curves; their mean is 1
+    weight: 7/8 of each of the many moves, 7/6 of each of the few curves; their mean is 1
 
     move:   cost = settling time / duration
                    1 + e / (e + 50 mm), e the RMS error of the last quarter, if it never settled
@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -49,16 +50,25 @@ class Condition:
     latency: float  # [s] of the camera
     noise_factor: float  # on the usual noise
     weight: float  # of a run in the score
+    command_delay: float | None = None  # [s] None for the plant's own
+
+
+@dataclass(frozen=True)
+class TuningRun(RunRequest):
+    """A run of a tuning set, still without a controller."""
+
+    command_delay: float | None = None  # [s] None for the plant's own
 
 
 MOVE: Final = "random"
 CONDITIONS: Final = (
-    Condition(MOVE, 0.0, 1.0, weight=0.75),
-    Condition(MOVE, 0.05, 4.0, weight=0.75),
-    Condition(MOVE, 0.1, 1.0, weight=0.75),
-    Condition(MOVE, 0.15, 4.0, weight=0.75),
-    Condition("circle", 0.0, 1.0, weight=1.5),
-    Condition("lemniscate", 0.1, 4.0, weight=1.5),
+    Condition(MOVE, 0.0, 1.0, weight=7 / 8),
+    Condition(MOVE, 0.05, 4.0, weight=7 / 8),
+    Condition(MOVE, 0.1, 1.0, weight=7 / 8),
+    Condition(MOVE, 0.15, 4.0, weight=7 / 8),
+    Condition("circle", 0.0, 1.0, weight=7 / 6),
+    Condition("circle", 0.05, 1.0, weight=7 / 6, command_delay=0.0),
+    Condition("lemniscate", 0.1, 4.0, weight=7 / 6),
 )
 WEIGHTS: Final[Mapping[str, float]] = {condition.task: condition.weight for condition in CONDITIONS}
 MISMATCHES: Final = (
@@ -107,12 +117,12 @@ class TuningSet:
         """Return the second, larger set: other robots of the tuning range, which no trial sees."""
         return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
 
-    def runs(self) -> list[RunRequest]:
+    def runs(self) -> list[TuningRun]:
         """Return all runs, still without a controller, the robots of a condition one after the other."""
         seeds = tuning_seeds(len(CONDITIONS) * self.robots, self.offset)
         mismatches = [read_mismatch(text) for text in MISMATCHES]
         return [
-            RunRequest(
+            TuningRun(
                 plant,
                 "",
                 condition.task,
@@ -120,6 +130,7 @@ class TuningSet:
                 seeds[c * self.robots + robot],
                 condition.noise_factor,
                 condition.latency,
+                command_delay=condition.command_delay,
             )
             for plant in self.plants
             for c, condition in enumerate(CONDITIONS)
@@ -139,11 +150,18 @@ class Trial:
     controller: str
     config: Any
 
-    def resolved(self, runs: Sequence[RunRequest]) -> list[ResolvedRun]:
+    def resolved(self, runs: Sequence[TuningRun]) -> list[ResolvedRun]:
         """Return runs of this trial, which share their settings; tuned values that are in use do not matter."""
         requests = [replace(run, controller=self.controller) for run in runs]
         sections = resolve_sections(requests, Settings(TASKS)) | {self.controller: self.config}
-        return [select(request, sections) for request in requests]
+        chosen = [(select(request, sections), request.command_delay) for request in requests]
+        return [run if delay is None else replace(run, plant=_delayed(run.plant, delay)) for run, delay in chosen]
+
+
+@lru_cache
+def _delayed(plant: Any, command_delay: float) -> Any:  # noqa: ANN401 - any configuration dataclass
+    """Return the same object for all runs of a delay [s], so that they can advance together."""
+    return replace(plant, command_delay=command_delay)
 
 
 Cost: TypeAlias = tuple[int, int, float]  # index of the trial, index of the run, its cost
@@ -167,7 +185,7 @@ def score(costs: Sequence[float]) -> float:
     return float(np.mean(costs))
 
 
-def evaluate(trials: Sequence[Trial], runs: Sequence[RunRequest], workers: Workers) -> Iterator[Cost]:
+def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: Workers) -> Iterator[Cost]:
     """Carry out every run of every trial and yield each cost as it is known, in any order.
 
     Args:
