@@ -16,12 +16,14 @@ import numpy as np
 import pybullet
 
 from measuring import asked_to_be_quick, table
-from servobench.plant.bullet.bullet_plant import CONTACT_STEPS, BulletConfig, build_bullet
-from servobench.plant.bullet.drives import PHYSICS_STEP
+from servobench.plant.bullet.bullet_plant import build_bullet
 from servobench.plant.bullet.mechanics import Mechanics
-from servobench.plant.bullet.scene import Scene
+from servobench.plant.bullet.scene import BulletScene
 from servobench.plant.checks import FloatArray, whole_steps
 from servobench.plant.plant import PlantSetup
+from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.ur5 import nominal_ur5
@@ -34,7 +36,7 @@ PERIOD = 0.05  # [s]
 class PlainEnvironment:
     """A step in the manner of Gymnasium in a scene of its own."""
 
-    def __init__(self, scene: Scene, config: BulletConfig, X_BC: FloatArray) -> None:
+    def __init__(self, scene: BulletScene, config: RenderedConfig, X_BC: FloatArray) -> None:
         """Take the scene and the camera's pose."""
         self._arm, self._client, camera = scene._arm, scene._client, config.camera()
         pybullet.setPhysicsEngineParameter(fixedTimeStep=PHYSICS_STEP, physicsClientId=self._client)
@@ -72,11 +74,11 @@ def milliseconds(call: Callable[[], object]) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-def measure(config: BulletConfig, repeats: int) -> FloatArray:
+def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
     model = nominal_ur5()
     plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
-    scenes = [Scene(model.arm, scenery=config.scenery, window=False) for _ in range(2)]
+    scenes = [BulletScene(model.arm, scenery=config.scenery, window=False) for _ in range(2)]
     mechanics = Mechanics(model.arm, payload=config.drives.payload, assumed_payload=config.drives.assumed_payload)
     camera, environment = config.camera(), PlainEnvironment(scenes[1], config, model.X_BC)
     plant.reset(0)
@@ -91,7 +93,7 @@ def measure(config: BulletConfig, repeats: int) -> FloatArray:
             for _ in range(2):
                 pybullet.calculateInverseDynamics(arm, theta, rest, rest, physicsClientId=client)
             if step % CONTACT_STEPS == 0:
-                mechanics.contact(HOME)
+                list(mechanics.overlaps(HOME))
         scenes[0].render(camera, model.X_BC)
 
     for k in range(repeats):
@@ -111,7 +113,7 @@ def main() -> None:
     """Print medians and ratios, with and without table and floor."""
     repeats = 3 if asked_to_be_quick(__doc__) else 200
     rows = []
-    for name, config in (("with scenery", BulletConfig()), ("without scenery", BulletConfig(scenery=False))):
+    for name, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
         medians = np.median(measure(config, repeats), axis=1)
         for kind, value in zip(("bare calls", "`Bench.step`", "Gymnasium-style loop"), medians, strict=True):
             rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])

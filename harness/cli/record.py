@@ -118,7 +118,7 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import check_settings
-    from servobench.plant.bullet.bullet_plant import BulletConfig
+    from servobench.plant.rendered.settings import RenderedConfig
 
     chosen = {
         "plant": choose_plant(asked["plant"]),
@@ -130,4 +130,4 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
         raise ConfigurationError(f"seed must not be negative, got {request.seed}")
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
-    return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", BulletConfig())))
+    return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", RenderedConfig())))

@@ -16,7 +16,7 @@ from typing import IO, Any, cast
 
 from servobench.harness.config.extras import missing_extra
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.bullet.detection import ByteArray
+from servobench.plant.rendered.detection import ByteArray
 
 MP4, GIF = "mp4", "gif"
 GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second

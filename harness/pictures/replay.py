@@ -20,10 +20,10 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
-from servobench.plant.bullet.bullet_plant import BulletConfig
-from servobench.plant.bullet.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -31,7 +31,7 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_seed
 
 if TYPE_CHECKING:
-    from servobench.plant.bullet.scene import Scene
+    from servobench.plant.bullet.scene import BulletScene
 
 EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame of a UR5: from the front right, down to it
 OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
@@ -69,7 +69,7 @@ class LoggedRun:
     model: HandEyeModel
     moved: HandEyeModel | None
     moved_from: int
-    config: BulletConfig
+    config: RenderedConfig
     joint_position: FloatArray
     ball: FloatArray
     reference: FloatArray
@@ -103,9 +103,9 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
             f"run {run_id} has no column {missing[0]}; wanted the joint positions of a {robot.title}"
         )
     model, moved = _true_model(row, robot)
-    known = {item.name for item in fields(BulletConfig)}
+    known = {item.name for item in fields(RenderedConfig)}
     try:
-        config = BulletConfig(**{name: value for name, value in settings.items() if name in known})
+        config = RenderedConfig(**{name: value for name, value in settings.items() if name in known})
     except (ValueError, TypeError) as error:
         raise ConfigurationError(f"run {run_id}: settings of bullet in the manifest: {error}") from error
     q, ball = steps[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
@@ -153,10 +153,10 @@ class Replay:
             run: what to show.
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
-        from servobench.plant.bullet.scene import Scene  # noqa: PLC0415 - PyBullet loads slowly
+        from servobench.plant.bullet.scene import BulletScene  # noqa: PLC0415 - PyBullet loads slowly
 
         self._run, self._fineness, scale = run, fineness, run.robot.workspace.scale
-        self._scene: Scene = Scene(run.model.arm, scenery=True, window=False, robot=run.robot)
+        self._scene: BulletScene = BulletScene(run.model.arm, scenery=True, window=False, robot=run.robot)
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]

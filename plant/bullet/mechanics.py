@@ -1,7 +1,7 @@
 """The arm as rigid bodies: its inertia and gravity torques, and what touches what; computed by PyBullet.
 
 A physics world of its own, without looks: the arm with its true load, the arm as the drives believe it, and the table,
-the floor and the boxes around it. The motion itself is integrated in `servobench.plant.bullet.drives`.
+the floor and the boxes around it. The motion itself is integrated in `servobench.plant.bullet.simulation`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from servobench.plant.bullet.drives import RigidBody
 from servobench.plant.bullet.engine import pybullet
-from servobench.plant.bullet.urdf import Box, arm_mechanics, boxes_urdf, room_boxes
+from servobench.plant.rendered.drives import RigidBody
+from servobench.plant.rendered.engine import MIN_OVERLAP, Overlap
+from servobench.plant.rendered.urdf import Box, arm_mechanics, boxes_urdf, room_boxes
+from servobench.plant.robot.bodies import GRAVITY
 from servobench.plant.robot.catalogue import UR5, find_robot
 
 if TYPE_CHECKING:
@@ -24,11 +26,7 @@ if TYPE_CHECKING:
     from servobench.plant.robot.arm import SerialArm
     from servobench.plant.robot.robot import Robot
 
-GRAVITY = 9.81  # m/s²
 CONTACT_DISTANCE = 8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
-MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
-LAST_ON_TABLE = 1  # base and shoulder stand on the table
-BUILT_INTO_EACH_OTHER = (0, 2)  # base and upper arm, whose housings meet inside the shoulder in every pose
 
 
 class Mechanics:
@@ -72,10 +70,6 @@ class Mechanics:
             raise
         self._joints = list(range(arm.n))
         self._rest = [0.0] * arm.n
-        self._names = ["base", *arm.joint_names]
-        self._built_in = {BUILT_INTO_EACH_OTHER}
-        if described.name != UR5:
-            self._built_in |= self._meeting(arm.joint_angle(described.workspace.home))
 
     def _load(self, urdf: str, flags: int) -> int:
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
@@ -103,41 +97,16 @@ class Mechanics:
             np.array(torques(self._assumed, theta, rest, rest, physicsClientId=client)),
         )
 
-    def contact(self, angle: FloatArray, *, room: bool = True, own: bool = True) -> tuple[str, str] | None:
-        """Return the names of two bodies that overlap, or None.
-
-        Neighbouring links never count, nor do base and shoulder on their table. Flange, tool and ball belong to the
-        last link.
-
-        Args:
-            angle: (n,) [rad], joint angles.
-            room: whether contact with table, floor and boxes counts.
-            own: whether contact of the arm with itself counts.
-        """
-        for first, second, other in self._overlaps(angle):
-            if room and other is not None and first > LAST_ON_TABLE:
-                return self._names[first], other
-            pair = min(first, second), max(first, second)
-            if own and other is None and pair[1] - pair[0] > 1 and pair not in self._built_in:
-                return self._names[pair[0]], self._names[pair[1]]
-        return None
-
-    def _meeting(self, angle: FloatArray) -> set[tuple[int, int]]:
-        """Return the pairs of links that overlap at joint angles (n,) [rad] in which nothing touches in truth."""
-        return {
-            (min(first, second), max(first, second)) for first, second, other in self._overlaps(angle) if other is None
-        }
-
-    def _overlaps(self, angle: FloatArray) -> Iterator[tuple[int, int, str | None]]:
-        """Yield the bodies that overlap: two links, counted from the base, or a link and the name of a box."""
+    def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
+        """See `Simulation.overlaps`."""
         client, n = self._client, len(self._joints)
         for joint, value in zip(self._joints, angle.tolist(), strict=True):
             pybullet.resetJointState(self._arm, joint, value, physicsClientId=client)
         pybullet.performCollisionDetection(physicsClientId=client)
         for point in pybullet.getContactPoints(bodyA=self._arm, physicsClientId=client):
             if point[CONTACT_DISTANCE] <= -MIN_OVERLAP:
-                first, second = (min(link, n - 1) + 1 for link in point[3:5])  # PyBullet counts the base as -1
-                yield first, second, self._boxes.get(point[2])
+                link, other = (min(each, n - 1) + 1 for each in point[3:5])  # PyBullet counts the base as -1
+                yield Overlap(link, self._boxes.get(point[2], other))
 
     def close(self) -> None:
         """Leave the world; calling it twice is allowed."""

@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from servobench.plant.bullet.engine import pybullet
-from servobench.plant.bullet.meshes import sphere_obj
-from servobench.plant.bullet.urdf import Box, arm_urdf, bench_files, boxes_urdf
+from servobench.plant.rendered.engine import Scene
+from servobench.plant.rendered.meshes import sphere_obj
+from servobench.plant.rendered.urdf import Box, arm_urdf, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
 from servobench.plant.robot.catalogue import UR5, find_robot
 
 if TYPE_CHECKING:
-    from servobench.plant.bullet.detection import ByteArray
     from servobench.plant.checks import FloatArray
+    from servobench.plant.rendered.detection import ByteArray
     from servobench.plant.robot.arm import SerialArm
     from servobench.plant.robot.robot import Robot
 
@@ -36,7 +37,7 @@ def describe_renderer() -> str:
     return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
 
 
-class Scene:
+class BulletScene(Scene):
     """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
 
     def __init__(
@@ -48,14 +49,7 @@ class Scene:
         boxes: tuple[Box, ...] = (),
         robot: Robot | None = None,
     ) -> None:
-        """Open a world and load the arm.
-
-        Args:
-            arm: the true kinematics.
-            scenery: whether to load the table and the floor.
-            window: whether to open PyBullet's window.
-            boxes: what else is in the room.
-            robot: by its maker's description, for the looks; None for the UR5.
+        """Open a world and load the arm; see `OpenScene`.
 
         Raises:
             ValueError: a robot with another number of joints, or a window is wanted where there is no display.
@@ -108,19 +102,19 @@ class Scene:
         pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
 
     def place(self, theta: FloatArray) -> None:
-        """Put the arm at joint angles `theta` (n,) rad."""
+        """See `Scene.place`."""
         for joint, angle in zip(self._joints, theta.tolist(), strict=True):
             pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._client)
 
     def ball_position(self) -> FloatArray:
-        """Return the ball's centre in the base frame, (3,) m, from the simulator's own link state."""
+        """See `Scene.ball_position`; from the simulator's own link state."""
         state = pybullet.getLinkState(
             self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=self._client
         )
         return np.array(state[4])
 
     def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
-        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 4) uint8, and OpenGL depths (h, w) in [0, 1]."""
+        """See `Scene.render`."""
         _, _, rgba, depth, _ = pybullet.getCameraImage(
             camera.width,
             camera.height,
@@ -135,7 +129,7 @@ class Scene:
         return np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4), np.asarray(depth).reshape(shape)
 
     def close(self) -> None:
-        """Leave the world; calling it twice is allowed."""
+        """See `Scene.close`."""
         if self._client >= 0:
             client, self._client = self._client, -1
             if pybullet.isConnected(client):

@@ -12,8 +12,9 @@ import pytest
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
 from kit.bullet import BARE, HOME, IDEAL, MODEL, geared_ur5, wiggle
-from servobench.plant.bullet.bullet_plant import BulletConfig, build_bullet
+from servobench.plant.bullet.bullet_plant import build_bullet
 from servobench.plant.plant import PlantSetup
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.signals import Command
 
 
@@ -105,4 +106,4 @@ def test_naming_the_plant_does_not_load_pybullet():
 def test_a_window_without_a_display_is_refused(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ValueError, match="view needs a display"):
-        build_bullet(BulletConfig(view=True), PlantSetup(MODEL, HOME, 0.05))
+        build_bullet(RenderedConfig(view=True), PlantSetup(MODEL, HOME, 0.05))

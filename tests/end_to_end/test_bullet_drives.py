@@ -9,9 +9,11 @@ import pytest
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
 from kit.bullet import BARE, HOME, IDEAL, MODEL, geared_ur5
-from servobench.plant.bullet.drives import PHYSICS_STEP, DriveConfig
 from servobench.plant.bullet.mechanics import Mechanics
 from servobench.plant.faults import Collision, FeatureLost, PlantDiverged
+from servobench.plant.rendered.contact import Contacts
+from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.signals import Command
 
 
@@ -147,8 +149,9 @@ def test_meeting_itself_ends_the_run_where_that_is_wanted(open_plant):
 def test_neighbouring_links_never_count_as_contact():
     mechanics, rng = Mechanics(MODEL.arm, payload=1.0, assumed_payload=1.0), np.random.default_rng(0)
     names = ["base", *MODEL.arm.joint_names]
-    met = [mechanics.contact(rng.uniform(-np.pi, np.pi, 6), room=False) for _ in range(200)]
-    assert mechanics.contact(HOME) is None
+    contacts = Contacts(mechanics.overlaps, MODEL.arm, find_robot("ur5"))
+    met = [contacts.find(rng.uniform(-np.pi, np.pi, 6), room=False) for _ in range(200)]
+    assert contacts.find(HOME) is None
     mechanics.close()
     pairs = [pair for pair in met if pair is not None]
     assert 5 < len(pairs) < 195

@@ -9,10 +9,10 @@ import pytest
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
 from kit.bullet import BARE, HOME, IDEAL, MODEL, wiggle
-from servobench.plant.bullet.bullet_plant import BulletConfig
-from servobench.plant.bullet.detection import find_patch, locate_ball
-from servobench.plant.bullet.scene import Scene
+from servobench.plant.bullet.scene import BulletScene
 from servobench.plant.faults import FeatureLost
+from servobench.plant.rendered.detection import find_patch, locate_ball
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
 from servobench.plant.signals import Command
@@ -23,7 +23,7 @@ FLANGE_DOWN = np.array([np.pi, -1.6, 1.9, -1.87, -np.pi / 2, 0.0])
 def errors_over_poses(noise, count) -> tuple[np.ndarray, int]:
     """Detected less simulated ball centres over random visible poses, and how many poses were tried."""
     camera, rng = PinholeCamera(), np.random.default_rng(11)
-    scene = Scene(MODEL.arm, scenery=False, window=False)
+    scene = BulletScene(MODEL.arm, scenery=False, window=False)
     errors, tried = [], 0
     while len(errors) < count:
         scene.place(HOME + rng.uniform(-0.6, 0.6, 6))
@@ -63,7 +63,7 @@ def test_stereo_noise_moves_the_centre_by_more_than_the_noise_of_kinematic():
 
 
 def test_table_and_floor_cost_time_and_change_no_bit_of_an_observation(open_plant):
-    np.testing.assert_array_equal(wiggle(open_plant(BulletConfig()), 3, 6), wiggle(open_plant(BARE), 3, 6))
+    np.testing.assert_array_equal(wiggle(open_plant(RenderedConfig()), 3, 6), wiggle(open_plant(BARE), 3, 6))
 
 
 def test_a_ball_that_gets_hidden_is_not_valid_and_the_last_feature_is_held(open_plant):
@@ -87,7 +87,7 @@ def test_a_ball_that_is_hidden_at_the_start_is_reported_with_evidence(open_plant
 
 
 def test_table_and_floor_are_in_view():
-    scene, camera = Scene(MODEL.arm, scenery=True, window=False), PinholeCamera()
+    scene, camera = BulletScene(MODEL.arm, scenery=True, window=False), PinholeCamera()
     depth = camera.metric_depth(scene.render(camera, MODEL.X_BC)[1])
     scene.close()
     distance = MODEL.X_BC[2, 3]

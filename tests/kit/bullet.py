@@ -3,18 +3,19 @@
 import numpy as np
 
 from kit.plants import configure
-from servobench.plant.bullet.bullet_plant import BulletConfig, build_bullet
-from servobench.plant.bullet.drives import DriveConfig
+from servobench.plant.bullet.bullet_plant import build_bullet
 from servobench.plant.plant import PlantSetup
+from servobench.plant.rendered.drives import DriveConfig
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
-BARE = BulletConfig(scenery=False)
+BARE = RenderedConfig(scenery=False)
 IDEAL = configure(
-    BulletConfig,
+    RenderedConfig,
     scenery=False,
     lag=0.0,
     drives=DriveConfig(dynamics=False),

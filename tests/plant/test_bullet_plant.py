@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 
 from kit.plants import NEEDS_BULLET, configure
-from servobench.plant.bullet.bullet_plant import BulletConfig, build_bullet
+from servobench.plant.bullet.bullet_plant import build_bullet
 from servobench.plant.plant import PlantSetup
+from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 HOME = np.array(ur5.HOME)
-BARE = BulletConfig(scenery=False)
+BARE = RenderedConfig(scenery=False)
 MODEL = ur5.nominal_ur5()
 
 
@@ -28,7 +29,7 @@ def test_the_camera_sees_the_circle_of_the_workspace_with_a_margin(height):
 @NEEDS_BULLET
 def test_a_period_that_physics_does_not_divide_is_refused():
     with pytest.raises(ValueError, match=r"period must be a whole multiple of the plant's own step of 0\.001 s"):
-        build_bullet(configure(BulletConfig, scenery=False, latency=0.0), PlantSetup(MODEL, HOME, 0.0305))
+        build_bullet(configure(RenderedConfig, scenery=False, latency=0.0), PlantSetup(MODEL, HOME, 0.0305))
 
 
 @NEEDS_BULLET
@@ -41,4 +42,4 @@ def test_a_gear_ratio_of_zero_is_refused():
 
 def test_an_obstacle_that_is_no_box_is_refused():
     with pytest.raises(ValueError, match="obstacles"):
-        BulletConfig(obstacles=((0.1, 0.2, 0.3),))
+        RenderedConfig(obstacles=((0.1, 0.2, 0.3),))

@@ -3,7 +3,7 @@ import colorsys
 import numpy as np
 import pytest
 
-from servobench.plant.bullet.detection import (
+from servobench.plant.rendered.detection import (
     Detection,
     add_colour_noise,
     disc_area,

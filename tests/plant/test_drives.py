@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servobench.plant.bullet.drives import PHYSICS_STEP, STICKING_SPEED, DriveConfig, Drives, DriveState, RigidBody
+from servobench.plant.rendered.drives import PHYSICS_STEP, STICKING_SPEED, DriveConfig, Drives, DriveState, RigidBody
 
 FREE = DriveConfig(
     coulomb_friction=(0.0,),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
-from servobench.plant.bullet.drives import DriveConfig, drives_for
-from servobench.plant.bullet.urdf import arm_urdf
+from servobench.plant.rendered.drives import DriveConfig, drives_for
+from servobench.plant.rendered.urdf import arm_urdf
 from servobench.plant.robot.arm import rotation_from_rpy
 from servobench.plant.robot.bodies import at_far_end, estimate_links
 from servobench.plant.robot.catalogue import ROBOTS, find_robot

@@ -3,9 +3,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from servobench.plant.bullet.meshes import rectangles_obj, sphere_obj
-from servobench.plant.bullet.urdf import arm_mechanics, arm_urdf, bench_files
-from servobench.plant.bullet.urdf_elements import rpy_along
+from servobench.plant.rendered.meshes import rectangles_obj, sphere_obj
+from servobench.plant.rendered.urdf import arm_mechanics, arm_urdf, bench_files
+from servobench.plant.rendered.urdf_elements import rpy_along
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 

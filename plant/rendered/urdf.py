@@ -14,8 +14,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from servobench.plant.bullet.meshes import rectangles_obj
-from servobench.plant.bullet.urdf_elements import (
+from servobench.plant.checks import FloatArray
+from servobench.plant.rendered.meshes import rectangles_obj
+from servobench.plant.rendered.urdf_elements import (
     add_joint,
     add_link,
     add_visual,
@@ -25,7 +26,6 @@ from servobench.plant.bullet.urdf_elements import (
     numbers,
     text,
 )
-from servobench.plant.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.robot import Robot

@@ -1,0 +1,144 @@
+"""The contract of a physics engine under a rendered plant: it shows an arm, and it moves one.
+
+Joint angles here are the true ones, θ; the world frame W is the arm's base frame B.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from servobench.plant.checks import FloatArray
+from servobench.plant.rendered.urdf import Box
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.robot import Robot
+
+if TYPE_CHECKING:
+    from servobench.plant.rendered.detection import ByteArray
+    from servobench.plant.rendered.drives import DriveConfig
+
+MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
+
+
+class Scene(ABC):
+    """An arm with a ball on its flange that is only looked at."""
+
+    @abstractmethod
+    def place(self, theta: FloatArray) -> None:
+        """Put the arm at joint angles `theta` (n,) rad."""
+
+    @abstractmethod
+    def ball_position(self) -> FloatArray:
+        """Return the ball's centre in the base frame, (3,) m, from the engine's own kinematics."""
+
+    @abstractmethod
+    def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
+        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1]."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the engine's world; calling it twice is allowed."""
+
+
+class OpenScene(Protocol):
+    """The constructor of an engine's scene."""
+
+    def __call__(
+        self, arm: SerialArm, *, scenery: bool, window: bool, boxes: tuple[Box, ...] = (), robot: Robot | None = None
+    ) -> Scene:
+        """Open a world and load the arm.
+
+        Args:
+            arm: the true kinematics.
+            scenery: whether to load the table and the floor.
+            window: whether to open the engine's window.
+            boxes: what else is in the room.
+            robot: by its maker's description, for the looks; None for the UR5.
+
+        Raises:
+            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """What a simulation is built from.
+
+    Attributes:
+        arm: the true kinematics.
+        robot: by its maker's description, for masses and shapes.
+        boxes: obstacles beside table and floor.
+        drives: loops, torque limits, friction and load of the joints.
+        lag: [s] by which the drives smooth commanded velocities, 0 for none.
+        start: (n,) [rad], joint angles at which the loops are tuned.
+        stops: (n,) and (n,) [rad], lower and upper stop of the joint angles.
+    """
+
+    arm: SerialArm
+    robot: Robot
+    boxes: tuple[Box, ...]
+    drives: DriveConfig
+    lag: float
+    start: FloatArray
+    stops: tuple[FloatArray, FloatArray]
+
+
+class Joints(Protocol):
+    """The state of a simulation: an immutable value with whatever the engine needs to go on."""
+
+    @property
+    def angle(self) -> FloatArray:
+        """Joint angles θ, (n,) [rad]."""
+
+
+class Overlap(NamedTuple):
+    """Two bodies that overlap by `MIN_OVERLAP` or more.
+
+    Attributes:
+        link: number of a link, counted from the base, which is 0; flange, tool and ball belong to the last one.
+        other: number of another link, or the name of a box in the room.
+    """
+
+    link: int
+    other: int | str
+
+
+class Simulation(ABC):
+    """An arm with mass and drives among obstacles; its state is a value that goes in and comes out."""
+
+    @abstractmethod
+    def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - `Joints` of its own, as below
+        """Return joints at rest at `angle` (n,) [rad] whose drives carry the arm's weight."""
+
+    @abstractmethod
+    def advance(self, joints: Any, speed: FloatArray, steps: int) -> Any:  # noqa: ANN401
+        """Return the joints some physics steps later.
+
+        Args:
+            joints: the present state.
+            speed: (n,) [rad/s], commanded, of the joint angles.
+            steps: how many steps of `PHYSICS_STEP`.
+        """
+
+    @abstractmethod
+    def overlaps(self, angle: FloatArray) -> Iterable[Overlap]:
+        """Return the bodies that overlap at joint angles (n,) [rad]."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free the engine's world; calling it twice is allowed."""
+
+
+class Engine(NamedTuple):
+    """A physics engine: how its scenes and simulations are opened.
+
+    Attributes:
+        scene: for the camera.
+        simulation: for the motion.
+    """
+
+    scene: OpenScene
+    simulation: Callable[[Machine], Simulation]
