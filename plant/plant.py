@@ -216,6 +216,7 @@ class PlantEntry:
         config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
+        lacking: returns one line about what this machine lacks beside packages; empty if nothing.
         engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
         any_sensing: it takes every sensing set-up; else only the ball that a fixed camera sees in 3-D.
     """
@@ -227,6 +228,7 @@ class PlantEntry:
     own_robot: bool = False
     side_by_side: bool = False
     needs: tuple[str, ...] = ()
+    lacking: Callable[[], str] | None = None
     engine: Callable[[], str] | None = None
     config_for: Callable[[Robot], Any] | None = None
     any_sensing: bool = False

@@ -22,6 +22,7 @@ PACKAGES = (
     "pandas",
     "pyarrow",
     "pybullet",
+    "mujoco",
     "control",
     "casadi",
     "fmpy",

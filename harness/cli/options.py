@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
     from servobench.plant.plant import PlantEntry
 
-DEFAULT_PLANT = "bullet, or kinematic where PyBullet is not installed"
+DEFAULT_PLANT = "the first of bullet, mujoco and kinematic that is installed"
 FAILED = 1  # exit code where a run failed, or a check was not passed
 INTERRUPTED = 130  # exit code after Ctrl-C
 

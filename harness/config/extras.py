@@ -10,6 +10,7 @@ from servobench.harness.config.settings import ConfigurationError
 
 EXTRAS: Final = {  # top-level module -> extra
     "pybullet": "bullet",
+    "mujoco": "mujoco",
     "jinja2": "report",
     "optuna": "tune",
     "distributed": "cluster",
@@ -17,6 +18,11 @@ EXTRAS: Final = {  # top-level module -> extra
     "yourdfpy": "urdf",
 }
 NO_WHEELS: Final = (3, 12)  # first version of Python for which PyBullet 3.2 offers none
+
+
+def has_no_wheel() -> bool:
+    """Return whether PyBullet would have to be compiled on this version of Python."""
+    return sys.version_info >= NO_WHEELS
 
 
 def missing_extra(error: ImportError, what: str) -> str | None:
@@ -47,7 +53,7 @@ def check_installed(modules: tuple[str, ...], what: str) -> None:
 
 def _line(module: str, what: str) -> str:
     line = f"{what} needs {module}: pip install " + (f"'servobench[{EXTRAS[module]}]'" if module in EXTRAS else module)
-    if module == "pybullet" and sys.version_info >= NO_WHEELS:
+    if module == "pybullet" and has_no_wheel():
         version = ".".join(map(str, sys.version_info[:2]))
         line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"
     return line

@@ -19,7 +19,7 @@ from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
-from servobench.harness.config.extras import check_installed
+from servobench.harness.config.extras import check_installed, has_no_wheel
 from servobench.harness.config.own import Own, describe_import, is_place, read_own
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.files import user_path
@@ -32,9 +32,11 @@ CONTROLLER_GROUP = "servobench.controllers"
 PLANTS = {
     "kinematic": "servobench.plant.kinematic:ENTRY",
     "bullet": "servobench.plant.bullet.bullet_plant:ENTRY",
+    "mujoco": "servobench.plant.mujoco.mujoco_plant:ENTRY",
     "fmu": "servobench.fmus.ur5_plant:ENTRY",
 }
-DEFAULT_PLANTS = ("bullet", "kinematic")  # the first one that is installed
+RENDERED = ("bullet", "mujoco")  # a run without a named plant is on the first one that is installed
+UNRENDERED = "kinematic"  # its plant where none of them is
 MAPPED = "fmu:"
 ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
@@ -164,10 +166,13 @@ def installed_plant(name: str) -> PlantEntry:
     """Return the plant called `name` if all that it needs is installed.
 
     Raises:
-        ConfigurationError: as `find_plant`, or an extra is missing; the message says what to install.
+        ConfigurationError: as `find_plant`, or an extra or a renderer is missing; the message says what to install.
     """
     entry = find_plant(name)
     check_installed(entry.needs, f"plant {name!r}")
+    lack = "" if entry.lacking is None else entry.lacking()
+    if lack:
+        raise ConfigurationError(f"plant {name!r} cannot run here: {lack}")
     return entry
 
 
@@ -185,13 +190,19 @@ def _told(entry: PlantEntry) -> str:
 
 
 def default_plant() -> tuple[str, str]:
-    """Return the plant of a run for which none is named, and why it is not the first choice; empty if it is."""
-    first, second = DEFAULT_PLANTS
-    try:
-        installed_plant(first)
-    except ConfigurationError as error:
-        return second, str(error)
-    return first, ""
+    """Return the plant of a run for which none is named, and why it is not a first choice; empty if it is.
+
+    Where PyBullet has no wheel, `mujoco` is as good a choice as `bullet`, and the one to install.
+    """
+    missing = {}
+    for name in RENDERED:
+        try:
+            installed_plant(name)
+        except ConfigurationError as error:
+            missing[name] = str(error)
+        else:
+            return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
+    return UNRENDERED, missing[RENDERED[has_no_wheel()]]
 
 
 def find_controller(name: str) -> ControllerEntry:

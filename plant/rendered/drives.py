@@ -175,6 +175,21 @@ class Drives:
         """Return the state of joints that are exactly where their reference is."""
         return state._replace(angle=state.reference, speed=state.reference_speed)
 
+    def torque(self, state: DriveState, assumed_gravity: FloatArray) -> tuple[FloatArray, DriveState]:
+        """Return the torque for one physics step, (n,) [Nm], and the loops after it: joints where they were.
+
+        Args:
+            state: the state whose reference has just been advanced by `follow`.
+            assumed_gravity: ĝ in the state, (n,) [Nm].
+        """
+        behind = np.minimum(np.maximum(state.reference - state.angle, -MAX_FOLLOWING_ERROR), MAX_FOLLOWING_ERROR)
+        error = state.reference_speed + self._position_gain * behind - state.speed
+        friction = self._compensation * self._drag(state.reference_speed) * state.reference_speed
+        asked = self._velocity_gain * error + state.integral + assumed_gravity + friction
+        torque = np.minimum(np.maximum(asked, -self._limit), self._limit)
+        integral = state.integral + self._integral_gain * error * (asked == torque)
+        return torque, state._replace(reference=state.angle + behind, integral=integral)
+
     def drive(self, state: DriveState, body: RigidBody) -> DriveState:
         """Return the state one physics step later under the loops' torques.
 
@@ -182,13 +197,8 @@ class Drives:
             state: the state whose reference has just been advanced by `follow`.
             body: what the links and the load ask in the state.
         """
+        torque, after = self.torque(state, body.assumed_gravity)
         angle, speed, h = state.angle, state.speed, PHYSICS_STEP
-        behind = np.minimum(np.maximum(state.reference - angle, -MAX_FOLLOWING_ERROR), MAX_FOLLOWING_ERROR)
-        error = state.reference_speed + self._position_gain * behind - speed
-        friction = self._compensation * self._drag(state.reference_speed) * state.reference_speed
-        asked = self._velocity_gain * error + state.integral + body.assumed_gravity + friction
-        torque = np.minimum(np.maximum(asked, -self._limit), self._limit)
-        integral = state.integral + self._integral_gain * error * (asked == torque)
         inertia = body.inertia + self._rotor
         momentum = inertia @ speed + h * (torque - body.bias)
         inertia[self._diagonal] += self._drag(speed)
@@ -196,7 +206,7 @@ class Drives:
         moved = angle + h * speed
         angle_after = np.minimum(np.maximum(moved, self._lower), self._upper)
         speed = np.where(angle_after == moved, speed, 0.0)
-        return DriveState(angle_after, speed, angle + behind, state.reference_speed, integral)
+        return after._replace(angle=angle_after, speed=speed)
 
     def _drag(self, speed: FloatArray) -> FloatArray:
         """Return friction over speed, times the physics step, at speeds (n,) [rad/s], (n,) [kg m²]."""

@@ -10,9 +10,10 @@ from importlib.metadata import version
 import pytest
 
 from kit.folders import comparison
-from kit.plants import NEEDS_BULLET
-from servobench.harness.config import extras
+from kit.plants import NEEDS_BULLET, NEEDS_MUJOCO
+from servobench.harness.config import extras, registry
 from servobench.harness.config.extras import EXTRAS
+from servobench.harness.config.settings import ConfigurationError
 
 HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", "pybullet", "casadi", "fmpy", "cv2", *EXTRAS)
 QUICK = ("run", "--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", "out")
@@ -69,6 +70,8 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
         ("pybullet", "bullet", ("record", "--plant", "kinematic")),
         ("pybullet", "bullet", ("run", "--plant", "bullet")),
         ("pybullet", "bullet", ("compare", "--plants", "kinematic,bullet")),
+        ("mujoco", "mujoco", ("run", "--plant", "mujoco")),
+        ("mujoco", "mujoco", ("compare", "--plants", "kinematic,mujoco")),
     ],
 )
 def test_a_missing_extra_is_one_line_that_says_what_to_install(tmp_path, module, extra, arguments):
@@ -80,15 +83,46 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(tmp_path, module,
     assert f" needs {module}: pip install 'servobench[{extra}]'" in done.stderr
 
 
-def test_without_pybullet_a_run_that_names_no_plant_takes_the_kinematic_one_and_says_why(tmp_path):
-    done = servobench_without(("pybullet",), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path)
+def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and_says_why(tmp_path):
+    done = servobench_without(("pybullet", "mujoco"), ("run", "--set", "exp2.duration=0.5", "--out", "out"), tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     told, *_, folder = done.stdout.splitlines()
-    assert told.startswith("no plant is named, so this run is on kinematic: plant 'bullet' needs pybullet: ")
+    wanted = ("mujoco", "mujoco") if extras.has_no_wheel() else ("bullet", "pybullet")
+    assert told.startswith("no plant is named, so this run is on kinematic: plant '{}' needs {}: ".format(*wanted))
     assert folder.endswith(" in out")
     assert json.loads((tmp_path / "out" / "manifest.json").read_text())["engines"] == {}
     listed = servobench_without(("pybullet",), ("plants",), tmp_path).stdout
     assert "'servobench[bullet]'" in listed
+
+
+@NEEDS_MUJOCO
+def test_without_pybullet_mujoco_is_the_rendered_plant(monkeypatch):
+    monkeypatch.setattr(registry, "check_installed", lambda needs, what: needs == ("pybullet",) and refuse(what))
+    assert registry.default_plant() == (
+        "mujoco",
+        "" if extras.has_no_wheel() else "plant 'bullet' needs what is not here",
+    )
+
+
+def refuse(what):
+    raise ConfigurationError(f"{what} needs what is not here")
+
+
+@NEEDS_MUJOCO
+@pytest.mark.parametrize(
+    ("word", "reason"),
+    [
+        ("off", "MuJoCo cannot render through off"),
+        ("nonsense", "MuJoCo cannot be loaded: invalid value for environment"),
+    ],
+)
+def test_a_machine_that_cannot_render_is_told_what_to_install(tmp_path, monkeypatch, word, reason):
+    monkeypatch.setenv("MUJOCO_GL", word)
+    done = servobench_without((), ("run", "--plant", "mujoco"), tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"servobench: plant 'mujoco' cannot run here: {reason}")
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 @NEEDS_BULLET

@@ -58,7 +58,7 @@ def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whethe
         (("--offset", "-1"), "offset must be at least 0, got -1"),
         (("--study-seed", "-1"), "study_seed must be at least 0, got -1"),
         (("--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
-        (("--plants", ""), "--plants is empty; valid: kinematic, bullet, fmu"),
+        (("--plants", ""), "--plants is empty; valid: kinematic, bullet, mujoco, fmu"),
     ],
 )
 def test_bad_input_is_one_line_exit_code_2_and_nothing_written(monkeypatch, capsys, tmp_path, arguments, message):

@@ -74,7 +74,7 @@ def completed(*words):
         (("run", "ukf_m"), ["ukf_mfac", "ukf_mfac:published", "ukf_mpc", "ukf_mpc:published"]),
         (("run", "--controller", "mfac+br"), ["mfac+broyden"]),
         (("run", "--estimator", "ka"), ["kalman"]),
-        (("run", "--plant", ""), ["kinematic", "bullet", "fmu"]),
+        (("run", "--plant", ""), ["kinematic", "bullet", "mujoco", "fmu"]),
         (("run", "--task", "exp"), ["exp1", "exp2", "exp3", "exp4"]),
         (("run", "--robot", "ur5"), ["ur5", "ur5e"]),
         (("run", "--mismatch", "mod"), ["moderate"]),

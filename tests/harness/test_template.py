@@ -17,7 +17,7 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve_sections
 from servobench.harness.run.tasks import TASKS
 
-PLANTS = ("kinematic", "bullet", "fmu")
+PLANTS = ("kinematic", "bullet", "mujoco", "fmu")
 
 
 def sections(plants, controllers, tasks, *assignments, path=None):

@@ -17,7 +17,16 @@ NEEDS_BULLET = pytest.mark.skipif(
     find_spec("pybullet") is None, reason="PyBullet is not installed; from Python 3.12 on it has no wheel"
 )
 
-ALL_PLANTS = [pytest.param(name, marks=NEEDS_BULLET) if name == "bullet" else name for name in plant_names()]
+NEEDS_MUJOCO = pytest.mark.skipif(find_spec("mujoco") is None, reason="the extra mujoco is not installed")
+NEEDS = {"bullet": NEEDS_BULLET, "mujoco": NEEDS_MUJOCO}
+
+
+def plant_parameters(names):
+    """Return names of plants as parameters of a test, each skipped where what it needs is not installed."""
+    return [pytest.param(name, marks=NEEDS[name]) if name in NEEDS else name for name in names]
+
+
+ALL_PLANTS = plant_parameters(plant_names())
 
 
 def mismatched(text, seed=3):

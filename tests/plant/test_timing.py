@@ -173,7 +173,7 @@ def test_a_bench_refuses_a_world_that_is_too_coarse():
         Bench(world, 0.05, SensingConfig(latency=0.02))
 
 
-@pytest.mark.parametrize("name", ["kinematic", "fmu", "bullet"])
+@pytest.mark.parametrize("name", ["kinematic", "fmu", "bullet", "mujoco"])
 def test_earlier_keys_are_refused_with_the_new_ones(name):
     kind = find_plant(name).config
     with pytest.raises(ValueError, match="no setting 'command_delay_periods' any more: it is now command_delay, in s"):

@@ -1,0 +1,1 @@
+"""The UR5 in MuJoCo, seen through a rendered camera."""

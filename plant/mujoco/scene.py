@@ -1,0 +1,168 @@
+"""What a camera sees of the arm on its table, rendered by MuJoCo through OpenGL.
+
+The bodies are those of the URDF that PyBullet loads. One pass gives colours and depths, without shadows, reflections
+and smoothing, which would cost many times as much on a processor. OpenGL samples pixels in their middle and
+`servobench.plant.robot.camera` elsewhere, so the camera's frustum is shifted by the difference.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from servobench.plant.mujoco.engine import mujoco, open_context
+from servobench.plant.mujoco.model import read_urdf
+from servobench.plant.rendered.engine import Scene
+from servobench.plant.rendered.meshes import sphere_obj
+from servobench.plant.rendered.urdf import BALL_LINK, Box, arm_urdf, bench_files, boxes_urdf
+from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
+from servobench.plant.robot.catalogue import UR5, find_robot
+
+if TYPE_CHECKING:
+    from servobench.plant.checks import FloatArray
+    from servobench.plant.rendered.detection import ByteArray
+    from servobench.plant.robot.arm import SerialArm
+    from servobench.plant.robot.robot import Robot
+
+BALL_MESH = "ball.obj"
+SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
+AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
+LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
+BACKGROUND = (0.93, 0.94, 0.95)  # red, green, blue beyond the floor
+MAX_PARTS = 1000  # that are drawn
+COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_FOG", "mjRND_HAZE")
+
+
+class MujocoScene(Scene):
+    """An arm with a ball on its flange in a MuJoCo model of its own; joint angles here are the true ones, θ."""
+
+    def __init__(
+        self,
+        arm: SerialArm,
+        *,
+        scenery: bool,
+        window: bool,
+        boxes: tuple[Box, ...] = (),
+        robot: Robot | None = None,
+    ) -> None:
+        """Load the arm; see `OpenScene`.
+
+        Raises:
+            ValueError: a robot with another number of joints, nothing to render with, or a window is wanted where
+                there is no display.
+        """
+        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
+        self._model = _compile(arm, boxes, robot or find_robot(UR5), scenery=scenery)
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, self._data)  # places the light
+        self._ball = self._model.body(BALL_LINK).id
+        self._drawn = mujoco.MjvScene(self._model, MAX_PARTS)
+        for name in COSTLY:
+            self._drawn.flags[getattr(mujoco.mjtRndFlag, name)] = 0
+        self._options, self._view = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._window: Any = None
+        self._gl = open_context(self._model.vis.global_.offwidth, self._model.vis.global_.offheight)
+        with self._gl.as_current():
+            self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
+            self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        if window:
+            self._open_window()
+
+    def _open_window(self) -> None:
+        """Show the arm from the front right, without MuJoCo's side panels."""
+        from mujoco import viewer  # noqa: PLC0415 - only where there is a window
+
+        self._window = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
+        camera = self._window.cam
+        camera.distance, camera.azimuth, camera.elevation, camera.lookat[:] = 1.9, 140.0, -30.0, (0.3, 0.0, 0.15)
+
+    def place(self, theta: FloatArray) -> None:
+        """See `Scene.place`."""
+        self._data.qpos[:] = theta
+        mujoco.mj_kinematics(self._model, self._data)
+        if self._window is not None:
+            self._window.sync()
+
+    def ball_position(self) -> FloatArray:
+        """See `Scene.ball_position`."""
+        return np.array(self._data.xpos[self._ball])
+
+    def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
+        """See `Scene.render`."""
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
+        )
+        for eye in self._drawn.camera:
+            _aim(eye, camera, X_BC)
+        shape, area = (camera.height, camera.width), mujoco.MjrRect(0, 0, camera.width, camera.height)
+        rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
+        context = self._context
+        with self._gl.as_current():
+            if camera.width > context.offWidth or camera.height > context.offHeight:
+                size = max(camera.width, context.offWidth), max(camera.height, context.offHeight)
+                mujoco.mjr_resizeOffscreen(*size, context)
+            mujoco.mjr_render(area, self._drawn, context)
+            mujoco.mjr_readPixels(rgb, depth, area, context)
+        # The first row is the lowest one. Depths are 1 at the near plane: so float32 resolves them best.
+        return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
+
+    def close(self) -> None:
+        """See `Scene.close`."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+        if self._gl is not None:
+            with self._gl.as_current():
+                self._context.free()
+            self._gl.free()
+            self._gl = None
+
+
+def _compile(arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, *, scenery: bool) -> Any:  # noqa: ANN401
+    """Return the model of all that is drawn, an `MjModel`."""
+    spec = read_urdf(arm_urdf(arm, BALL_MESH, robot), {BALL_MESH: sphere_obj()})
+    rooms = []
+    if scenery:
+        files = bench_files(robot.workspace.scale)
+        rooms.append(("bench", files.pop("bench.urdf"), files))
+    if boxes:
+        rooms.append(("boxes", boxes_urdf(boxes), {}))
+    for name, text, meshes in rooms:
+        spec.attach(read_urdf(text, meshes), prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        dir=LIGHT,
+        ambient=[AMBIENT] * 3,
+        diffuse=[DIFFUSE] * 3,
+        specular=[0.0] * 3,
+        castshadow=False,
+    )
+    spec.add_texture(
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=BACKGROUND,
+        rgb2=BACKGROUND,
+        width=8,
+        height=8,
+    )
+    looks = spec.visual
+    looks.headlight.active = 0
+    looks.quality.offsamples, looks.quality.shadowsize = 0, 0
+    looks.quality.numslices, looks.quality.numstacks, looks.quality.numquads = SLICES, STACKS, 1
+    return spec.compile()
+
+
+def _aim(eye: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # noqa: ANN401 - an `MjvGLCamera`
+    """Let a camera of OpenGL see what `camera` sees from X_BC (4, 4), pixel by pixel."""
+    eye.pos, eye.forward, eye.up = X_BC[:3, 3], X_BC[:3, 2], -X_BC[:3, 1]
+    pixel = camera.near / camera.focal  # [m] of a pixel on the near plane
+    right, down = pixel * (PIXEL_CENTRE[0] - 0.5), pixel * (PIXEL_CENTRE[1] - 0.5)
+    half = 0.5 * camera.height * pixel
+    eye.frustum_center, eye.frustum_width = right, 0.5 * camera.width * pixel
+    eye.frustum_bottom, eye.frustum_top = -half - down, half - down
+    eye.frustum_near, eye.frustum_far, eye.orthographic = camera.near, camera.far, 0
