@@ -7,9 +7,10 @@ import os
 import platform
 import shlex
 import shutil
+import struct
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,6 +121,41 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform, libr
     if done.returncode != 0:
         lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
         raise CompilationFailed(f"{arguments[0]} failed for {target.name}: {lines[0] if lines else 'no message'}")
+
+
+def library_files(libraries: Mapping[Platform, bytes], identifier: str, fmi_version: int) -> dict[str, bytes]:
+    """Return libraries by their paths in an FMU.
+
+    Importers of FMI 2 look on ARM in the folder of the 64-bit system, which has no word for the processor: for macOS it
+    gets a library for both processors, for Linux that of ARM unless there is one of x86-64.
+    """
+    files = {each.folder(fmi_version): (each.suffix, content) for each, content in libraries.items()}
+    if fmi_version == 2:
+        named = {each.name: content for each, content in libraries.items()}
+        mac = [named[name] for name in ("x86_64-darwin", "aarch64-darwin") if name in named]
+        if mac:
+            files["darwin64"] = (".dylib", universal_library(mac))
+        if "aarch64-linux" in named:
+            files.setdefault("linux64", (".so", named["aarch64-linux"]))
+    return {f"binaries/{folder}/{identifier}{suffix}": content for folder, (suffix, content) in files.items()}
+
+
+def universal_library(slices: Sequence[bytes]) -> bytes:
+    """Return one macOS library that holds those of several processors; a single one stays as it is.
+
+    The format is that of `mach-o/fat.h`: a header with processor, offset, size and alignment of each slice, big-endian.
+    """
+    if len(slices) == 1:
+        return slices[0]
+    alignment = 14  # [bits], pages of 16 KiB, as Apple's processors have them
+    page = 1 << alignment
+    header, body, end = struct.pack(">II", 0xCAFEBABE, len(slices)), b"", page
+    for content in slices:
+        processor, variant = struct.unpack_from("<II", content, 4)
+        header += struct.pack(">5I", processor, variant, end, len(content), alignment)
+        body += content + bytes(-len(content) % page)
+        end = page + len(body)
+    return header + bytes(page - len(header)) + body
 
 
 def _words(command: str) -> list[str]:

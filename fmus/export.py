@@ -21,9 +21,16 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compile import CODE, Platform, compile_library, this_platform
+from servobench.fmus.compile import CODE, Platform, compile_library, library_files, this_platform
 from servobench.fmus.generate import kinematics_source, layout_header
-from servobench.fmus.model_description import Description, write_build_description, write_fmi2, write_fmi3
+from servobench.fmus.model_description import (
+    REFERENCES,
+    Description,
+    write_build_description,
+    write_fmi2,
+    write_fmi3,
+    write_references,
+)
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
 from servobench.fmus.variables import Actuation, Layout, arm_groups, parameters_of
 from servobench.plant.robot.catalogue import UR5, find_robot
@@ -36,9 +43,14 @@ HEADERS = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
-FMI_SOURCES = {2: ("fmi2.c",), 3: ("fmi3.c", "fmi3_absent.c")}
+FMI_SOURCES = {2: ("fmi2.c", "fmi2_exchange.c"), 3: ("fmi3.c", "fmi3_exchange.c", "fmi3_absent.c")}
+INSTANCE_HEADERS = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
 SHARED_SOURCES = ("model.c", "instance.c", "kinematics.c")
 COMMITTED = {MACHINERY: ("instance.h", "instance.c"), MODEL: ("kinematics.h", "model.h", "model.c")}
+RELATED_FILES = (
+    (INPUT_FILE, "testcase", "Commands of the reference run, each held over the step that begins at its time."),
+    (OUTPUT_FILE, "result", "Outputs of the reference run, computed by an independent implementation."),
+)
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 
 
@@ -54,7 +66,7 @@ class ExportOptions:
     """Options of an export.
 
     Attributes:
-        fmi_version: 2 (co-simulation and model exchange) or 3 (co-simulation).
+        fmi_version: 2 or 3; each has co-simulation and model exchange.
         model: arm and camera whose numbers become the start values.
         actuation: lag, limits and home that become start values.
         platforms: platforms to compile for.
@@ -145,6 +157,8 @@ def source_files(options: ExportOptions) -> dict[str, str]:
     layout, start = arm_layout(options.model.arm.n), parameters_of(options.model, options.actuation)
     texts = {name: _committed(folder, name) for folder, names in COMMITTED.items() for name in names}
     texts |= {name: _committed(MACHINERY, name) for name in FMI_SOURCES[options.fmi_version]}
+    header = INSTANCE_HEADERS[options.fmi_version]
+    texts[header] = _committed(MACHINERY, header)
     texts |= {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
     texts["kinematics.c"] = _kinematics(layout)
     texts["layout.h"] = layout_header(layout, start, options.identifier, _PLACEHOLDER)
@@ -158,6 +172,9 @@ def _companion_files(options: ExportOptions) -> dict[str, str]:
     return {
         INPUT_FILE: input_csv(run, layout),
         OUTPUT_FILE: output_csv(run, layout),
+        f"extra/{REFERENCES}/fmi-ls-manifest.xml": write_references(
+            (f"../{file.removeprefix('extra/')}", role, text) for file, role, text in RELATED_FILES
+        ).decode(),
         "documentation/index.html": _documentation(layout, options),
         "documentation/licenses/license.txt": _committed(MODEL, "license.txt"),
     }
@@ -241,10 +258,12 @@ def _compile(folder: Path, contents: dict[str, bytes], options: ExportOptions) -
             file = folder / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
+    libraries = {}
     for target in options.platforms:
         library = folder / "library" / target.name / f"{options.identifier}{target.suffix}"
         compile_library(folder / "sources", (*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES), target, library)
-        contents[f"binaries/{target.folder(options.fmi_version)}/{library.name}"] = library.read_bytes()
+        libraries[target] = library.read_bytes()
+    contents |= library_files(libraries, options.identifier, options.fmi_version)
 
 
 def _write_archive(path: Path, contents: Mapping[str, bytes]) -> None:

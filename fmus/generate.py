@@ -17,7 +17,7 @@ from typing import Any
 import casadi
 import numpy as np
 
-from servobench.fmus.variables import INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
+from servobench.fmus.variables import FIXED, INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
 from servobench.plant.checks import FloatArray
 from servobench.plant.robot.symbolic import SX, HandEyeGeometry, feature_and_jacobian
 
@@ -67,7 +67,7 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: s
     sizes = ", ".join(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups)
     zero = np.zeros(1)
     values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
-    settable = layout.of_role(PARAMETER, INPUT, STATE)
+    settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
     minima = [bound for group in settable for bound in [_bound(group.minimum)] * group.size]
     lines += [f"#define GROUPS {{{sizes}}}"]
     lines += [_initialiser("START_VALUES", [float(value).hex() for value in values])]

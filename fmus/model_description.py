@@ -1,16 +1,28 @@
-"""Writes modelDescription.xml for FMI 2.0 (co-simulation and model exchange) and FMI 3.0 (co-simulation).
+"""Writes modelDescription.xml for FMI 2.0 and FMI 3.0, each for co-simulation and model exchange.
 
 Dependencies are explicit. The text holds no date and no machine name, so equal models give equal bytes.
 """
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from servobench.fmus.variables import DERIVATIVE, INPUT, KINEMATIC_PARAMETERS, OUTPUT, PARAMETER, STATE, Group, Layout
+from servobench.fmus.variables import (
+    DERIVATIVE,
+    FIXED,
+    INDICATOR,
+    INPUT,
+    KINEMATIC_PARAMETERS,
+    OUTPUT,
+    PARAMETER,
+    STATE,
+    Group,
+    Layout,
+)
 from servobench.plant.checks import FloatArray
 
 UNITS: dict[str, dict[str, str]] = {
@@ -22,15 +34,24 @@ UNITS: dict[str, dict[str, str]] = {
     "rad/s2": {"rad": "1", "s": "-2"},
     "m/rad": {"m": "1", "rad": "-1"},
 }
+DISPLAY_UNITS = {"rad": "deg", "rad/s": "deg/s", "rad/s2": "deg/s2"}
 ATTRIBUTES = {
     PARAMETER: {"causality": "parameter", "variability": "tunable", "initial": "exact"},
+    FIXED: {"causality": "parameter", "variability": "fixed", "initial": "exact"},
     INPUT: {"causality": "input", "variability": "continuous"},
     STATE: {"causality": "output", "variability": "continuous", "initial": "calculated"},
     DERIVATIVE: {"causality": "local", "variability": "continuous", "initial": "calculated"},
+    INDICATOR: {"causality": "local", "variability": "continuous", "initial": "calculated"},
     OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
 }
-LOG_CATEGORIES = {"logStatusError": "What went wrong.", "logStatusWarning": "What was refused."}
-DEFAULT_EXPERIMENT = {"startTime": "0", "stopTime": "10", "stepSize": "0.05"}
+LOG_CATEGORIES = {
+    "logStatusError": "What went wrong.",
+    "logStatusWarning": "What was refused.",
+    "logEvents": "Joints that meet a stop or leave it.",
+}
+DEFAULT_EXPERIMENT = {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": "0.05"}
+REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard that tells the roles of related files
+REFERENCES_VERSION = "1.0.0-alpha.1"
 
 
 @dataclass(frozen=True)
@@ -60,7 +81,8 @@ def write_fmi2(description: Description, token: str) -> bytes:
     """Return modelDescription.xml of FMI 2.0 with the GUID `token`."""
     root = ET.Element("fmiModelDescription", fmiVersion="2.0", modelName=description.model_name, guid=token)
     _describe(root, description)
-    root.attrib["numberOfEventIndicators"] = "0"
+    indicators = description.layout.of_role(INDICATOR)
+    root.attrib["numberOfEventIndicators"] = str(sum(group.size for group in indicators))
     capabilities = {
         "modelIdentifier": description.model_identifier,
         "canNotUseMemoryManagementFunctions": "true",
@@ -69,7 +91,7 @@ def write_fmi2(description: Description, token: str) -> bytes:
         "providesDirectionalDerivative": "true",
     }
     for interface, more in (
-        ("ModelExchange", {}),
+        ("ModelExchange", {"completedIntegratorStepNotNeeded": "true"}),
         ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
     ):
         files = ET.SubElement(ET.SubElement(root, interface, {**capabilities, **more}), "SourceFiles")
@@ -81,6 +103,8 @@ def write_fmi2(description: Description, token: str) -> bytes:
     _scalar_variables(ET.SubElement(root, "ModelVariables"), description)
     structure = ET.SubElement(root, "ModelStructure")
     for section in _Structure(description.layout).sections():
+        if not section.fmi2:
+            continue
         element = ET.SubElement(structure, section.fmi2)
         for index, dependencies in section.scalars():
             attributes = {"index": str(index + 1)} | _dependent([i + 1 for i in dependencies])
@@ -93,15 +117,14 @@ def write_fmi3(description: Description, token: str) -> bytes:
     root = ET.Element("fmiModelDescription", fmiVersion="3.0", modelName=description.model_name)
     root.attrib["instantiationToken"] = token
     _describe(root, description)
-    ET.SubElement(
-        root,
-        "CoSimulation",
-        modelIdentifier=description.model_identifier,
-        canGetAndSetFMUState="true",
-        canSerializeFMUState="true",
-        providesDirectionalDerivatives="true",
-        canHandleVariableCommunicationStepSize="true",
-    )
+    capabilities = {
+        "modelIdentifier": description.model_identifier,
+        "canGetAndSetFMUState": "true",
+        "canSerializeFMUState": "true",
+        "providesDirectionalDerivatives": "true",
+    }
+    ET.SubElement(root, "ModelExchange", capabilities)
+    ET.SubElement(root, "CoSimulation", capabilities, canHandleVariableCommunicationStepSize="true")
     _units(root)
     _log_categories(root)
     ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
@@ -120,6 +143,27 @@ def write_build_description(description: Description) -> bytes:
     files = ET.SubElement(configuration, "SourceFileSet", language="C11")
     for name in description.sources:
         ET.SubElement(files, "SourceFile", name=name)
+    ET.SubElement(configuration, "Library", name="m", external="true", description="C's mathematical functions")
+    return _bytes(root)
+
+
+def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
+    """Return the manifest of FMI-LS-REF.
+
+    Args:
+        files: of each related CSV file its path relative to the manifest, its role and a description.
+    """
+    namespace = "http://fmi-standard.org/fmi-ls-manifest"
+    ET.register_namespace("fmi-ls", namespace)
+    attributes = {
+        f"{{{namespace}}}fmi-ls-name": REFERENCES,
+        f"{{{namespace}}}fmi-ls-version": REFERENCES_VERSION,
+        f"{{{namespace}}}fmi-ls-description": "Layered Standard providing information on related files included in "
+        "an FMU.",
+    }
+    root = ET.Element("fmiReferences", attributes)
+    for source, role, text in files:
+        ET.SubElement(root, "Related", type="text/csv", source=source, role=role, description=text)
     return _bytes(root)
 
 
@@ -128,7 +172,10 @@ _Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]  # unknown, what it d
 
 @dataclass(frozen=True)
 class _Section:
-    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole."""
+    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole.
+
+    FMI 2 has no element for event indicators.
+    """
 
     fmi2: str
     fmi3: str
@@ -182,6 +229,7 @@ class _Structure:
             self._section("Outputs", "Output", outputs),
             self._section("Derivatives", "ContinuousStateDerivative", derivatives),
             self._section("InitialUnknowns", "InitialUnknown", start),
+            self._section("", "EventIndicator", [("stop_indicator", (*state[:1], "joint_velocity_command"), False)]),
         )
 
     def _section(self, fmi2: str, fmi3: str, rows: _Rows) -> _Section:
@@ -199,7 +247,10 @@ def _describe(root: ET.Element, description: Description) -> None:
 def _units(root: ET.Element) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
     for name, exponents in UNITS.items():
-        ET.SubElement(ET.SubElement(definitions, "Unit", name=name), "BaseUnit", exponents)
+        unit = ET.SubElement(definitions, "Unit", name=name)
+        ET.SubElement(unit, "BaseUnit", exponents)
+        if name in DISPLAY_UNITS:
+            ET.SubElement(unit, "DisplayUnit", name=DISPLAY_UNITS[name], factor=repr(180 / math.pi))
 
 
 def _log_categories(root: ET.Element) -> None:
@@ -216,7 +267,7 @@ def _scalar_variables(variables: ET.Element, description: Description) -> None:
             variable = ET.SubElement(variables, "ScalarVariable", name=name, valueReference=str(reference))
             variable.attrib.update(ATTRIBUTES[group.role] | {"description": group.description})
             real = ET.SubElement(variable, "Real", _real(group))
-            if group.role in (PARAMETER, INPUT):
+            if group.role in (PARAMETER, FIXED, INPUT):
                 real.attrib["start"] = _starts(description, group)[k]
             if group.role == DERIVATIVE:
                 real.attrib["derivative"] = str(layout.offsets[_state_of(group)] + k + 1)
@@ -228,7 +279,7 @@ def _array_variables(variables: ET.Element, description: Description) -> None:
     for group in layout.groups:
         variable = ET.SubElement(variables, "Float64", name=group.name, valueReference=str(layout.offsets[group.name]))
         variable.attrib.update(ATTRIBUTES[group.role] | {"description": group.description} | _real(group))
-        if group.role in (PARAMETER, INPUT):
+        if group.role in (PARAMETER, FIXED, INPUT):
             variable.attrib["start"] = " ".join(_starts(description, group))
         if group.role == DERIVATIVE:
             variable.attrib["derivative"] = str(layout.offsets[_state_of(group)])
@@ -242,7 +293,12 @@ def _state_of(group: Group) -> str:
 
 
 def _real(group: Group) -> dict[str, str]:
-    return {"unit": group.unit} | ({} if group.minimum is None else {"min": repr(group.minimum)})
+    attributes = {"unit": group.unit, "displayUnit": DISPLAY_UNITS.get(group.unit)}
+    attributes |= {
+        name: None if bound is None else repr(bound)
+        for name, bound in (("min", group.minimum), ("nominal", group.nominal))
+    }
+    return {name: text for name, text in attributes.items() if text is not None}
 
 
 def _starts(description: Description, group: Group) -> list[str]:

@@ -21,7 +21,8 @@ from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_ro
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.limits import JointLimits, narrowed
 
-PARAMETER, INPUT, STATE, DERIVATIVE, OUTPUT = "parameter", "input", "state", "derivative", "output"
+PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
+DERIVATIVE, INDICATOR, OUTPUT = "derivative", "event indicator", "output"
 
 
 @dataclass(frozen=True)
@@ -31,10 +32,11 @@ class Group:
     Attributes:
         name: as FMI 3 shows it.
         shape: sizes of its axes.
-        role: parameter, input, state, derivative or output.
+        role: one of the roles above; a fixed parameter holds from the end of initialisation on.
         unit: as in the description; "1" for none.
         description: one sentence.
         minimum: smallest admissible value, or None.
+        nominal: usual size of a value, for a solver's tolerances, or None.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Group:
     unit: str
     description: str
     minimum: float | None = None
+    nominal: float | None = None
 
     @property
     def size(self) -> int:
@@ -82,12 +85,13 @@ def arm_groups(n: int) -> tuple[Group, ...]:
         Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
         Group("joint_upper", (n,), PARAMETER, "rad", "The joint stops here."),
         Group("encoder_resolution", (n,), PARAMETER, "rad", "Step of the encoder; 0 for an exact one.", 0.0),
-        Group("home", (n,), PARAMETER, "rad", "Reported joint position at the start; read at initialisation."),
+        Group("home", (n,), FIXED, "rad", "Reported joint position at the start, within the stops."),
         Group("joint_velocity_command", (n,), INPUT, "rad/s", "Joint velocity command, held over a step."),
-        Group("joint_position", (n,), STATE, "rad", "Reported joint position."),
-        Group("joint_velocity", (n,), STATE, "rad/s", "Reported joint velocity."),
+        Group("joint_position", (n,), STATE, "rad", "Reported joint position.", nominal=1.0),
+        Group("joint_velocity", (n,), STATE, "rad/s", "Reported joint velocity.", nominal=1.0),
         Group("der(joint_position)", (n,), DERIVATIVE, "rad/s", "Derivative of the joint position."),
         Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
+        Group("stop_indicator", (n, 2), INDICATOR, "1", "Distance to lower and upper stop; at a stop the command."),
         Group("encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."),
         Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
         Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),

@@ -1,44 +1,34 @@
-/* FMI 2.0 for co-simulation and model exchange around `Model`. */
-#include "fmi2Functions.h"
-#include "instance.h"
+/* FMI 2.0 around `Model`: what both interfaces share, and co-simulation. */
+#include "fmi2_instance.h"
 
-#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* How far the master's time may be from the model's own, relative to its size. */
-#define TIME_TOLERANCE 1e-6
-
-typedef struct {
-    Model model;
-    Phase phase;
-    fmi2Type type;
-    fmi2Boolean logging;
-    const fmi2CallbackFunctions *callbacks;
-    char *name;
-} Instance;
-
-static fmi2Status report(const Instance *instance, fmi2Status status, const char *function, const char *message)
+static void tell(const Instance *instance, fmi2Status status, unsigned category, const char *text)
 {
     const fmi2CallbackFunctions *callbacks = instance->callbacks;
-    if (callbacks->logger != NULL && (instance->logging || status >= fmi2Error)) {
-        char text[MESSAGE_SIZE];
-        compose(text, function, message);
-        callbacks->logger(callbacks->componentEnvironment, instance->name, status,
-                          status >= fmi2Error ? "logStatusError" : "logStatusWarning", text);
-    }
+    if (callbacks->logger == NULL || (status < fmi2Error && (instance->logged & (1u << category)) == 0)) return;
+    callbacks->logger(callbacks->componentEnvironment, instance->name, status, log_categories[category], text);
+}
+
+fmi2Status report(const Instance *instance, fmi2Status status, const char *function, const char *message)
+{
+    char text[MESSAGE_SIZE];
+    compose(text, function, message);
+    tell(instance, status, status >= fmi2Error ? 0 : 1, text);
     return status;
 }
 
-static fmi2Status fail(Instance *instance, const char *function, const char *message)
+fmi2Status answer(const Instance *instance, const char *function, const char *message)
 {
-    return report(instance, fmi2Error, function, message);
+    return message == NULL ? fmi2OK : report(instance, fmi2Error, function, message);
 }
 
-#define OPEN(function, phases)                                                                     \
-    Instance *const instance = component;                                                          \
-    if (instance == NULL) return fmi2Error;                                                        \
-    if ((instance->phase & (phases)) == 0) return fail(instance, function, "not allowed in this phase")
+void report_events(Instance *instance)
+{
+    char text[MESSAGE_SIZE];
+    while ((instance->logged & LOG_EVENTS) && core_next_event(&instance->core, text)) tell(instance, fmi2OK, 2, text);
+}
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
@@ -46,10 +36,10 @@ const char *fmi2GetVersion(void) { return fmi2Version; }
 
 fmi2Status fmi2SetDebugLogging(fmi2Component component, fmi2Boolean on, size_t count, const fmi2String categories[])
 {
-    (void)count;
-    (void)categories;
     OPEN("fmi2SetDebugLogging", ~0);
-    instance->logging = on;
+    const unsigned bits = category_bits(count, categories);
+    if (bits == 0) return answer(instance, "fmi2SetDebugLogging", "there is no such category");
+    instance->logged = on ? instance->logged | bits : instance->logged & ~bits;
     return fmi2OK;
 }
 
@@ -68,15 +58,13 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     }
     instance->name = strcpy(copy, name);
     instance->callbacks = callbacks;
-    instance->logging = logging;
-    instance->type = type;
-    instance->phase = INSTANTIATED;
+    instance->logged = logging ? LOG_ALL : 0;
     if (strcmp(guid, TOKEN) != 0) {
-        fail(instance, "fmi2Instantiate", "the GUID is not that of this model");
+        answer(instance, "fmi2Instantiate", "the GUID is not that of this model");
         fmi2FreeInstance(instance);
         return NULL;
     }
-    model_reset(&instance->model);
+    core_reset(&instance->core, type == fmi2ModelExchange);
     return instance;
 }
 
@@ -93,44 +81,35 @@ fmi2Status fmi2SetupExperiment(fmi2Component component, fmi2Boolean tolerance_de
 {
     (void)tolerance_defined;
     (void)tolerance;
-    (void)stop_defined;
-    (void)stop;
     OPEN("fmi2SetupExperiment", INSTANTIATED);
-    if (!isfinite(start)) return fail(instance, "fmi2SetupExperiment", "the start time is not finite");
-    instance->model.time = start;
-    return fmi2OK;
+    return answer(instance, "fmi2SetupExperiment", core_begin(&instance->core, start, stop_defined, stop));
 }
 
 fmi2Status fmi2EnterInitializationMode(fmi2Component component)
 {
     OPEN("fmi2EnterInitializationMode", INSTANTIATED);
-    model_start(&instance->model);
-    instance->phase = INITIALISING;
+    model_start(&instance->core.model);
+    instance->core.phase = INITIALISING;
     return fmi2OK;
 }
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component component)
 {
     OPEN("fmi2ExitInitializationMode", INITIALISING);
-    if (model_has_empty_range(&instance->model)) {
-        return fail(instance, "fmi2ExitInitializationMode", "joint_lower is not below joint_upper");
-    }
-    instance->phase = instance->type == fmi2CoSimulation ? STEPPING : IN_EVENT;
-    return fmi2OK;
+    return answer(instance, "fmi2ExitInitializationMode", core_leave_initialisation(&instance->core));
 }
 
 fmi2Status fmi2Terminate(fmi2Component component)
 {
     OPEN("fmi2Terminate", RUNNING | FAILED);
-    instance->phase = TERMINATED;
+    instance->core.phase = TERMINATED;
     return fmi2OK;
 }
 
 fmi2Status fmi2Reset(fmi2Component component)
 {
     OPEN("fmi2Reset", ~0);
-    model_reset(&instance->model);
-    instance->phase = INSTANTIATED;
+    core_reset(&instance->core, instance->core.model.exchange);
     return fmi2OK;
 }
 
@@ -138,8 +117,8 @@ fmi2Status fmi2GetReal(fmi2Component component, const fmi2ValueReference referen
 {
     OPEN("fmi2GetReal", INSTANTIATED | READABLE);
     for (size_t i = 0; i < count; i++) {
-        const ModelStatus status = model_get(&instance->model, references[i], &values[i]);
-        if (status != MODEL_OK) return fail(instance, "fmi2GetReal", explain(status));
+        const char *message = core_get(&instance->core, references[i], &values[i]);
+        if (message != NULL) return answer(instance, "fmi2GetReal", message);
     }
     return fmi2OK;
 }
@@ -149,14 +128,10 @@ fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference referen
 {
     OPEN("fmi2SetReal", INSTANTIATED | INITIALISING | RUNNING);
     for (size_t i = 0; i < count; i++) {
-        /* Integrators that know no other way may set states one by one. */
-        const int is_state = references[i] >= OFFSET_JOINT_POSITION;
-        const ModelStatus status = is_state && (instance->phase & (IN_EVENT | CONTINUOUS)) == 0 && references[i] < N_VALUES
-                                       ? MODEL_NOT_SETTABLE
-                                       : model_set(&instance->model, references[i], values[i]);
-        if (status != MODEL_OK) return fail(instance, "fmi2SetReal", explain(status));
+        const char *message = core_set(&instance->core, references[i], values[i]);
+        if (message != NULL) return answer(instance, "fmi2SetReal", message);
     }
-    if (instance->phase & (INSTANTIATED | INITIALISING)) model_start(&instance->model);
+    if (instance->core.phase & (INSTANTIATED | INITIALISING)) model_start(&instance->core.model);
     return fmi2OK;
 }
 
@@ -167,7 +142,7 @@ fmi2Status fmi2SetReal(fmi2Component component, const fmi2ValueReference referen
         (void)references;                                                                                         \
         (void)values;                                                                                             \
         OPEN(#name, ~0);                                                                                          \
-        return count == 0 ? fmi2OK : fail(instance, #name, explain(MODEL_NO_SUCH_VARIABLE));                      \
+        return answer(instance, #name, count == 0 ? NULL : "the model has real variables only");                   \
     }
 
 NO_VARIABLES(fmi2GetInteger, fmi2Integer)
@@ -180,8 +155,8 @@ NO_VARIABLES(fmi2SetString, const fmi2String)
 fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *state)
 {
     OPEN("fmi2GetFMUstate", ~0);
-    Snapshot *snapshot = snapshot_take(&instance->model, instance->phase);
-    if (snapshot == NULL) return fail(instance, "fmi2GetFMUstate", "out of memory");
+    Snapshot *snapshot = snapshot_take(&instance->core);
+    if (snapshot == NULL) return answer(instance, "fmi2GetFMUstate", "out of memory");
     free(*state);
     *state = snapshot;
     return fmi2OK;
@@ -190,11 +165,7 @@ fmi2Status fmi2GetFMUstate(fmi2Component component, fmi2FMUstate *state)
 fmi2Status fmi2SetFMUstate(fmi2Component component, fmi2FMUstate state)
 {
     OPEN("fmi2SetFMUstate", ~0);
-    if (state == NULL) return fail(instance, "fmi2SetFMUstate", "there is no state");
-    const Snapshot *snapshot = state;
-    memcpy(&instance->model, &snapshot->model, sizeof instance->model);
-    instance->phase = snapshot->phase;
-    return fmi2OK;
+    return answer(instance, "fmi2SetFMUstate", core_restore(&instance->core, state));
 }
 
 fmi2Status fmi2FreeFMUstate(fmi2Component component, fmi2FMUstate *state)
@@ -216,7 +187,7 @@ fmi2Status fmi2SerializedFMUstateSize(fmi2Component component, fmi2FMUstate stat
 fmi2Status fmi2SerializeFMUstate(fmi2Component component, fmi2FMUstate state, fmi2Byte bytes[], size_t size)
 {
     OPEN("fmi2SerializeFMUstate", ~0);
-    if (state == NULL || size < sizeof(Snapshot)) return fail(instance, "fmi2SerializeFMUstate", "no state or no room");
+    if (state == NULL || size < sizeof(Snapshot)) return answer(instance, "fmi2SerializeFMUstate", "no state or no room");
     memcpy(bytes, state, sizeof(Snapshot));
     return fmi2OK;
 }
@@ -225,7 +196,7 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component component, const fmi2Byte bytes
 {
     OPEN("fmi2DeSerializeFMUstate", ~0);
     Snapshot *snapshot = snapshot_read(bytes, size);
-    if (snapshot == NULL) return fail(instance, "fmi2DeSerializeFMUstate", "these bytes are no state of this model");
+    if (snapshot == NULL) return answer(instance, "fmi2DeSerializeFMUstate", "these bytes are no state of this model");
     free(*state);
     *state = snapshot;
     return fmi2OK;
@@ -235,15 +206,15 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2Value
                                         const fmi2ValueReference knowns[], size_t n_knowns, const fmi2Real seed[],
                                         fmi2Real sensitivity[])
 {
-    OPEN("fmi2GetDirectionalDerivative", INITIALISING | RUNNING);
+    OPEN("fmi2GetDirectionalDerivative", DIFFERENTIABLE);
     double direction[N_VALUES] = {0.0};
     for (size_t i = 0; i < n_knowns; i++) {
-        if (knowns[i] >= N_SETTABLE) return fail(instance, "fmi2GetDirectionalDerivative", "this is no known");
+        if (knowns[i] >= N_SETTABLE) return answer(instance, "fmi2GetDirectionalDerivative", "this is no known");
         direction[knowns[i]] = seed[i];
     }
-    model_derive(&instance->model, direction, instance->phase == INITIALISING);
+    model_derive(&instance->core.model, direction, instance->core.phase == INITIALISING);
     for (size_t i = 0; i < n_unknowns; i++) {
-        if (unknowns[i] >= N_VALUES) return fail(instance, "fmi2GetDirectionalDerivative", "this is no unknown");
+        if (unknowns[i] >= N_VALUES) return answer(instance, "fmi2GetDirectionalDerivative", "this is no unknown");
         sensitivity[i] = direction[unknowns[i]];
     }
     return fmi2OK;
@@ -258,7 +229,7 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component component, const fmi2ValueR
     (void)orders;
     (void)values;
     OPEN("fmi2SetRealInputDerivatives", ~0);
-    return count == 0 ? fmi2OK : fail(instance, "fmi2SetRealInputDerivatives", "inputs are held, not interpolated");
+    return answer(instance, "fmi2SetRealInputDerivatives", count == 0 ? NULL : "inputs are held, not interpolated");
 }
 
 fmi2Status fmi2GetRealOutputDerivatives(fmi2Component component, const fmi2ValueReference references[], size_t count,
@@ -268,29 +239,22 @@ fmi2Status fmi2GetRealOutputDerivatives(fmi2Component component, const fmi2Value
     (void)orders;
     (void)values;
     OPEN("fmi2GetRealOutputDerivatives", ~0);
-    return count == 0 ? fmi2OK : fail(instance, "fmi2GetRealOutputDerivatives", "not provided");
+    return answer(instance, "fmi2GetRealOutputDerivatives", count == 0 ? NULL : "not provided");
 }
 
 fmi2Status fmi2DoStep(fmi2Component component, fmi2Real time, fmi2Real step, fmi2Boolean no_set_state)
 {
     (void)no_set_state;
     OPEN("fmi2DoStep", STEPPING);
-    if (!isfinite(step) || step < 0.0) return fail(instance, "fmi2DoStep", "the step size is negative or not finite");
-    if (!(fabs(time - instance->model.time) <= TIME_TOLERANCE * fmax(1.0, fabs(time)))) {
-        return fail(instance, "fmi2DoStep", "the communication point is not where the last step ended");
-    }
-    if (step > 0.0 && model_step(&instance->model, step) != 0) {
-        instance->phase = FAILED;
-        return fail(instance, "fmi2DoStep", "a joint position is not finite");
-    }
-    instance->model.time = time + step;
-    return fmi2OK;
+    const char *message = core_step(&instance->core, time, step);
+    report_events(instance);
+    return answer(instance, "fmi2DoStep", message);
 }
 
 fmi2Status fmi2CancelStep(fmi2Component component)
 {
     OPEN("fmi2CancelStep", ~0);
-    return fail(instance, "fmi2CancelStep", "no step is ever pending");
+    return answer(instance, "fmi2CancelStep", "no step is ever pending");
 }
 
 fmi2Status fmi2GetStatus(fmi2Component component, const fmi2StatusKind kind, fmi2Status *value)
@@ -305,7 +269,7 @@ fmi2Status fmi2GetRealStatus(fmi2Component component, const fmi2StatusKind kind,
 {
     OPEN("fmi2GetRealStatus", ~0);
     if (kind != fmi2LastSuccessfulTime) return report(instance, fmi2Discard, "fmi2GetRealStatus", "not provided");
-    *value = instance->model.time;
+    *value = instance->core.model.time;
     return fmi2OK;
 }
 
@@ -321,7 +285,7 @@ fmi2Status fmi2GetBooleanStatus(fmi2Component component, const fmi2StatusKind ki
 {
     OPEN("fmi2GetBooleanStatus", ~0);
     if (kind != fmi2Terminated) return report(instance, fmi2Discard, "fmi2GetBooleanStatus", "not provided");
-    *value = instance->phase == TERMINATED ? fmi2True : fmi2False;
+    *value = instance->core.phase == TERMINATED ? fmi2True : fmi2False;
     return fmi2OK;
 }
 
@@ -331,93 +295,4 @@ fmi2Status fmi2GetStringStatus(fmi2Component component, const fmi2StatusKind kin
     (void)value;
     OPEN("fmi2GetStringStatus", ~0);
     return report(instance, fmi2Discard, "fmi2GetStringStatus", "not provided");
-}
-
-/* Model exchange */
-
-fmi2Status fmi2EnterEventMode(fmi2Component component)
-{
-    OPEN("fmi2EnterEventMode", IN_EVENT | CONTINUOUS);
-    instance->phase = IN_EVENT;
-    return fmi2OK;
-}
-
-fmi2Status fmi2NewDiscreteStates(fmi2Component component, fmi2EventInfo *info)
-{
-    OPEN("fmi2NewDiscreteStates", IN_EVENT);
-    memset(info, 0, sizeof *info);
-    return fmi2OK;
-}
-
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component component)
-{
-    OPEN("fmi2EnterContinuousTimeMode", IN_EVENT | CONTINUOUS);
-    instance->phase = CONTINUOUS;
-    return fmi2OK;
-}
-
-fmi2Status fmi2CompletedIntegratorStep(fmi2Component component, fmi2Boolean no_set_state, fmi2Boolean *enter_event,
-                                       fmi2Boolean *terminate)
-{
-    (void)no_set_state;
-    OPEN("fmi2CompletedIntegratorStep", CONTINUOUS);
-    *enter_event = fmi2False;
-    *terminate = fmi2False;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SetTime(fmi2Component component, fmi2Real time)
-{
-    OPEN("fmi2SetTime", IN_EVENT | CONTINUOUS);
-    instance->model.time = time;
-    return fmi2OK;
-}
-
-static fmi2Status check_count(Instance *instance, const char *function, size_t count, size_t wanted)
-{
-    return count == wanted ? fmi2OK : fail(instance, function, "wrong number of values");
-}
-
-fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real states[], size_t count)
-{
-    OPEN("fmi2SetContinuousStates", IN_EVENT | CONTINUOUS);
-    const fmi2Status status = check_count(instance, "fmi2SetContinuousStates", count, 2 * N_JOINTS);
-    if (status == fmi2OK) model_set_states(&instance->model, states);
-    return status;
-}
-
-static void copy_values(Instance *instance, size_t offset, fmi2Real values[])
-{
-    for (size_t i = 0; i < 2 * N_JOINTS; i++) model_get(&instance->model, offset + i, &values[i]);
-}
-
-fmi2Status fmi2GetDerivatives(fmi2Component component, fmi2Real derivatives[], size_t count)
-{
-    OPEN("fmi2GetDerivatives", RUNNING | TERMINATED);
-    const fmi2Status status = check_count(instance, "fmi2GetDerivatives", count, 2 * N_JOINTS);
-    if (status == fmi2OK) copy_values(instance, OFFSET_DER_JOINT_POSITION, derivatives);
-    return status;
-}
-
-fmi2Status fmi2GetEventIndicators(fmi2Component component, fmi2Real indicators[], size_t count)
-{
-    (void)indicators;
-    OPEN("fmi2GetEventIndicators", ~0);
-    return check_count(instance, "fmi2GetEventIndicators", count, 0);
-}
-
-fmi2Status fmi2GetContinuousStates(fmi2Component component, fmi2Real states[], size_t count)
-{
-    OPEN("fmi2GetContinuousStates", READABLE);
-    const fmi2Status status = check_count(instance, "fmi2GetContinuousStates", count, 2 * N_JOINTS);
-    if (status == fmi2OK) copy_values(instance, OFFSET_JOINT_POSITION, states);
-    return status;
-}
-
-fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component component, fmi2Real nominals[], size_t count)
-{
-    OPEN("fmi2GetNominalsOfContinuousStates", ~0);
-    const fmi2Status status = check_count(instance, "fmi2GetNominalsOfContinuousStates", count, 2 * N_JOINTS);
-    for (size_t i = 0; status == fmi2OK && i < count; i++) nominals[i] = 1.0;
-    return status;
 }

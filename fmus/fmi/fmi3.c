@@ -1,39 +1,33 @@
-/* FMI 3.0 for co-simulation around `Model`; every variable is an array of doubles. */
-#include "fmi3Functions.h"
-#include "instance.h"
+/* FMI 3.0 around `Model`: what both interfaces share, and co-simulation; every variable is an array of doubles. */
+#include "fmi3_instance.h"
 
-#include <math.h>
 #include <stdlib.h>
 #include <string.h>
-
-/* How far the importer's time may be from the model's own, relative to its size. */
-#define TIME_TOLERANCE 1e-6
-
-typedef struct {
-    Model model;
-    Phase phase;
-    bool logging;
-    fmi3LogMessageCallback log;
-    fmi3InstanceEnvironment environment;
-} Instance;
 
 static const struct {
     unsigned offset;
     unsigned size;
 } groups[N_GROUPS] = GROUPS;
 
-static fmi3Status fail(const Instance *instance, const char *function, const char *message)
+fmi3Status answer(const Instance *instance, const char *function, const char *message)
 {
+    if (message == NULL) return fmi3OK;
     char text[MESSAGE_SIZE];
     compose(text, function, message);
-    if (instance->log != NULL) instance->log(instance->environment, fmi3Error, "logStatusError", text);
+    if (instance->log != NULL) instance->log(instance->environment, fmi3Error, log_categories[0], text);
     return fmi3Error;
 }
 
-#define OPEN(function, phases)                                                                    \
-    Instance *const self = instance;                                                              \
-    if (self == NULL) return fmi3Error;                                                           \
-    if ((self->phase & (phases)) == 0) return fail(self, function, "not allowed in this phase")
+void report_events(Instance *instance)
+{
+    char text[MESSAGE_SIZE];
+    if (instance->log == NULL) return;
+    while ((instance->logged & LOG_EVENTS) && core_next_event(&instance->core, text)) {
+        instance->log(instance->environment, fmi3OK, log_categories[2], text);
+    }
+}
+
+#define NO_SUCH_VARIABLE "there is no variable with this value reference"
 
 /* Number of values behind a reference, 0 if there is no such variable. */
 static size_t size_of(fmi3ValueReference reference)
@@ -48,11 +42,28 @@ const char *fmi3GetVersion(void) { return fmi3Version; }
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t count, const fmi3String categories[])
 {
-    (void)count;
-    (void)categories;
     OPEN("fmi3SetDebugLogging", ~0);
-    self->logging = on;
+    const unsigned bits = category_bits(count, categories);
+    if (bits == 0) return answer(self, "fmi3SetDebugLogging", "there is no such category");
+    self->logged = on ? self->logged | bits : self->logged & ~bits;
     return fmi3OK;
+}
+
+static Instance *instantiate(const char *function, fmi3String token, int exchange, fmi3Boolean logging,
+                             fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
+{
+    Instance *instance = calloc(1, sizeof *instance);
+    if (instance == NULL) return NULL;
+    instance->logged = logging ? LOG_ALL : 0;
+    instance->log = log;
+    instance->environment = environment;
+    if (token == NULL || strcmp(token, TOKEN) != 0) {
+        answer(instance, function, "the token is not that of this model");
+        free(instance);
+        return NULL;
+    }
+    core_reset(&instance->core, exchange);
+    return instance;
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
@@ -69,19 +80,17 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
     (void)intermediate;
     (void)n_intermediate;
     (void)update;
-    Instance *instance = calloc(1, sizeof *instance);
-    if (instance == NULL) return NULL;
-    instance->logging = logging;
-    instance->log = log;
-    instance->environment = environment;
-    instance->phase = INSTANTIATED;
-    if (token == NULL || strcmp(token, TOKEN) != 0) {
-        fail(instance, "fmi3InstantiateCoSimulation", "the token is not that of this model");
-        free(instance);
-        return NULL;
-    }
-    model_reset(&instance->model);
-    return instance;
+    return instantiate("fmi3InstantiateCoSimulation", token, 0, logging, environment, log);
+}
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible,
+                                          fmi3Boolean logging, fmi3InstanceEnvironment environment,
+                                          fmi3LogMessageCallback log)
+{
+    (void)name;
+    (void)resources;
+    (void)visible;
+    return instantiate("fmi3InstantiateModelExchange", token, 1, logging, environment, log);
 }
 
 void fmi3FreeInstance(fmi3Instance instance) { free(instance); }
@@ -91,38 +100,32 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
 {
     (void)tolerance_defined;
     (void)tolerance;
-    (void)stop_defined;
-    (void)stop;
     OPEN("fmi3EnterInitializationMode", INSTANTIATED);
-    if (!isfinite(start)) return fail(self, "fmi3EnterInitializationMode", "the start time is not finite");
-    self->model.time = start;
-    model_start(&self->model);
-    self->phase = INITIALISING;
-    return fmi3OK;
+    const char *message = core_begin(&self->core, start, stop_defined, stop);
+    if (message == NULL) {
+        model_start(&self->core.model);
+        self->core.phase = INITIALISING;
+    }
+    return answer(self, "fmi3EnterInitializationMode", message);
 }
 
 fmi3Status fmi3ExitInitializationMode(fmi3Instance instance)
 {
     OPEN("fmi3ExitInitializationMode", INITIALISING);
-    if (model_has_empty_range(&self->model)) {
-        return fail(self, "fmi3ExitInitializationMode", "joint_lower is not below joint_upper");
-    }
-    self->phase = STEPPING;
-    return fmi3OK;
+    return answer(self, "fmi3ExitInitializationMode", core_leave_initialisation(&self->core));
 }
 
 fmi3Status fmi3Terminate(fmi3Instance instance)
 {
     OPEN("fmi3Terminate", RUNNING | FAILED);
-    self->phase = TERMINATED;
+    self->core.phase = TERMINATED;
     return fmi3OK;
 }
 
 fmi3Status fmi3Reset(fmi3Instance instance)
 {
     OPEN("fmi3Reset", ~0);
-    model_reset(&self->model);
-    self->phase = INSTANTIATED;
+    core_reset(&self->core, self->core.model.exchange);
     return fmi3OK;
 }
 
@@ -133,16 +136,16 @@ fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference refere
     size_t k = 0;
     for (size_t i = 0; i < count; i++) {
         if (references[i] == N_VALUES) { /* the independent variable */
-            if (k == n_values) return fail(self, "fmi3GetFloat64", "too few values for these variables");
-            values[k++] = self->model.time;
+            if (k == n_values) return answer(self, "fmi3GetFloat64", "too few values for these variables");
+            values[k++] = self->core.model.time;
             continue;
         }
         const size_t size = size_of(references[i]);
-        if (size == 0) return fail(self, "fmi3GetFloat64", explain(MODEL_NO_SUCH_VARIABLE));
-        if (k + size > n_values) return fail(self, "fmi3GetFloat64", "too few values for these variables");
-        for (size_t j = 0; j < size; j++) model_get(&self->model, references[i] + j, &values[k++]);
+        if (size == 0) return answer(self, "fmi3GetFloat64", NO_SUCH_VARIABLE);
+        if (k + size > n_values) return answer(self, "fmi3GetFloat64", "too few values for these variables");
+        for (size_t j = 0; j < size; j++) core_get(&self->core, references[i] + j, &values[k++]);
     }
-    return k == n_values ? fmi3OK : fail(self, "fmi3GetFloat64", "too many values for these variables");
+    return answer(self, "fmi3GetFloat64", k == n_values ? NULL : "too many values for these variables");
 }
 
 fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference references[], size_t count,
@@ -152,23 +155,22 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference refere
     size_t k = 0;
     for (size_t i = 0; i < count; i++) {
         const size_t size = size_of(references[i]);
-        if (size == 0) return fail(self, "fmi3SetFloat64", explain(MODEL_NO_SUCH_VARIABLE));
-        if (references[i] >= OFFSET_JOINT_POSITION) return fail(self, "fmi3SetFloat64", explain(MODEL_NOT_SETTABLE));
-        if (k + size > n_values) return fail(self, "fmi3SetFloat64", "too few values for these variables");
+        if (size == 0) return answer(self, "fmi3SetFloat64", NO_SUCH_VARIABLE);
+        if (k + size > n_values) return answer(self, "fmi3SetFloat64", "too few values for these variables");
         for (size_t j = 0; j < size; j++) {
-            const ModelStatus status = model_set(&self->model, references[i] + j, values[k++]);
-            if (status != MODEL_OK) return fail(self, "fmi3SetFloat64", explain(status));
+            const char *message = core_set(&self->core, references[i] + j, values[k++]);
+            if (message != NULL) return answer(self, "fmi3SetFloat64", message);
         }
     }
-    if (self->phase & (INSTANTIATED | INITIALISING)) model_start(&self->model);
-    return k == n_values ? fmi3OK : fail(self, "fmi3SetFloat64", "too many values for these variables");
+    if (self->core.phase & (INSTANTIATED | INITIALISING)) model_start(&self->core.model);
+    return answer(self, "fmi3SetFloat64", k == n_values ? NULL : "too many values for these variables");
 }
 
 fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state)
 {
     OPEN("fmi3GetFMUState", ~0);
-    Snapshot *snapshot = snapshot_take(&self->model, self->phase);
-    if (snapshot == NULL) return fail(self, "fmi3GetFMUState", "out of memory");
+    Snapshot *snapshot = snapshot_take(&self->core);
+    if (snapshot == NULL) return answer(self, "fmi3GetFMUState", "out of memory");
     free(*state);
     *state = snapshot;
     return fmi3OK;
@@ -177,11 +179,7 @@ fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state)
 fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state)
 {
     OPEN("fmi3SetFMUState", ~0);
-    if (state == NULL) return fail(self, "fmi3SetFMUState", "there is no state");
-    const Snapshot *snapshot = state;
-    memcpy(&self->model, &snapshot->model, sizeof self->model);
-    self->phase = snapshot->phase;
-    return fmi3OK;
+    return answer(self, "fmi3SetFMUState", core_restore(&self->core, state));
 }
 
 fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
@@ -203,7 +201,7 @@ fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state,
 fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state, fmi3Byte bytes[], size_t size)
 {
     OPEN("fmi3SerializeFMUState", ~0);
-    if (state == NULL || size < sizeof(Snapshot)) return fail(self, "fmi3SerializeFMUState", "no state or no room");
+    if (state == NULL || size < sizeof(Snapshot)) return answer(self, "fmi3SerializeFMUState", "no state or no room");
     memcpy(bytes, state, sizeof(Snapshot));
     return fmi3OK;
 }
@@ -212,7 +210,7 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[]
 {
     OPEN("fmi3DeserializeFMUState", ~0);
     Snapshot *snapshot = snapshot_read(bytes, size);
-    if (snapshot == NULL) return fail(self, "fmi3DeserializeFMUState", "these bytes are no state of this model");
+    if (snapshot == NULL) return answer(self, "fmi3DeserializeFMUState", "these bytes are no state of this model");
     free(*state);
     *state = snapshot;
     return fmi3OK;
@@ -222,26 +220,26 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
                                         const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[],
                                         size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity)
 {
-    OPEN("fmi3GetDirectionalDerivative", INITIALISING | RUNNING);
+    OPEN("fmi3GetDirectionalDerivative", DIFFERENTIABLE);
     double direction[N_VALUES] = {0.0};
     size_t k = 0;
     for (size_t i = 0; i < n_knowns; i++) {
         const size_t size = size_of(knowns[i]);
-        if (size == 0 || knowns[i] >= N_SETTABLE) return fail(self, "fmi3GetDirectionalDerivative", "this is no known");
-        if (k + size > n_seed) return fail(self, "fmi3GetDirectionalDerivative", "too few values in the seed");
+        if (size == 0 || knowns[i] >= N_SETTABLE) return answer(self, "fmi3GetDirectionalDerivative", "this is no known");
+        if (k + size > n_seed) return answer(self, "fmi3GetDirectionalDerivative", "too few values in the seed");
         memcpy(direction + knowns[i], seed + k, size * sizeof(double));
         k += size;
     }
-    model_derive(&self->model, direction, self->phase == INITIALISING);
+    model_derive(&self->core.model, direction, self->core.phase == INITIALISING);
     size_t j = 0;
     for (size_t i = 0; i < n_unknowns; i++) {
         const size_t size = size_of(unknowns[i]);
-        if (size == 0) return fail(self, "fmi3GetDirectionalDerivative", "this is no unknown");
-        if (j + size > n_sensitivity) return fail(self, "fmi3GetDirectionalDerivative", "too little room");
+        if (size == 0) return answer(self, "fmi3GetDirectionalDerivative", "this is no unknown");
+        if (j + size > n_sensitivity) return answer(self, "fmi3GetDirectionalDerivative", "too little room");
         memcpy(sensitivity + j, direction + unknowns[i], size * sizeof(double));
         j += size;
     }
-    return k == n_seed && j == n_sensitivity ? fmi3OK : fail(self, "fmi3GetDirectionalDerivative", "too many values");
+    return answer(self, "fmi3GetDirectionalDerivative", k == n_seed && j == n_sensitivity ? NULL : "too many values");
 }
 
 fmi3Status fmi3EnterStepMode(fmi3Instance instance)
@@ -257,15 +255,8 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
     (void)no_set_state;
     OPEN("fmi3DoStep", STEPPING);
     *event_needed = *terminate = *early_return = false;
-    *last_time = self->model.time;
-    if (!isfinite(step) || step < 0.0) return fail(self, "fmi3DoStep", "the step size is negative or not finite");
-    if (!(fabs(time - self->model.time) <= TIME_TOLERANCE * fmax(1.0, fabs(time)))) {
-        return fail(self, "fmi3DoStep", "the communication point is not where the last step ended");
-    }
-    if (step > 0.0 && model_step(&self->model, step) != 0) {
-        self->phase = FAILED;
-        return fail(self, "fmi3DoStep", "a joint position is not finite");
-    }
-    *last_time = self->model.time = time + step;
-    return fmi3OK;
+    const char *message = core_step(&self->core, time, step);
+    *last_time = self->core.model.time;
+    report_events(self);
+    return answer(self, "fmi3DoStep", message);
 }

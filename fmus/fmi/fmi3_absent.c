@@ -2,20 +2,24 @@
 #ifdef __GNUC__
 #pragma GCC diagnostic ignored "-Wunused-parameter" /* that is what absent means */
 #endif
-#include "fmi3Functions.h"
+#include "fmi3_instance.h"
 
-#include <stddef.h>
+/* Any phase: whatever is asked, there is nothing of the kind. */
+static fmi3Status refuse(const Instance *instance, const char *function, const char *message)
+{
+    return instance == NULL ? fmi3Error : answer(instance, function, message);
+}
 
 #define ABSENT_TYPE(Type)                                                                                            \
     fmi3Status fmi3Get##Type(fmi3Instance instance, const fmi3ValueReference references[], size_t count,             \
                              fmi3##Type values[], size_t n_values)                                                   \
     {                                                                                                                \
-        return instance != NULL && count == 0 ? fmi3OK : fmi3Error;                                                  \
+        return refuse(instance, "fmi3Get" #Type, count == 0 ? NULL : "the model has Float64 variables only");        \
     }                                                                                                                \
     fmi3Status fmi3Set##Type(fmi3Instance instance, const fmi3ValueReference references[], size_t count,             \
                              const fmi3##Type values[], size_t n_values)                                             \
     {                                                                                                                \
-        return instance != NULL && count == 0 ? fmi3OK : fmi3Error;                                                  \
+        return refuse(instance, "fmi3Set" #Type, count == 0 ? NULL : "the model has Float64 variables only");        \
     }
 
 ABSENT_TYPE(Float32)
@@ -32,7 +36,7 @@ ABSENT_TYPE(String)
 
 /* Functions of which this model has no use: they fail, whatever they are given. */
 #define ABSENT(name, ...) \
-    fmi3Status name(__VA_ARGS__) { return fmi3Error; }
+    fmi3Status name(__VA_ARGS__) { return refuse(i, #name, "this FMU has no such capability"); }
 
 typedef const fmi3ValueReference Reference;
 typedef fmi3IntervalQualifier Qualifier;
@@ -57,27 +61,8 @@ ABSENT(fmi3SetIntervalFraction, fmi3Instance i, Reference r[], size_t n, const f
 ABSENT(fmi3SetShiftDecimal, fmi3Instance i, Reference r[], size_t n, const fmi3Float64 v[])
 ABSENT(fmi3SetShiftFraction, fmi3Instance i, Reference r[], size_t n, const fmi3UInt64 c[], const fmi3UInt64 s[])
 ABSENT(fmi3EvaluateDiscreteStates, fmi3Instance i)
-ABSENT(fmi3UpdateDiscreteStates, fmi3Instance i, fmi3Boolean *a, fmi3Boolean *b, fmi3Boolean *c, fmi3Boolean *d,
-       fmi3Boolean *e, fmi3Float64 *t)
-ABSENT(fmi3EnterEventMode, fmi3Instance i)
-ABSENT(fmi3EnterContinuousTimeMode, fmi3Instance i)
-ABSENT(fmi3CompletedIntegratorStep, fmi3Instance i, fmi3Boolean a, fmi3Boolean *b, fmi3Boolean *c)
-ABSENT(fmi3SetTime, fmi3Instance i, fmi3Float64 t)
-ABSENT(fmi3SetContinuousStates, fmi3Instance i, const fmi3Float64 v[], size_t n)
-ABSENT(fmi3GetContinuousStateDerivatives, fmi3Instance i, fmi3Float64 v[], size_t n)
-ABSENT(fmi3GetEventIndicators, fmi3Instance i, fmi3Float64 v[], size_t n)
-ABSENT(fmi3GetContinuousStates, fmi3Instance i, fmi3Float64 v[], size_t n)
-ABSENT(fmi3GetNominalsOfContinuousStates, fmi3Instance i, fmi3Float64 v[], size_t n)
-ABSENT(fmi3GetNumberOfEventIndicators, fmi3Instance i, size_t *n)
-ABSENT(fmi3GetNumberOfContinuousStates, fmi3Instance i, size_t *n)
 ABSENT(fmi3GetOutputDerivatives, fmi3Instance i, Reference r[], size_t n, const fmi3Int32 o[], fmi3Float64 v[], size_t nv)
 ABSENT(fmi3ActivateModelPartition, fmi3Instance i, fmi3ValueReference r, fmi3Float64 t)
-
-fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String path, fmi3Boolean visible,
-                                          fmi3Boolean logging, fmi3InstanceEnvironment e, fmi3LogMessageCallback log)
-{
-    return NULL;
-}
 
 fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String path, fmi3Boolean visible,
                                                fmi3Boolean logging, fmi3InstanceEnvironment e,

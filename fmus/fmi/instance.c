@@ -1,16 +1,131 @@
 #include "instance.h"
 
+#include <float.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-Snapshot *snapshot_take(const Model *model, Phase phase)
+/* How far the importer's time may be from the model's own: a share of the step, and rounding of the time itself. */
+#define STEP_SHARE 1e-6
+#define ROUNDING (8.0 * DBL_EPSILON)
+/* How far a solver's last point may be behind the stop time [s]. */
+#define STOP_SLACK 1e-9
+
+const char *const log_categories[N_CATEGORIES] = {"logStatusError", "logStatusWarning", "logEvents"};
+
+static double time_tolerance(double time, double step) { return STEP_SHARE * step + ROUNDING * fabs(time); }
+
+static const char *explain(ModelStatus status)
+{
+    switch (status) {
+    case MODEL_NO_SUCH_VARIABLE: return "there is no variable with this value reference";
+    case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
+    case MODEL_FIXED: return "this parameter is fixed: it can be set before the end of initialisation only";
+    case MODEL_BAD_VALUE: return "the value is not finite or below the variable's minimum";
+    case MODEL_EMPTY_RANGE: return "joint_lower is not below joint_upper";
+    case MODEL_BEYOND_STOP: return "a joint is beyond its stops joint_lower and joint_upper";
+    case MODEL_NOT_FINITE: return "a joint position is not finite";
+    default: return NULL;
+    }
+}
+
+void core_reset(Core *core, int exchange)
+{
+    memset(core, 0, sizeof *core);
+    model_reset(&core->model, exchange);
+    core->stop_time = HUGE_VAL;
+    core->phase = INSTANTIATED;
+}
+
+const char *core_begin(Core *core, double start, int stop_defined, double stop)
+{
+    if (!isfinite(start)) return "the start time is not finite";
+    if (stop_defined && !(stop >= start)) return "the stop time is before the start time";
+    core->model.time = start;
+    core->stop_time = stop_defined ? stop : HUGE_VAL;
+    return NULL;
+}
+
+const char *core_leave_initialisation(Core *core)
+{
+    const ModelStatus status = model_check_range(&core->model);
+    if (status == MODEL_OK) core->phase = core->model.exchange ? IN_EVENT : STEPPING;
+    return explain(status);
+}
+
+const char *core_get(Core *core, size_t index, double *value) { return explain(model_get(&core->model, index, value)); }
+
+const char *core_set(Core *core, size_t index, double value)
+{
+    const int starting = (core->phase & (INSTANTIATED | INITIALISING)) != 0;
+    /* Solvers that know no other way may set states one by one. */
+    if (index >= OFFSET_JOINT_POSITION && index < N_SETTABLE && (core->phase & EXCHANGING) == 0) {
+        return explain(MODEL_NOT_SETTABLE);
+    }
+    if (!starting && index >= OFFSET_HOME && index < OFFSET_HOME + N_JOINTS) return explain(MODEL_FIXED);
+    return explain(model_set(&core->model, index, value));
+}
+
+const char *core_step(Core *core, double time, double step)
+{
+    Model *model = &core->model;
+    if (!isfinite(step) || step < 0.0) return "the step size is negative or not finite";
+    const double tolerance = time_tolerance(time, step);
+    if (!(fabs(time - model->time) <= tolerance)) return "the communication point is not where the last step ended";
+    if (time + step > core->stop_time + tolerance) return "the step ends after the stop time";
+    if (step > 0.0) {
+        const ModelStatus status = model_step(model, step);
+        if (status == MODEL_NOT_FINITE) core->phase = FAILED;
+        if (status != MODEL_OK) return explain(status);
+    }
+    model->time = time + step;
+    return NULL;
+}
+
+const char *core_check_stop_time(const Core *core)
+{
+    const double time = core->model.time, slack = STOP_SLACK + ROUNDING * fabs(time);
+    return time <= core->stop_time + slack ? NULL : "the time is after the stop time";
+}
+
+const char *core_update_discrete_states(Core *core, int *states_changed)
+{
+    const ModelStatus status = model_has_empty_range(&core->model) ? MODEL_EMPTY_RANGE : MODEL_OK;
+    *states_changed = status == MODEL_OK && model_settle(&core->model);
+    return explain(status);
+}
+
+int core_next_event(Core *core, char text[MESSAGE_SIZE])
+{
+    model_hold(&core->model);
+    for (int i = 0; i < N_JOINTS; i++) {
+        const int held = core->model.held[i];
+        if (held == core->reported[i]) continue;
+        const char *what = held > 0 ? "is held by its upper stop" : held < 0 ? "is held by its lower stop" : "is free";
+        snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, what, core->model.time);
+        core->reported[i] = held;
+        return 1;
+    }
+    return 0;
+}
+
+/* FNV-1a */
+static unsigned long long checksum_of(const Core *core)
+{
+    const unsigned char *bytes = (const unsigned char *)core;
+    unsigned long long sum = 14695981039346656037ULL;
+    for (size_t i = 0; i < sizeof *core; i++) sum = (sum ^ bytes[i]) * 1099511628211ULL;
+    return sum;
+}
+
+Snapshot *snapshot_take(const Core *core)
 {
     Snapshot *snapshot = calloc(1, sizeof *snapshot);
     if (snapshot == NULL) return NULL;
     strncpy(snapshot->token, TOKEN, sizeof snapshot->token - 1);
-    memcpy(&snapshot->model, model, sizeof *model);
-    snapshot->phase = phase;
+    memcpy(&snapshot->core, core, sizeof *core);
+    snapshot->checksum = checksum_of(&snapshot->core);
     return snapshot;
 }
 
@@ -19,11 +134,21 @@ Snapshot *snapshot_read(const void *bytes, size_t size)
     Snapshot *snapshot = size == sizeof *snapshot ? malloc(size) : NULL;
     if (snapshot == NULL) return NULL;
     memcpy(snapshot, bytes, size);
-    if (memcmp(snapshot->token, TOKEN, sizeof TOKEN) != 0) {
+    if (memcmp(snapshot->token, TOKEN, sizeof TOKEN) != 0 || snapshot->checksum != checksum_of(&snapshot->core)) {
         free(snapshot);
         return NULL;
     }
     return snapshot;
+}
+
+const char *core_restore(Core *core, const Snapshot *snapshot)
+{
+    if (snapshot == NULL) return "there is no state";
+    if (snapshot->core.model.exchange != core->model.exchange) {
+        return "this state was saved in the other of model exchange and co-simulation";
+    }
+    memcpy(core, &snapshot->core, sizeof *core);
+    return NULL;
 }
 
 void compose(char text[MESSAGE_SIZE], const char *function, const char *message)
@@ -31,12 +156,16 @@ void compose(char text[MESSAGE_SIZE], const char *function, const char *message)
     snprintf(text, MESSAGE_SIZE, "%s: %s", function, message);
 }
 
-const char *explain(ModelStatus status)
+unsigned category_bits(size_t count, const char *const categories[])
 {
-    switch (status) {
-    case MODEL_NO_SUCH_VARIABLE: return "there is no variable with this value reference";
-    case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
-    case MODEL_BAD_VALUE: return "the value is not finite or below the variable's minimum";
-    default: return "no error";
+    unsigned bits = count == 0 ? LOG_ALL : 0;
+    for (size_t i = 0; i < count; i++) {
+        unsigned bit = 0;
+        for (unsigned k = 0; k < N_CATEGORIES; k++) {
+            if (categories[i] != NULL && strcmp(categories[i], log_categories[k]) == 0) bit = 1u << k;
+        }
+        if (bit == 0) return 0;
+        bits |= bit;
     }
+    return bits;
 }

@@ -1,4 +1,4 @@
-/* What both FMI layers need beside the model: the phase of the instance and its saved state. */
+/* What FMI 2 and FMI 3 have in common beside the model: phases, time, saved states, messages. */
 #ifndef INSTANCE_H
 #define INSTANCE_H
 
@@ -14,23 +14,55 @@ typedef enum {
     FAILED = 64
 } Phase;
 
-enum { RUNNING = STEPPING | IN_EVENT | CONTINUOUS, READABLE = INITIALISING | RUNNING | TERMINATED | FAILED };
+enum {
+    EXCHANGING = IN_EVENT | CONTINUOUS,
+    RUNNING = STEPPING | EXCHANGING,
+    READABLE = INITIALISING | RUNNING | TERMINATED | FAILED,
+    DIFFERENTIABLE = INITIALISING | RUNNING | TERMINATED
+};
+
+/* Bits of the log categories, in the order of their names in `log_categories`. */
+enum { LOG_ERRORS = 1, LOG_WARNINGS = 2, LOG_EVENTS = 4, LOG_ALL = 7, N_CATEGORIES = 3 };
+extern const char *const log_categories[N_CATEGORIES];
+
+/* The part of an instance that a saved state holds. */
+typedef struct {
+    Model model;
+    Phase phase;
+    double stop_time; /* infinite if none was given */
+    int reported[N_JOINTS]; /* stops that the joints are held by, as far as the log knows */
+} Core;
 
 typedef struct {
     char token[64]; /* of the model that saved it: a state of another model is refused */
-    Model model;
-    Phase phase;
+    Core core;
+    unsigned long long checksum;
 } Snapshot;
 
-/* NULL without memory. */
-Snapshot *snapshot_take(const Model *model, Phase phase);
-/* NULL if `bytes` are not the state of this model. */
-Snapshot *snapshot_read(const void *bytes, size_t size);
+/* A function that returns text returns NULL where all is well, and otherwise what to tell the user. */
 
+void core_reset(Core *core, int exchange);
+const char *core_begin(Core *core, double start, int stop_defined, double stop);
+const char *core_leave_initialisation(Core *core);
+const char *core_get(Core *core, size_t index, double *value);
+const char *core_set(Core *core, size_t index, double value);
+const char *core_step(Core *core, double time, double step);
+/* Solvers evaluate the equations beyond the stop time as well; what ends a step or changes a state may not. */
+const char *core_check_stop_time(const Core *core);
+const char *core_update_discrete_states(Core *core, int *states_changed);
+/* Writes what happened at a stop since the last call; zero if nothing (more) did. */
 #define MESSAGE_SIZE 256
+int core_next_event(Core *core, char text[MESSAGE_SIZE]);
+
+/* NULL without memory. */
+Snapshot *snapshot_take(const Core *core);
+/* NULL if `bytes` are not an intact state of this model. */
+Snapshot *snapshot_read(const void *bytes, size_t size);
+const char *core_restore(Core *core, const Snapshot *snapshot);
+
 /* Writes "function: message". Importers without printf formatting get whole texts that way. */
 void compose(char text[MESSAGE_SIZE], const char *function, const char *message);
-
-const char *explain(ModelStatus status);
+/* The bits that a list of categories stands for, all of them for an empty list; 0 if one is unknown. */
+unsigned category_bits(size_t count, const char *const categories[]);
 
 #endif

@@ -6,6 +6,8 @@
 
 /* In continuous time a lag of zero would make the equations algebraic; below this it counts as this. */
 #define SMALLEST_LAG 1e-6
+/* How far behind its stop a joint meets it [rad]; a joint that leaves a stop does not meet it at once that way. */
+#define STOP_HYSTERESIS 1e-9
 
 enum { STALE_BALL = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
 
@@ -35,19 +37,31 @@ static double continuous_lag(const Model *model, size_t i)
     return fmax(model->values[OFFSET_LAG + i], SMALLEST_LAG);
 }
 
-/* A joint at its stop that is driven further into it. */
-static int is_blocked(const Model *model, size_t i)
+static double upper_room(const Model *model, size_t i)
 {
-    const double q = model->values[OFFSET_JOINT_POSITION + i], v = model->values[OFFSET_JOINT_VELOCITY + i];
-    return (q >= model->values[OFFSET_JOINT_UPPER + i] && v > 0.0) ||
-           (q <= model->values[OFFSET_JOINT_LOWER + i] && v < 0.0);
+    return model->values[OFFSET_JOINT_UPPER + i] - model->values[OFFSET_JOINT_POSITION + i];
 }
 
-void model_reset(Model *model)
+static double lower_room(const Model *model, size_t i)
+{
+    return model->values[OFFSET_JOINT_POSITION + i] - model->values[OFFSET_JOINT_LOWER + i];
+}
+
+/* 1 if a joint at or behind its upper stop moves on by its velocity, or at rest by its command; -1 for the lower one. */
+static int side_met(const Model *model, size_t i)
+{
+    const double v = model->values[OFFSET_JOINT_VELOCITY + i], along = v != 0.0 ? v : clipped_command(model, i);
+    return along > 0.0 && upper_room(model, i) <= 0.0 ? 1 : along < 0.0 && lower_room(model, i) <= 0.0 ? -1 : 0;
+}
+
+static int is_driven(const Model *model, size_t i, int side) { return clipped_command(model, i) * side > 0.0; }
+
+void model_reset(Model *model, int exchange)
 {
     memset(model, 0, sizeof *model);
     memcpy(model->values, start_values, sizeof start_values);
     model->gain_step = -1.0;
+    model->exchange = exchange;
     model_start(model);
 }
 
@@ -56,6 +70,7 @@ void model_start(Model *model)
     for (size_t i = 0; i < N_JOINTS; i++) {
         model->values[OFFSET_JOINT_POSITION + i] = model->values[OFFSET_HOME + i];
         model->values[OFFSET_JOINT_VELOCITY + i] = 0.0;
+        model->held[i] = 0;
     }
     model->stale = STALE_ALL;
 }
@@ -66,6 +81,42 @@ int model_has_empty_range(const Model *model)
         if (!(model->values[OFFSET_JOINT_LOWER + i] < model->values[OFFSET_JOINT_UPPER + i])) return 1;
     }
     return 0;
+}
+
+ModelStatus model_check_range(const Model *model)
+{
+    if (model_has_empty_range(model)) return MODEL_EMPTY_RANGE;
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        if (upper_room(model, i) < 0.0 || lower_room(model, i) < 0.0) return MODEL_BEYOND_STOP;
+    }
+    return MODEL_OK;
+}
+
+int model_settle(Model *model)
+{
+    int changed = 0;
+    for (size_t i = 0; i < N_JOINTS; i++) {
+        const int side = side_met(model, i);
+        if (side != 0) {
+            double *position = &model->values[OFFSET_JOINT_POSITION + i];
+            double *velocity = &model->values[OFFSET_JOINT_VELOCITY + i];
+            const double stop = model->values[(side > 0 ? OFFSET_JOINT_UPPER : OFFSET_JOINT_LOWER) + i];
+            changed |= *position != stop || *velocity != 0.0;
+            *position = stop;
+            *velocity = 0.0;
+        }
+        model->held[i] = is_driven(model, i, side) ? side : 0;
+    }
+    model->stale = STALE_ALL;
+    return changed;
+}
+
+void model_hold(Model *model)
+{
+    for (size_t i = 0; i < N_JOINTS && !model->exchange; i++) {
+        const int side = side_met(model, i);
+        model->held[i] = is_driven(model, i, side) ? side : 0;
+    }
 }
 
 ModelStatus model_set(Model *model, size_t index, double value)
@@ -97,15 +148,18 @@ static void refresh_kinematics(Model *model, int part)
     model->stale &= ~part;
 }
 
+/* Free joints meet a stop where its distance crosses zero; held ones are freed where the command does. */
 static void refresh_derivatives(Model *model)
 {
+    model_hold(model);
     for (size_t i = 0; i < N_JOINTS; i++) {
-        const double v = model->values[OFFSET_JOINT_VELOCITY + i];
-        const double u = clipped_command(model, i);
-        const int blocked = is_blocked(model, i);
-        const double towards = blocked && u * v > 0.0 ? 0.0 : u;
-        model->values[OFFSET_DER_JOINT_POSITION + i] = blocked ? 0.0 : v;
-        model->values[OFFSET_DER_JOINT_VELOCITY + i] = (towards - v) / continuous_lag(model, i);
+        const double v = model->values[OFFSET_JOINT_VELOCITY + i], u = clipped_command(model, i);
+        const int held = model->held[i];
+        double *indicators = model->values + OFFSET_STOP_INDICATOR + 2 * i;
+        model->values[OFFSET_DER_JOINT_POSITION + i] = held ? 0.0 : v;
+        model->values[OFFSET_DER_JOINT_VELOCITY + i] = held ? 0.0 : (u - v) / continuous_lag(model, i);
+        indicators[0] = held < 0 ? -u : lower_room(model, i) + STOP_HYSTERESIS;
+        indicators[1] = held > 0 ? u : upper_room(model, i) + STOP_HYSTERESIS;
     }
     model->stale &= ~STALE_DERIVATIVES;
 }
@@ -149,46 +203,57 @@ static void refresh_gains(Model *model, double step)
     model->gain_step = step;
 }
 
-int model_step(Model *model, double step)
+ModelStatus model_step(Model *model, double step)
 {
     double *position = model->values + OFFSET_JOINT_POSITION, *velocity = model->values + OFFSET_JOINT_VELOCITY;
-    if (step != model->gain_step) refresh_gains(model, step);
+    if (step != model->gain_step) { /* also after a parameter was set */
+        const ModelStatus status = model_check_range(model);
+        if (status != MODEL_OK) return status;
+        refresh_gains(model, step);
+    }
     for (size_t i = 0; i < N_JOINTS; i++) {
         const double u = clipped_command(model, i), v = velocity[i];
         const double q = position[i] + model->drift[i] * v + model->push[i] * u;
-        if (!isfinite(q)) return 1;
+        if (!isfinite(q)) return MODEL_NOT_FINITE;
         position[i] = clip(q, model->values[OFFSET_JOINT_LOWER + i], model->values[OFFSET_JOINT_UPPER + i]);
         velocity[i] = position[i] == q ? model->decay[i] * v + (1.0 - model->decay[i]) * u : 0.0;
     }
     model->stale = STALE_ALL;
-    return 0;
+    return MODEL_OK;
 }
 
-static double derive_acceleration(const Model *model, const double *direction, size_t i, int blocked)
+/* The clipped command's derivative along `direction`. */
+static double derive_command(const Model *model, const double *direction, size_t i)
 {
-    const double lag = continuous_lag(model, i), limit = model->values[OFFSET_MAX_SPEED + i];
-    const double v = model->values[OFFSET_JOINT_VELOCITY + i], command = model->values[OFFSET_JOINT_VELOCITY_COMMAND + i];
-    double u = command, du = direction[OFFSET_JOINT_VELOCITY_COMMAND + i];
-    if (fabs(command) > limit) {
-        u = command > 0.0 ? limit : -limit;
-        du = command > 0.0 ? direction[OFFSET_MAX_SPEED + i] : -direction[OFFSET_MAX_SPEED + i];
-    }
-    if (blocked && u * v > 0.0) u = du = 0.0;
+    const double command = model->values[OFFSET_JOINT_VELOCITY_COMMAND + i], limit = model->values[OFFSET_MAX_SPEED + i];
+    if (fabs(command) <= limit) return direction[OFFSET_JOINT_VELOCITY_COMMAND + i];
+    return command > 0.0 ? direction[OFFSET_MAX_SPEED + i] : -direction[OFFSET_MAX_SPEED + i];
+}
+
+static double derive_acceleration(const Model *model, const double *direction, size_t i)
+{
+    const double lag = continuous_lag(model, i), v = model->values[OFFSET_JOINT_VELOCITY + i];
+    const double u = clipped_command(model, i), du = derive_command(model, direction, i);
     const double dlag = model->values[OFFSET_LAG + i] > SMALLEST_LAG ? direction[OFFSET_LAG + i] : 0.0;
     return (du - direction[OFFSET_JOINT_VELOCITY + i]) / lag - (u - v) / (lag * lag) * dlag;
 }
 
-void model_derive(const Model *model, double direction[N_VALUES], int starting)
+void model_derive(Model *model, double direction[N_VALUES], int starting)
 {
+    model_hold(model);
     if (starting) {
         memcpy(direction + OFFSET_JOINT_POSITION, direction + OFFSET_HOME, N_JOINTS * sizeof(double));
         memset(direction + OFFSET_JOINT_VELOCITY, 0, N_JOINTS * sizeof(double));
     }
     for (size_t i = 0; i < N_JOINTS; i++) {
-        const int blocked = is_blocked(model, i);
-        direction[OFFSET_DER_JOINT_POSITION + i] = blocked ? 0.0 : direction[OFFSET_JOINT_VELOCITY + i];
-        direction[OFFSET_DER_JOINT_VELOCITY + i] = derive_acceleration(model, direction, i, blocked);
-        direction[OFFSET_ENCODER_POSITION + i] = direction[OFFSET_JOINT_POSITION + i]; /* the mean over a step */
+        const int held = model->held[i];
+        const double dq = direction[OFFSET_JOINT_POSITION + i], du = derive_command(model, direction, i);
+        double *indicators = direction + OFFSET_STOP_INDICATOR + 2 * i;
+        direction[OFFSET_DER_JOINT_POSITION + i] = held ? 0.0 : direction[OFFSET_JOINT_VELOCITY + i];
+        direction[OFFSET_DER_JOINT_VELOCITY + i] = held ? 0.0 : derive_acceleration(model, direction, i);
+        direction[OFFSET_ENCODER_POSITION + i] = dq; /* the mean over a step */
+        indicators[0] = held < 0 ? -du : dq - direction[OFFSET_JOINT_LOWER + i];
+        indicators[1] = held > 0 ? du : direction[OFFSET_JOINT_UPPER + i] - dq;
     }
     double work[N_WORK];
     const double *arguments[4] = {model->values + OFFSET_JOINT_POSITION, model->values,

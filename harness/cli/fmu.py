@@ -18,7 +18,7 @@ FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 @fmu_app.command()
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The .fmu file to write.")],
-    fmi: Annotated[int, typer.Option(help="2 (co-simulation and model exchange) or 3 (co-simulation).")] = 2,
+    fmi: Annotated[int, typer.Option(help="2 or 3; both offer co-simulation and model exchange.")] = 2,
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
     robot: RobotOption = "ur5",
     seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,

@@ -108,16 +108,20 @@ def _feature_function(
     try:
         builder = casadi.DaeBuilder("fmu", str(root))
         states, outputs, constants = list(builder.x()), list(builder.y()), list(builder.p())
+        values = dict(zip(constants, _starts(builder, constants), strict=True))
+        fixed = list(builder.c())
+        for name, value in parameters.items():
+            names = _resolve("parameters", [name], [*constants, *fixed], f"parameters of {path.name}")
+            for each, number in zip(names, np.broadcast_to(np.ravel(value), (len(names),)).tolist(), strict=True):
+                if each in fixed:
+                    builder.set(each, number)
+                values[each] = number
         chosen = _resolve("joints", joints, states, f"states of {path.name}")
         builder.set_y(_resolve("features", features, outputs, f"outputs of {path.name}"))
         whole = builder.create("fmu", ["x", "u", "p"], ["y"])
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]  # the lines before say where in CasADi
         raise ValueError(f"fmu file {path} cannot be read by CasADi: {reason}") from error
-    values = dict(zip(constants, _starts(builder, constants), strict=True))
-    for name, value in parameters.items():
-        names = _resolve("parameters", [name], constants, f"parameters of {path.name}")
-        values.update(zip(names, np.broadcast_to(np.ravel(value), (len(names),)), strict=True))
     q = casadi.MX.sym("joint_position", len(chosen))
     place = {name: i for i, name in enumerate(chosen)}
     rest = dict(zip(states, _starts(builder, states), strict=True))

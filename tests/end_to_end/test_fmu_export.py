@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
@@ -149,6 +150,10 @@ def test_zig_puts_libraries_for_five_platforms_into_one_fmu(version, tmp_path):
             target = PLATFORMS[name]
             inside = f"binaries/{target.folder(version)}/ur5_mismatched{target.suffix}"
             content = archive.read(inside)
+            if version == 2 and name == "x86_64-darwin":  # one file for both processors
+                assert content.startswith(b"\xca\xfe\xba\xbe")
+                _, _, start, size, _ = struct.unpack_from(">5I", content, 8)
+                content = content[start : start + size]
             assert content.startswith(magic), name
             assert content[offset:].startswith(machine), name
             assert f"fmi{version}DoStep".encode() in content or name.endswith("darwin")  # whose names share prefixes
@@ -185,12 +190,11 @@ def test_information_tells_version_platform_and_variables(version):
     assert information.fmi_version == f"{version}.0"
     assert information.platforms == (this_platform().folder(version),)
     assert information.has_sources
-    offered = ["co-simulation", "model exchange"] if version == 2 else ["co-simulation"]
-    assert list(information.interfaces) == offered
+    assert list(information.interfaces) == ["co-simulation", "model exchange"]
     for capabilities in information.interfaces.values():
         assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
         assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
-    assert len(information.variables) == (156 if version == 2 else 28)
+    assert len(information.variables) == (168 if version == 2 else 29)
     assert all(variable.unit and variable.description for variable in information.variables) or version == 2
 
 

@@ -147,6 +147,18 @@ def test_nominal_parameters_give_controllers_a_model_to_start_from(tmp_path):
         assert row["steady_state_error"] < 2e-3
 
 
+def test_fixed_parameters_reach_the_model_like_tunable_ones(tmp_path):
+    q = np.array([0.4, 0.9])
+    description = describe_exchange().replace(
+        'causality="parameter" variability="tunable"', 'causality="parameter" variability="fixed"'
+    )
+    build_crane(tmp_path / "fixed.fmu", 2, description=description)
+    names = ("wheel.slew", "wheel.luff"), ("place.slew", "place.luff")
+    values = dict(zip(("arm.slew", "arm.luff"), TRUE_ARM, strict=True))
+    model = FmuModel(tmp_path / "fixed.fmu", *names, values)
+    np.testing.assert_allclose(model.jacobian(q), crane_jacobian(q), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("controller", "old", "new", "message"),
     [

@@ -159,7 +159,7 @@ static int call(void)
 {
     const unsigned k = below(INSTANCES);
     const fmi2Component instance = below(50) ? instances[k] : NULL;
-    const fmi2String categories[] = {"logAll"};
+    const fmi2String categories[] = {below(2) ? "logEvents" : "logAll"};
     switch (below(24)) {
     case 0: return below(40) ? fmi2OK : make(k);
     case 1: return fmi2SetupExperiment(instance, 0, 0.0, below(4) ? 0.0 : number(), (int)below(2), number());

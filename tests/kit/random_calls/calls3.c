@@ -21,9 +21,12 @@ static int make(unsigned k)
 {
     fmi3FreeInstance(instances[k]);
     const char *token = below(20) ? TOKEN : "{another}";
-    instances[k] = fmi3InstantiateCoSimulation(below(30) ? "arm" : NULL, below(30) ? token : NULL, NULL, below(2),
-                                               below(2), below(2), below(2), NULL, 0, NULL,
-                                               below(2) ? on_message : NULL, NULL);
+    const char *name = below(30) ? "arm" : NULL;
+    const fmi3LogMessageCallback log = below(2) ? on_message : NULL;
+    token = below(30) ? token : NULL;
+    instances[k] = below(2) ? fmi3InstantiateModelExchange(name, token, NULL, below(2), below(2), NULL, log)
+                            : fmi3InstantiateCoSimulation(name, token, NULL, below(2), below(2), below(2), below(2),
+                                                          NULL, 0, NULL, log, NULL);
     times[k] = 0.0;
     return instances[k] == NULL ? fmi3Error : fmi3OK;
 }
@@ -123,6 +126,31 @@ static int use_state(fmi3Instance instance)
     }
 }
 
+static int exchange(fmi3Instance instance)
+{
+    const size_t count = below(6) ? 2 * N_JOINTS : few();
+    double *values = numbers(count), time;
+    size_t size;
+    bool b[5];
+    int status = fmi3OK;
+    switch (below(12)) {
+    case 0: status = fmi3EnterEventMode(instance); break;
+    case 1: status = fmi3UpdateDiscreteStates(instance, &b[0], &b[1], &b[2], &b[3], &b[4], &time); break;
+    case 2: status = fmi3EnterContinuousTimeMode(instance); break;
+    case 3: status = fmi3CompletedIntegratorStep(instance, true, &b[0], &b[1]); break;
+    case 4: status = fmi3SetTime(instance, number()); break;
+    case 5: status = fmi3SetContinuousStates(instance, values, count); break;
+    case 6: status = fmi3GetContinuousStateDerivatives(instance, values, count); break;
+    case 7: status = fmi3GetEventIndicators(instance, values, count); break;
+    case 8: status = fmi3GetContinuousStates(instance, values, count); break;
+    case 9: status = fmi3GetNumberOfContinuousStates(instance, &size); break;
+    case 10: status = fmi3GetNumberOfEventIndicators(instance, &size); break;
+    default: status = fmi3GetNominalsOfContinuousStates(instance, values, count); break;
+    }
+    free(values);
+    return status;
+}
+
 static int step(fmi3Instance instance, unsigned k)
 {
     const double time = below(4) ? times[k] : number(), size = below(4) ? 0.05 : number();
@@ -137,8 +165,8 @@ static int call(void)
 {
     const unsigned k = below(INSTANCES);
     const fmi3Instance instance = below(50) ? instances[k] : NULL;
-    const fmi3String categories[] = {"logAll"};
-    switch (below(22)) {
+    const fmi3String categories[] = {below(2) ? "logEvents" : "logAll"};
+    switch (below(24)) {
     case 0: return below(40) ? fmi3OK : make(k);
     case 1: return fmi3EnterInitializationMode(instance, 0, 0.0, below(4) ? 0.0 : number(), below(2), number());
     case 2: return fmi3ExitInitializationMode(instance);
@@ -152,6 +180,7 @@ static int call(void)
     case 12: case 13: case 14: return access_values(instance, 0);
     case 15: case 16: return access_values(instance, 1);
     case 17: return access_values(instance, 2);
+    case 18: case 19: return exchange(instance);
     default: return step(instance, k);
     }
 }

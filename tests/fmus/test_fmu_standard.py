@@ -1,0 +1,243 @@
+"""The exported FMU to the letter of the standard, with fmpy as importer: times, parameters, ranges, stops, states."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+import zipfile
+
+import numpy as np
+import pytest
+from fmpy import read_model_description, simulate_fmu
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi2 import FMU2Model, FMU2Slave
+from fmpy.fmi3 import FMU3Model, FMU3Slave
+from fmpy.model_description import read_build_description
+
+from servobench.fmus.export import arm_layout
+from servobench.fmus.ur5_plant import cached_fmu
+from servobench.plant.fmu.archive import extract_fmu
+
+VERSIONS = [2, 3]
+LAYOUT = arm_layout(6)
+
+
+class Fmu:
+    """An instance of the exported FMU as fmpy drives it."""
+
+    def __init__(self, version: int, exchange: bool = False) -> None:
+        self.version, self.exchange = version, exchange
+        path = cached_fmu(version)
+        self.description = read_model_description(str(path))
+        kinds = {(2, False): FMU2Slave, (2, True): FMU2Model, (3, False): FMU3Slave, (3, True): FMU3Model}
+        token = self.description.guid if version == 2 else self.description.instantiationToken
+        self.fmu = kinds[version, exchange](
+            guid=token,
+            unzipDirectory=str(extract_fmu(path)),
+            modelIdentifier="ur5_mismatched",
+            instanceName="arm",
+        )
+        self.fmu.instantiate()
+
+    def start(self, time: float = 0.0, stop: float | None = None) -> None:
+        if self.version == 2:
+            self.fmu.setupExperiment(startTime=time, stopTime=stop)
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.enterInitializationMode(startTime=time, stopTime=stop)
+        self.fmu.exitInitializationMode()
+
+    def step(self, time: float, size: float) -> None:
+        self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
+
+    def references(self, name: str) -> list[int]:
+        first, size = LAYOUT.offsets[name], next(group.size for group in LAYOUT.groups if group.name == name)
+        return list(range(first, first + size)) if self.version == 2 else [first]
+
+    def set(self, name: str, value: float, size: int = 6) -> None:
+        write = self.fmu.setReal if self.version == 2 else self.fmu.setFloat64
+        write(self.references(name), [value] * size)
+
+    def get(self, name: str) -> np.ndarray:
+        if self.version == 2:
+            return np.array(self.fmu.getReal(self.references(name)))
+        size = next(group.size for group in LAYOUT.groups if group.name == name)
+        return np.array(self.fmu.getFloat64(self.references(name), nValues=size))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.fmu.freeInstance()
+
+
+def refused():
+    return pytest.raises(FMICallException, match="status 3")
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_step_that_ends_after_the_stop_time_is_refused(version):
+    with Fmu(version) as arm:
+        arm.start(stop=1.0)
+        arm.step(0.0, 0.5)
+        with refused():
+            arm.step(0.5, 0.6)
+        arm.step(0.5, 0.5 + 1e-9)  # rounding of the importer
+    with Fmu(version) as arm:
+        arm.start()
+        arm.step(0.0, 5.0)
+    with Fmu(version) as arm, refused():
+        arm.start(time=2.0, stop=1.0)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_solver_may_look_beyond_the_stop_time_and_not_step_there(version):
+    with Fmu(version, exchange=True) as arm:
+        arm.start(stop=1.0)
+        arm.fmu.enterContinuousTimeMode()
+        arm.fmu.setTime(1.2)
+        arm.get("der(joint_velocity)")
+        for ended in (arm.fmu.completedIntegratorStep, arm.fmu.enterEventMode):
+            with refused():
+                ended()
+        arm.fmu.setTime(1.0)
+        arm.fmu.completedIntegratorStep()
+        arm.fmu.enterEventMode()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_no_step_is_lost_or_taken_twice_a_day_after_the_start(version):
+    with Fmu(version) as arm:
+        arm.start(time=1e5)
+        arm.step(1e5, 0.05)
+        for wrong in (1e5, 1e5 + 0.1, 1e5 + 0.0501):
+            with refused():
+                arm.step(wrong, 0.05)
+        for k in range(1, 1000):
+            arm.step(1e5 + k * 0.05, 0.05)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_home_is_fixed_from_the_end_of_initialisation_on(version):
+    variability = {each.name: each.variability for each in Fmu(version).description.modelVariables}
+    assert variability["home[1]" if version == 2 else "home"] == "fixed"
+    assert variability["a[1]" if version == 2 else "a"] == "tunable"
+    with Fmu(version) as arm:
+        arm.set("home", 0.25)
+        arm.start()
+        assert arm.get("joint_position").tolist() == [0.25] * 6
+        with refused():
+            arm.set("home", 0.5)
+        assert arm.get("home").tolist() == [0.25] * 6
+    with Fmu(version) as arm, refused():
+        arm.set("home", 50.0)
+        arm.start()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_stops_are_checked_while_stepping(version):
+    with Fmu(version) as arm:
+        arm.set("home", 0.0)
+        arm.start()
+        arm.set("joint_lower", 3.0)
+        arm.set("joint_upper", -3.0)
+        with refused():
+            arm.step(0.0, 0.05)
+        arm.set("joint_upper", 4.0)  # a range without the joint in it
+        with refused():
+            arm.step(0.0, 0.05)
+        assert arm.get("joint_position").tolist() == [0.0] * 6
+        arm.set("joint_lower", -0.01)
+        arm.set("joint_velocity_command", -1.0)
+        arm.step(0.0, 0.05)
+        assert arm.get("joint_position").tolist() == [-0.01] * 6
+
+
+def drive(version: int, kind: str, **options) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and velocity of joint 1, which is driven into its stop for half a second and then back."""
+    time, commands = np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 1.0, -0.3, -0.3])
+    if version == 2:
+        names = [f"joint_velocity_command[{i + 1}]" for i in range(6)]
+        signal = np.zeros(4, dtype=[("time", float), *((name, float) for name in names)])
+        for name in names:
+            signal[name] = commands
+        start = {f"{name}[{i + 1}]": value for name, value in (("joint_upper", 0.1), ("home", 0.0)) for i in range(6)}
+        outputs = ["joint_position[1]", "joint_velocity[1]"]
+    else:
+        signal = np.zeros(4, dtype=[("time", float), ("joint_velocity_command", float, (6,))])
+        signal["joint_velocity_command"] = commands[:, None]
+        start, outputs = {"joint_upper": [0.1] * 6, "home": [0.0] * 6}, ["joint_position", "joint_velocity"]
+    signal["time"] = time
+    result = simulate_fmu(
+        str(cached_fmu(version)),
+        fmi_type=kind,
+        stop_time=1.0,
+        output_interval=0.05,
+        start_values=start,
+        input=signal,
+        output=outputs,
+        record_events=False,
+        **options,
+    )
+    return tuple(np.reshape(result[name], (len(result), -1))[:, 0] for name in outputs)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_co_simulation_and_model_exchange_agree_at_a_stop(version):
+    q, v = drive(version, "CoSimulation", step_size=0.05)
+    solved_q, solved_v = drive(version, "ModelExchange", relative_tolerance=1e-9)
+    assert q.max() == 0.1
+    assert v[9] == 0.0  # at rest while it is driven into the stop
+    assert q[-1] < 0.0
+    np.testing.assert_allclose(solved_q, q, rtol=0, atol=2e-8)
+    np.testing.assert_allclose(solved_v, v, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_damaged_state_and_one_of_the_other_interface_are_refused(version):
+    with Fmu(version) as arm, Fmu(version, exchange=True) as model:
+        arm.start(), model.start()
+        names = ("getFMU{}", "setFMU{}", "serializeFMU{}", "deSerializeFMU{}")
+        if version == 3:
+            names = (*names[:3], "deserializeFMU{}")
+        word = "state" if version == 2 else "State"
+        get, put, read, write = (getattr(arm.fmu, name.format(word)) for name in names)
+        state = get()
+        content = bytes(read(state))
+        put(write(content))
+        for k in (64, len(content) // 2, len(content) - 12):
+            with refused():
+                write(content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :])
+        with refused():
+            (model.fmu.setFMUstate if version == 2 else model.fmu.setFMUState)(state)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_derivatives_can_be_asked_after_the_end(version):
+    with Fmu(version) as arm:
+        arm.start()
+        arm.step(0.0, 0.05)
+        arm.fmu.terminate()
+        known, unknown = arm.references("joint_position")[:1], arm.references("ball_position")
+        if version == 2:
+            column = arm.fmu.getDirectionalDerivative(unknown, known, [1.0])
+        else:
+            column = arm.fmu.getDirectionalDerivative(unknown, known, [1.0] + 5 * [0.0], 3)
+        np.testing.assert_allclose(column, arm.get("jacobian").reshape(3, 6)[:, 0], atol=1e-12)
+
+
+def test_the_description_says_what_tools_ask_for():
+    with zipfile.ZipFile(cached_fmu(3)) as archive:
+        build = ET.fromstring(archive.read("sources/buildDescription.xml"))
+        references = ET.fromstring(archive.read("extra/org.fmi-standard.fmi-ls-ref/fmi-ls-manifest.xml"))
+        for related in references.iter("Related"):
+            assert "extra/" + related.attrib["source"].removeprefix("../") in archive.namelist()
+    assert [each.attrib["name"] for each in build.iter("Library")] == ["m"]
+    assert len(read_build_description(str(cached_fmu(3)))) == 1
+    assert [each.attrib["role"] for each in references.iter("Related")] == ["testcase", "result"]
+    for version in VERSIONS:
+        description = read_model_description(str(cached_fmu(version)))
+        assert float(description.defaultExperiment.tolerance) == 1e-6
+        assert description.numberOfContinuousStates == description.numberOfEventIndicators == 12
+        variables = {each.name.removesuffix("[1]"): each for each in description.modelVariables}
+        assert float(variables["joint_velocity"].nominal) == 1.0
+        assert variables["joint_position"].displayUnit == "deg"
