@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import faulthandler
 import os
-import re
 import signal
 import sys
 import tempfile
@@ -17,7 +16,7 @@ from typing import Any, Final, TypeAlias
 
 from servobench.harness.check.report import Finding
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.config.source import PACKAGES, show
+from servobench.harness.config.source import PACKAGES, place_in_trace
 
 CHECK_LIMIT: Final = 60.0  # [s] of one check
 GRACE: Final = 10.0  # [s] more, after which the process is ended from outside
@@ -72,8 +71,7 @@ def check_guarded(checks: Checks, subject: str, limit: float = CHECK_LIMIT) -> I
 def _why(code: int | None, trace: Path, limit: float) -> str:
     """Return why a process ended in the middle of a check, with the place in the code of the user."""
     text = trace.read_text(errors="replace") if trace.exists() else ""
-    place = next((f"{show(Path(file))}:{line}: " for file, line in re.findall(r'File "(.+?)", line (\d+)', text)
-                  if _is_users(Path(file))), "")  # fmt: skip
+    place = place_in_trace(text, _is_users)
     if text.startswith(TIMED_OUT):
         return f"{place}no answer after {limit:g} s; is there a loop without an end, or something that waits?"
     if code is not None and code < 0:

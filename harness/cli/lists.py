@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Any
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from servobench.harness.cli import completion
 from servobench.harness.cli.options import RobotOption
 from servobench.harness.cli.terminal import console, print_json
+
+if TYPE_CHECKING:
+    from servobench.harness.batch.trial import Tried
 
 DEFAULT_ROBOT = "ur5"
 HELP = "Show the settings of this one."
@@ -21,15 +24,15 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.config.registry import choose_plant, find_plant, plant_names, unused_points
-    from servobench.harness.run.trial import usable_plant
+    from servobench.harness.batch.trial import try_plants
+    from servobench.harness.config.registry import choose_plant, find_plant, unused_points
     from servobench.plant.plant import PlantEntry
 
     if name:
         name = choose_plant(name)
         _show_settings(name, find_plant(name).config(), as_json=as_json)
     else:
-        _show_names(plant_names(), usable_plant, unused_points(PlantEntry), as_json=as_json)
+        _show_names(_listed(try_plants(), unused_points(PlantEntry)), as_json=as_json)
 
 
 def controllers(
@@ -39,20 +42,15 @@ def controllers(
     """List the controllers, or show the settings of one."""
     from servobench.controllers.controller import ControllerEntry
     from servobench.controllers.parts import ESTIMATORS, LAWS
+    from servobench.harness.batch.trial import try_controllers
     from servobench.harness.config.defaults import default_config
-    from servobench.harness.config.registry import (
-        choose_controller,
-        controller_names,
-        find_controller,
-        unused_points,
-    )
-    from servobench.harness.run.trial import usable_controller
+    from servobench.harness.config.registry import choose_controller, find_controller, unused_points
 
     if name:
         name = choose_controller(name)
         _show_settings(name, default_config(find_controller(name)), as_json=as_json)
         return
-    _show_names(controller_names(), usable_controller, unused_points(ControllerEntry), as_json=as_json)
+    _show_names(_listed(try_controllers(), unused_points(ControllerEntry)), as_json=as_json)
     if not as_json:
         console.print("\nOr any law with any estimator, such as mfac+rls, or a file of your own, such as ./mine.py:")
         console.print(f"Laws: {', '.join(LAWS)}. Estimators: {', '.join(ESTIMATORS)}.", highlight=False)
@@ -74,34 +72,36 @@ def tasks(
     elif robot != DEFAULT_ROBOT:
         raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
-        _show_names(list(TASKS), find_task, [], as_json=as_json)
+        _show_names([_described(name, entry.summary) for name, entry in TASKS.items()], as_json=as_json)
 
 
 def sensing(as_json: JsonOption = False) -> None:
     """List the sensing set-ups: what cameras measure of the arm."""
     from servobench.plant.eyes.registry import EYES
 
-    _show_names(list(EYES), EYES.__getitem__, [], as_json=as_json)
+    _show_names([_described(name, entry.summary) for name, entry in EYES.items()], as_json=as_json)
     if not as_json:
         console.print("\nEach with fixed cameras or with cameras on the hand, as pixel:hand; or a file of your own.")
 
 
-def _show_names(
-    names: Sequence[str], find: Callable[[str], Any], unused: Iterable[tuple[str, str]], *, as_json: bool
-) -> None:
-    """Print names with their summaries, and what is wrong with those that cannot be used."""
+def _described(name: str, summary: str) -> dict[str, str]:
+    return {"name": name, "summary": summary}
+
+
+def _listed(all_of_them: Iterable[Tried], unused: Iterable[tuple[str, str]]) -> list[dict[str, str]]:
+    """Return names with their summaries, and what is wrong with those that cannot be used."""
+    found = [
+        {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
+        for each in all_of_them
+    ]
+    return found + [{"name": name, "error": line} for name, line in unused]
+
+
+def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:
+    """Print names with their summaries or errors."""
     from rich.table import Table
     from rich.text import Text
 
-    from servobench.harness.config.settings import ConfigurationError
-
-    found: list[dict[str, str]] = []
-    for name in names:
-        try:
-            found.append({"name": name, "summary": find(name).summary})
-        except ConfigurationError as error:  # an extra is missing, or a plug-in is broken; the others are usable
-            found.append({"name": name, "error": str(error)})
-    found += [{"name": name, "error": line} for name, line in unused]
     if as_json:
         print_json(found)
         return

@@ -17,6 +17,7 @@ from servobench.harness.cli import completion
 if TYPE_CHECKING:
     from servobench.controllers.controller import ControllerEntry
     from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.batch.trial import Tried
     from servobench.harness.batch.workers import Bounds
     from servobench.harness.config.settings import Settings
     from servobench.plant.plant import PlantEntry
@@ -298,30 +299,23 @@ def tell_unused(entry: type[ControllerEntry | PlantEntry], named: Sequence[str])
             sys.stderr.write(f"servobench: note: {line}\n")
 
 
-def _usable(names: Sequence[str], find: Callable[[str], Any]) -> list[str]:
-    """Return those of all names that can be used, with a line for each other."""
-    from servobench.harness.config.settings import ConfigurationError
-
-    usable = []
-    for name in names:
-        try:
-            find(name)
-        except ConfigurationError as error:
-            sys.stderr.write(f"servobench: left out: {error}\n")
-        else:
-            usable.append(name)
-    return usable
+def _usable(all_of_them: Sequence[Tried]) -> list[str]:
+    """Return the names of those that can be used, with a line for each other."""
+    for each in all_of_them:
+        if each.fault:
+            sys.stderr.write(f"servobench: left out: {each.fault}\n")
+    return [each.name for each in all_of_them if not each.fault]
 
 
 def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of the plants that a user named, or whose place was given, such as ./cell.py:Cell."""
+    from servobench.harness.batch.trial import try_plants
     from servobench.harness.config.registry import ALL, choose_plant, find_plant, plant_names
-    from servobench.harness.run.trial import usable_plant
     from servobench.plant.plant import PlantEntry
 
     known, names = plant_names(), list[str]()
     for word in split_words(text):
-        names += _usable(known, lambda name: usable_plant(name, robot)) if word == ALL else [choose_plant(word)]
+        names += _usable(try_plants(robot)) if word == ALL else [choose_plant(word)]
     tell_unused(PlantEntry, split_words(text))
     return split_names(option, ",".join(names), known, find_plant)
 
@@ -329,13 +323,12 @@ def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple
 def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of the controllers that a user named, or whose place was given, such as ./mine.py:Mine."""
     from servobench.controllers.controller import ControllerEntry
+    from servobench.harness.batch.trial import try_controllers
     from servobench.harness.config.registry import ALL, choose_controller, controller_names, find_controller
-    from servobench.harness.run.trial import usable_controller
 
     known, names = controller_names(), list[str]()
     for word in split_words(text):
-        is_all = word == ALL
-        names += _usable(known, lambda name: usable_controller(name, robot)) if is_all else [choose_controller(word)]
+        names += _usable(try_controllers(robot)) if word == ALL else [choose_controller(word)]
     tell_unused(ControllerEntry, split_words(text))
     return split_names("controllers", ",".join(names), known, find_controller)
 

@@ -162,8 +162,12 @@ def _import(module: str) -> ModuleType:
 
 def describe_import(error: BaseException, module: str) -> str:
     """Return why a module cannot be imported, as one line with the place in it where there is one."""
+    return describe_at(error, folder_of_module(module))
+
+
+def folder_of_module(module: str) -> Path:
+    """Return the folder of the top-level package of a module, or of a module without one; else the present folder."""
     spec = None
     with contextlib.suppress(ImportError, ValueError):
         spec = importlib.util.find_spec(module.partition(".")[0])
-    origin = spec.origin if spec is not None and spec.has_location and spec.origin else None
-    return describe_at(error, Path(origin).parent if origin else Path.cwd())
+    return Path(spec.origin).parent if spec is not None and spec.has_location and spec.origin else Path.cwd()

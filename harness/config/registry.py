@@ -137,10 +137,10 @@ def find_plant(name: str) -> PlantEntry:
     return own.entry if own is not None and isinstance(own.entry, PlantEntry) else _load_plant(name)
 
 
-def is_published(entry: type[ControllerEntry | PlantEntry], name: str) -> bool:
-    """Return whether a controller or plant of this name is that of another distribution."""
+def published(entry: type[ControllerEntry | PlantEntry], name: str) -> EntryPoint | None:
+    """Return where another distribution has the controller or plant of this name; None where no other has it."""
     group = PLANT_GROUP if entry is PlantEntry else CONTROLLER_GROUP
-    return name not in {*PLANTS, *CONTROLLERS, *_OFFERED} and name in _points(group)
+    return None if name in {*PLANTS, *CONTROLLERS, *_OFFERED} else _points(group).get(name)
 
 
 def unused_points(entry: type[ControllerEntry | PlantEntry]) -> list[tuple[str, str]]:

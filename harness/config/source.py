@@ -7,9 +7,10 @@ import contextlib
 import hashlib
 import importlib
 import importlib.util
+import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -169,9 +170,20 @@ def place_of(error: BaseException, folder: Path) -> str:
     """Return `FILE:LINE` of the last place below `folder` at which an error was raised or passed on; "" if none."""
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         path = Path(frame.filename)
-        if path.is_relative_to(folder) and PACKAGES not in path.relative_to(folder).parts:
+        if is_below(path, folder):
             return f"{show(path)}:{frame.lineno}"
     return ""
+
+
+def place_in_trace(trace: str, is_users: Callable[[Path], bool]) -> str:
+    """Return `FILE:LINE: ` of the innermost line of the user in a trace of `faulthandler`; "" if there is none."""
+    places = ((Path(file), line) for file, line in re.findall(r'File "(.+?)", line (\d+)', trace))
+    return next((f"{show(path)}:{line}: " for path, line in places if is_users(path)), "")
+
+
+def is_below(path: Path, folder: Path) -> bool:
+    """Return whether a file lies below a folder, and is none of another package that is installed there."""
+    return path.is_relative_to(folder) and PACKAGES not in path.relative_to(folder).parts
 
 
 def show(path: Path) -> str:

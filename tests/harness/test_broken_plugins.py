@@ -28,11 +28,16 @@ gone = some_law:Nothing
 a/b = some_law:Mine
 circle = some_law:Mine
 hang = some_law:Hang
+ends = some_law:Ends
+falls = some_law:Falls
+import-ends = some_end:Mine
+import-hangs = some_wait:Mine
 ukf_mfac = some_law:Mine
 all = some_law:Mine
 [servobench.plants]
 cell = some_cell:Cell
 crashing = some_cell:Crash
+ending = some_cell:Ends
 needy = some_cell:NEEDY
 bullet = some_cell:Cell
 """
@@ -40,6 +45,7 @@ LAWS = (
     CONFIGURED
     + """
 
+print("a banner")
 NUMBER = 3
 UNSETTLED = servobench.ControllerEntry("unsettled", "", lambda: {}, Mine)
 
@@ -71,8 +77,25 @@ class Hang(Mine):
     def __init__(self, knowledge):
         while True:
             pass
+
+
+class Ends(Mine):
+    def __init__(self, knowledge):
+        os._exit(3)
+
+
+class Falls(Mine):
+    def __init__(self, knowledge):
+        ctypes.string_at(0)
 """
-)
+).replace("import numpy", "import ctypes\nimport os\n\nimport numpy")
+MODULES = {
+    "crash": "1 / 0\n",
+    "syntax": "class Mine\n",
+    "need": "import torhc\n",
+    "end": "import os\n\nos._exit(0)\n",
+    "wait": "import time\n\ntime.sleep(1000)\n",
+}
 CELLS = (
     CELL
     + """
@@ -80,6 +103,13 @@ CELLS = (
 class Crash(Cell):
     def __init__(self, setup):
         1 / 0
+
+
+class Ends(Cell):
+    def __init__(self, setup):
+        import os
+
+        os._exit(5)
 
 
 NEEDY = servobench.PlantEntry("needy", "", dict, Cell, needs=("a_package_that_is_not_there",))
@@ -97,11 +127,11 @@ CONTROLLERS = {
     "of servobench.Controller or a servobench.ControllerEntry",
     "function": "controller 'function' (some_law:make) cannot be used: some_law:make is the function make, wanted a "
     "subclass of servobench.Controller or a servobench.ControllerEntry",
-    "half": "controller 'half' (some_law:Half) cannot be used: site/some_law.py:37: class Half lacks reset and step, "
+    "half": "controller 'half' (some_law:Half) cannot be used: site/some_law.py:41: class Half lacks reset and step, "
     "which it must define",
-    "crash": "controller crash: site/some_law.py:43: AttributeError: 'RobotKnowledge' object has no attribute 'size'",
-    "exit": "controller exit: site/some_law.py:48: SystemExit: 3",
-    "signature": "controller 'signature' (some_law:Signature) cannot be used: site/some_law.py:51: Signature.__init__ "
+    "crash": "controller crash: site/some_law.py:47: AttributeError: 'RobotKnowledge' object has no attribute 'size'",
+    "exit": "controller exit: site/some_law.py:52: SystemExit: 3",
+    "signature": "controller 'signature' (some_law:Signature) cannot be used: site/some_law.py:55: Signature.__init__ "
     "must take (self, knowledge) or (self, config, knowledge), got (self)",
     "settings": "controller 'settings' (some_law:UNSETTLED) cannot be used: some_law:UNSETTLED: the settings config "
     "are no dataclass; return a dataclass",
@@ -111,9 +141,19 @@ CONTROLLERS = {
     "got 'a/b'",
     "circle": "a task is called 'circle', too; give the controller another name",
 }
-HANGING = "controller hang: site/some_law.py:58: TimeoutError: no answer after 2 s"
+ENDED = "cannot be used: it killed the process that carried it out: exit code"
+HARMFUL = {  # what only a process of its own survives
+    "hang": "controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:62: no answer after 4 s",
+    "ends": f"controller 'ends' (some_law:Ends) {ENDED} 3",
+    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:73: it killed the process that "
+    "carried it out: SIGSEGV",
+    "import-ends": f"controller 'import-ends' (some_end:Mine) {ENDED} 0",
+    "import-hangs": "controller 'import-hangs' (some_wait:Mine) cannot be used: site/some_wait.py:3: no answer after "
+    "4 s",
+}
 PLANTS = {
     "crashing": "plant crashing: site/some_cell.py:37: ZeroDivisionError: division by zero",
+    "ending": f"plant 'ending' (some_cell:Ends) {ENDED} 5",
     "needy": "plant 'needy' (some_cell:NEEDY) cannot be used: ",
 }
 UNUSED = {
@@ -127,11 +167,11 @@ UNUSED_PLANT = (
 DRIVER = """
 import contextlib, io, json, sys
 from servobench.controllers import methods
+from servobench.harness.batch import trial
 from servobench.harness.cli.main import main
 from servobench.harness.config import registry
-from servobench.harness.run import trial
 
-trial.ANSWER_LIMIT = 2.0
+trial.ANSWER_LIMIT = 4.0
 registry.METHODS = {name: registry.METHODS[name] for name in ("ukf_mfac", "constant")}
 told = []
 for arguments in json.loads(sys.argv[1]):
@@ -164,11 +204,11 @@ def told(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plugins")
     site = install(folder / "site", "some_law", LAWS, POINTS)
     write(site, CELLS, "some_cell.py")
-    for name, text in {"crash": "1 / 0\n", "syntax": "class Mine\n", "need": "import torhc\n"}.items():
+    for name, text in MODULES.items():
         write(site, text, f"some_{name}.py")
     done = subprocess.run(
         [sys.executable, "-c", DRIVER, json.dumps(list(COMMANDS.values()))], cwd=folder, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"}, check=False, timeout=300,
+        env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"}, check=False, timeout=900,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return dict(zip(COMMANDS, json.loads(done.stdout.splitlines()[-1]), strict=True))
@@ -180,7 +220,7 @@ def test_the_list_marks_each_and_shows_the_others(told):
     assert code == 0
     assert {name: error for name, error in listed if error and name in CONTROLLERS} == CONTROLLERS
     others = [error for _, error in listed if error and error not in CONTROLLERS.values()]
-    assert others == [HANGING, *UNUSED.values()]
+    assert others == [*HARMFUL.values(), *UNUSED.values()]
     assert [name for name, error in listed if error is None] == ["ukf_mfac", "constant", "nmpc_calibrated", "whole"]
 
 
@@ -190,15 +230,16 @@ def test_the_list_of_plants_marks_each_and_shows_the_others(told):
     errors = [error for _, error in listed if error]
     assert code == 0
     assert errors[0] == PLANTS["crashing"]
-    assert errors[1].startswith(PLANTS["needy"])
-    assert errors[2:] == [UNUSED_PLANT]
+    assert errors[1] == PLANTS["ending"]
+    assert errors[2].startswith(PLANTS["needy"])
+    assert errors[3:] == [UNUSED_PLANT]
     assert {"kinematic", "cell"} < {name for name, error in listed if error is None}
 
 
 def test_all_others_are_compared_and_each_broken_one_is_a_line(told):
     code, out, errors = told["compare"]
     assert code == 0, errors
-    left_out = [f"servobench: left out: {line}" for line in [*CONTROLLERS.values(), HANGING]]
+    left_out = [f"servobench: left out: {line}" for line in [*CONTROLLERS.values(), *HARMFUL.values()]]
     notes = [f"servobench: note: {line}" for line in UNUSED.values()]
     lines = [line for line in errors.splitlines() if line.startswith("servobench: ")]
     assert sorted(lines) == sorted(left_out + notes)
