@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 TERMINATED = 128 + signal.SIGTERM  # exit code
 
 LEFT = ("controller", "mismatch", "noise", "latency", "period", "pair", "failures", "outcome")  # columns of words
-WHOLE = ("controller", "pair")  # columns whose words are not broken over lines
-UNBROKEN = ("outcome",)  # columns of which no word is broken
+WHOLE = ("controller", "pair")  # columns whose cells are not broken over lines
+CONTROLLER_WIDTH = 15  # [characters] at least, so that tables below each other begin alike
+GAP = 2  # [characters] that a table needs for each column beside its cells
 
 console = Console()
 
@@ -39,21 +40,55 @@ def cleaning_up_when_terminated() -> Iterator[None]:
 
 
 def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -> None:
-    """Print tables of text with their titles, and a legend below all of them."""
+    """Print tables of text with their titles, and a legend below all of them.
+
+    Cells are broken between words where a table is wider than the terminal. Columns for which there is no room even so
+    follow in a table of their own below, after the first column again.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     for title, rows in tables:
-        table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-        for name in rows.columns:
-            words = [len(word) for cell in rows[name] for word in str(cell).split()] if name in UNBROKEN else []
-            width = max([15 * (name == "controller"), *words]) or None
-            table.add_column(name, justify="left" if name in LEFT else "right", no_wrap=name in WHOLE, min_width=width)
-        for row in rows.itertuples(index=False):
-            table.add_row(*row)
-        console.print(table)
+        for number, widths in enumerate(_fit(rows, console.width)):
+            table = Table(
+                title=None if number else title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False,
+                padding=(0, 1, 0, 0),
+            )  # fmt: skip
+            for name, width in widths.items():
+                table.add_column(name, justify="left" if name in LEFT else "right", width=width, overflow="fold")
+            for row in rows[list(widths)].itertuples(index=False):
+                table.add_row(*row)
+            console.print(table)
     if legend:
         console.print(legend)
+
+
+def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
+    """Yield the columns of each table that rows are printed as, with their widths [characters]."""
+    least, whole = dict[str, int](), dict[str, int]()
+    for name in rows.columns:
+        lines = [line for cell in (name, *rows[name]) for line in str(cell).splitlines()]
+        words = lines if name in WHOLE else [word for line in lines for word in line.split()]
+        least[name] = max([CONTROLLER_WIDTH * (name == "controller"), *map(len, words)])
+        whole[name] = max([least[name], *map(len, lines)])
+    first, *others = rows.columns
+    part = [first]
+    for name in others:
+        if len(part) > 1 and sum(least[each] + GAP for each in (*part, name)) > room:
+            yield _shares(part, least, whole, room)
+            part = [first]
+        part.append(name)
+    yield _shares(part, least, whole, room)
+
+
+def _shares(names: list[str], least: dict[str, int], whole: dict[str, int], room: int) -> dict[str, int]:
+    """Return the widths of columns in one table: the widest ones give way first."""
+    widths = {name: whole[name] for name in names}
+    for most in range(max(widths.values()), 0, -1):
+        if sum(widths.values()) + GAP * len(names) <= room:
+            break
+        widths = {name: max(least[name], min(whole[name], most)) for name in names}
+    return widths
 
 
 def print_json(value: object) -> None:

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 
 from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
@@ -19,6 +20,7 @@ from servobench.harness.analysis.tables import (
     judge_controllers,
 )
 from servobench.harness.batch import results
+from servobench.harness.cli import terminal
 from servobench.harness.config.settings import ConfigurationError
 
 
@@ -93,6 +95,22 @@ def test_the_command_prints_the_tables_of_a_folder(runs, tmp_path, monkeypatch, 
     folder = write_folder(tmp_path / "out", runs.to_dict("records"), [])
     assert servobench(monkeypatch, "statistics", str(folder), *option) == 0
     assert word in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("room", [60, 80, 100, 200])
+def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypatch, capsys, room):
+    named = runs.replace({"controller": {"slow": "rbfnn_mfac:published"}})
+    tables = [("a title", judge_controllers(named)), ("pairs", compare_controllers(named))]
+    monkeypatch.setattr(terminal, "console", Console(width=room))
+    terminal.print_tables(tables, "a legend")
+    text = capsys.readouterr().out
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= room
+    for _, table in tables:
+        words = " ".join([*table.columns, *table.astype(str).to_numpy().ravel()]).split()
+        assert set(words) <= set(text.split())
+    assert text.count("a title") == text.count("a legend") == 1
+    assert text.count("rbfnn_mfac:published") == (3 if room <= 80 else 2)
 
 
 def test_errors_are_shown_in_the_unit_of_the_feature(runs):
