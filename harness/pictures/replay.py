@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass, fields, replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -16,8 +17,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from servobench.harness.config.registry import find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
+from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
 from servobench.plant.checks import FloatArray
@@ -33,6 +33,7 @@ from servobench.plant.seeds import named_seed
 if TYPE_CHECKING:
     from servobench.plant.bullet.scene import BulletScene
 
+JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
 EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame of a UR5: from the front right, down to it
 OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
@@ -87,7 +88,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         ConfigurationError: a plant that brings its robot, a run without steps, or one whose robot is not found again.
     """
     run_id = row["run_id"]
-    if find_plant(row["plant"]).own_robot:
+    if row.get("robot") == OWN_ROBOT:
         raise ConfigurationError(f"run {run_id} cannot be shown: plant {row['plant']} brings a robot of its own")
     sensing = row.get("sensing", DEFAULT_SENSING)
     if sensing != DEFAULT_SENSING:
@@ -96,11 +97,10 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
         raise ConfigurationError(f"run {run_id} has no steps: it ended before its first period")
     track = Track(row, steps.reset_index(drop=True))
     robot = find_robot(str(row.get("robot", DEFAULT_ROBOT)))
-    names = [f"joint_position_{name}_rad" for name in robot.arm.joint_names]
-    missing = [name for name in names if name not in steps]
-    if missing:
+    names = [str(name) for name in steps if JOINT.fullmatch(str(name))]  # a plant may call its joints as it likes
+    if len(names) != robot.arm.n:
         raise ConfigurationError(
-            f"run {run_id} has no column {missing[0]}; wanted the joint positions of a {robot.title}"
+            f"run {run_id} has {len(names)} joint positions [rad]; wanted the {robot.arm.n} of a {robot.title}"
         )
     model, moved = _true_model(row, robot)
     known = {item.name for item in fields(RenderedConfig)}

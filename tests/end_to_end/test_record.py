@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import matplotlib as mpl
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
 from kit.command import finish, servobench, start, wait_for
+from kit.own import CELL, PLAIN_CELL, write
 from kit.plants import NEEDS_BULLET
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -264,7 +264,7 @@ def test_runs_that_cannot_be_shown_are_refused(result):
     row, steps = result.row, result.steps
     with pytest.raises(ConfigurationError, match="has no steps: it ended before its first period"):
         logged_run(row, steps.iloc[:0], {})
-    with pytest.raises(ConfigurationError, match="has no column joint_position_elbow_rad"):
+    with pytest.raises(ConfigurationError, match=r"has 5 joint positions \[rad\]; wanted the 6 of a UR5"):
         logged_run(row, steps.drop(columns="joint_position_elbow_rad"), {})
     other = json.loads(row["mismatch_values"])
     other["tool_offset"][0] += 1e-3
@@ -280,13 +280,27 @@ def test_settings_of_another_version_are_passed_over(result):
     assert logged_run(result.row, result.steps, {"width": 64, "height": 48, "new_in_2030": 1}).config.width == 64
 
 
-def test_a_plant_with_a_robot_of_its_own_is_refused(result, monkeypatch):
-    class Entry:
-        own_robot = True
+def run_on(monkeypatch, folder, text, *arguments):
+    """Carry out a short run on a plant of a file, which later commands do not know."""
+    write(folder, text, "cell.py")
+    arguments = ("run", "constant", "--plant", "./cell.py", *arguments, "--no-report", "--out", "out")
+    assert servobench(monkeypatch, *arguments) == 0
 
-    monkeypatch.setattr("servobench.harness.pictures.replay.find_plant", lambda name: Entry())
-    with pytest.raises(ConfigurationError, match="brings a robot of its own"):
-        logged_run(result.row | {"plant": "fmu:crane.toml"}, pd.DataFrame(), {})
+
+def test_a_run_on_an_own_plant_with_the_arm_is_recorded(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    run_on(monkeypatch, tmp_path, CELL, "--task", "exp2", "--set", "exp2.duration=0.5")
+    (tmp_path / "cell.py").unlink()  # the log is enough
+    assert servobench(monkeypatch, "record", "out", "--kinds", "snapshots") == 0, capsys.readouterr().err
+    assert (tmp_path / "out" / "recordings" / "Cell-constant-exp2-moderate-0_snapshots.png").stat().st_size > 10_000
+
+
+def test_a_plant_with_a_robot_of_its_own_is_refused(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    target = ("--task", "target", "--set", "target.target=[0.2, 0.7]", "--set", "target.duration=0.5")
+    run_on(monkeypatch, tmp_path, PLAIN_CELL, *target, "--mismatch", "none", "--set", "constant.initial.source=probe")
+    assert servobench(monkeypatch, "record", "out", "--kinds", "snapshots") == 2
+    assert "cannot be shown: plant Plain brings a robot of its own\n" in capsys.readouterr().err
 
 
 def test_a_run_whose_camera_was_moved_is_shown_by_both_poses():
