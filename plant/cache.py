@@ -63,7 +63,7 @@ def is_whole(entry: Path) -> bool:
     try:
         sums = json.loads((entry / SEAL).read_text(encoding="utf-8"))
         return bool(sums) and all(_sum(entry / FILES / name) == wanted for name, wanted in sums.items())
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
         return False
 
 

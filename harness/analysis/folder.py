@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
+from pyarrow import ArrowException
 
 from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import COMPLETED
 
 DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch", "noise_factor", "latency_s", "period_s")
@@ -52,14 +54,23 @@ def describe_settings(folder: Path) -> dict[str, str]:
 
 
 def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield name and content of each table beside the runs and steps of a folder, such as answered claims."""
+    """Yield name and content of each table beside the runs and steps of a folder, such as answered claims.
+
+    Raises:
+        ConfigurationError: one of them cannot be read.
+    """
     for path in sorted(folder.iterdir()):
         if path.name in (results.RUNS, results.STEPS) or path.name.startswith("."):
             continue
-        if path.suffix == ".parquet":
-            yield path.stem, pd.read_parquet(path)
-        elif path.suffix == ".csv":
-            yield path.stem, pd.read_csv(path)
+        read = {".parquet": pd.read_parquet, ".csv": pd.read_csv}.get(path.suffix)
+        if read is None:
+            continue
+        try:
+            table = read(path)
+        except (OSError, ValueError, ArrowException, OverflowError) as error:
+            why = " ".join(str(error).split())
+            raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error
+        yield path.stem, table
 
 
 def _setting(value: Any) -> str:  # noqa: ANN401 - whatever JSON holds

@@ -53,7 +53,7 @@ class Holder:
             texts = (str(content[key])[:200] for key in ("owner", "host", "begun", "started"))
             owner, host, begun, started = (" ".join(text.split()) for text in texts)
             return cls(owner, host, int(content["pid"]), begun, started)
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
 
     def __str__(self) -> str:
@@ -70,12 +70,14 @@ class Holder:
         """Whether it is known to have ended; never for a process of another machine."""
         if not self.here or os.name == "nt":  # there is no harmless way to ask on Windows
             return False
+        if self.pid <= 0:  # no process, but a group of them
+            return True
         try:
             os.kill(self.pid, 0)
-        except ProcessLookupError:
+        except (ProcessLookupError, OverflowError):
             return True
-        except (OSError, OverflowError):
-            return self.pid <= 0
+        except OSError:  # of another user
+            return False
         return self.started != _start_of(self.pid)
 
 

@@ -85,7 +85,8 @@ def read_tables(
             else:
                 table = pq.read_table(folder / name, columns=known, filters=only, page_checksum_verification=True)
             tables.append(table.replace_schema_metadata())
-    made: pd.DataFrame = pa.concat_tables(tables, promote_options="permissive").to_pandas()
+    with reading(folder, names[-1] if names else ""):
+        made: pd.DataFrame = pa.concat_tables(tables, promote_options="permissive").to_pandas()
     return made
 
 
@@ -127,9 +128,19 @@ def opened(folder: Path, name: str) -> Iterator[pq.ParquetFile]:
     Raises:
         DamagedFile: it cannot be read.
     """
+    with reading(folder, name), pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
+        yield file
+
+
+@contextlib.contextmanager
+def reading(folder: Path, name: str) -> Iterator[None]:
+    """Name a table from whose content nothing can be made.
+
+    Raises:
+        DamagedFile: names it.
+    """
     try:
-        with pq.ParquetFile(folder / name, page_checksum_verification=True) as file:
-            yield file
+        yield
     except ConfigurationError:
         raise
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:

@@ -13,8 +13,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from kit.folder_readers import HOLDER, LEDGER
 from kit.fuzzing import Broken, check, inputs
-from kit.parsers import FILES, PARSERS, WORDS, Parser
+from kit.parsers import PARSERS, Parser
 from servobench.harness.config.settings import ConfigurationError
 
 LONG = "9" * 400
@@ -46,6 +47,27 @@ FOUND: tuple[tuple[str, str | bytes], ...] = (  # what once was a traceback, a h
     ("reference run", "time,a\n0,1\r7\n"),
     ("modelDescription", '<?xml version="1.0" encoding="klingon"?><fmiModelDescription/>'),
     ("modelDescription", "<a>" * 200_000),
+    ("journal", LEDGER + "[" * 3000 + "\n"),
+    ("journal", LEDGER.replace("[0.5, 2]", "[]")),
+    ("journal", LEDGER.replace("[0.5, 2]", '["a", 2]')),
+    ("journal", LEDGER.replace("[0.5, 2]", "0.5")),
+    ("journal", LEDGER.replace("[0.5, 2]", f"[{LONG}]")),
+    ("other table", ""),
+    ("other table", 'a,b\n"1,2\n'),
+    ("other table", "a\n1\n1,2,3\n"),
+    ("other table", "\ud800"),
+    ("manifest", "[" * 3000),
+)
+
+
+PASSED_OVER: tuple[tuple[str, str], ...] = (  # what does not keep a folder from being used, and was a traceback, too
+    ("lock", "[" * 3000),
+    ("lock", HOLDER.replace('"pid": 4', '"pid": 1e999')),
+    ("lock", HOLDER.replace('"pid": 4', '"pid": -1')),
+    ("lock", HOLDER.replace('"pid": 4', '"pid": 9999999999999999999999')),
+    ("seal", "[" * 3000),
+    ("seal", '{"a": {}}'),
+    ("seal", "7"),
 )
 
 
@@ -65,7 +87,12 @@ def test_what_once_broke_is_refused_in_one_line(name, given_, tmp_path):
     assert not check(PARSERS[name], given_, tmp_path)
 
 
-@pytest.mark.parametrize("name", [*WORDS, *FILES])
+@pytest.mark.parametrize(("name", "given_"), PASSED_OVER)
+def test_what_once_broke_is_passed_over(name, given_, tmp_path):
+    assert check(PARSERS[name], given_, tmp_path)
+
+
+@pytest.mark.parametrize("name", PARSERS)
 def test_changed_inputs_are_read_or_refused(name, tmp_path):
     slow = PARSERS[name].share < 0.1
 

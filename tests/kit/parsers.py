@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kit.folder_readers import HOLDER, LEDGER, SEAL, files, journal, lock, of_runs, other_table, part_name, seal
 from kit.foreign_fmu import describe, describe_exchange
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from kit.toy import plant_spec
@@ -43,6 +44,7 @@ from servobench.plant.robot.hand_eye import FEATURE
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
+PART, OTHER_PART = "parts/00000000.runs.parquet", "parts/00000001.runs.parquet"
 RUN = RunRequest("kinematic", "rbfnn_mfac", "target", Mismatch(), 0)
 
 
@@ -275,4 +277,22 @@ FILES: dict[str, Parser] = {
 }
 """What stands in files."""
 
-PARSERS = WORDS | FILES
+JSON_WORDS = ('"', "{", "}", "[", "]", ":", ",", "null", "true", "\\ud800", "1e999", "NaN", "\n")
+TABLE_WORDS = ("PAR1", "\x00", "\xff\xff\xff\xff", "run_id", "status", "seed", "\x15\x00", "\x15\x0c", "\x80\x80\x04")
+RESULTS: dict[str, Parser] = {
+    "manifest": Parser(of_runs("manifest.json"), (files()["manifest.json"].decode(),), (*JSON_WORDS, *NUMBERS), 0.05),
+    "checksums": Parser(of_runs("SHA256SUMS"), (files()["SHA256SUMS"].decode(),), ("  ", "\n", "parts/", "../"), 0.05),
+    "table of runs": Parser(of_runs("runs.parquet"), (files()["runs.parquet"],), TABLE_WORDS, 0.09),
+    "table of steps": Parser(of_runs("steps.parquet"), (files()["steps.parquet"],), TABLE_WORDS, 0.05),
+    "part": Parser(
+        of_runs(PART, parts=True), tuple(files(parts=True)[name] for name in (PART, OTHER_PART)), TABLE_WORDS, 0.09
+    ),
+    "part name": Parser(part_name, ("00000000.runs.parquet",), (".", "x", ".runs.parquet", *NUMBERS[:6]), 0.02),
+    "other table": Parser(other_table, ("a,b\n1,2\n",), (",", "\n", '"', "\0", *NUMBERS), 0.3),
+    "lock": Parser(lock, (HOLDER,), (*JSON_WORDS, *NUMBERS), 1),
+    "journal": Parser(journal, (LEDGER,), (*JSON_WORDS, *NUMBERS), 1),
+    "seal": Parser(seal, (SEAL,), (*JSON_WORDS, *NUMBERS, "../"), 1),
+}
+"""What stands in a results folder, a study and the cache."""
+
+PARSERS = WORDS | FILES | RESULTS

@@ -15,6 +15,7 @@ from typing import Any, Final, final
 from servobench.harness.config.settings import ConfigurationError
 
 LEDGER: Final = ".jsonl"
+SHOWN: Final = 60  # letters of wrong costs that a message holds
 
 
 @final
@@ -41,8 +42,8 @@ class Ledger:
         try:
             whole, _, _ = self.path.read_bytes().rpartition(b"\n")  # a killed process may leave half a line
             header, *records = [json.loads(line) for line in whole.splitlines()] or [self._fingerprint]
-            self._costs = {_key(record["settings"]): record["costs"] for record in records}
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            self._costs = {_key(record["settings"]): _costs(record["costs"]) for record in records}
+        except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise ConfigurationError(f"study {self.path} cannot be opened: {error}") from error
         parts = [key for key in self._fingerprint if not isinstance(header, dict)
                  or header.get(key) != self._fingerprint[key]]  # fmt: skip
@@ -78,6 +79,17 @@ class Ledger:
         except OSError as error:
             raise ConfigurationError(f"study {self.path} cannot be written: {error.strerror}") from error
         self._costs[_key(settings)] = list(costs)
+
+
+def _costs(given: object) -> list[float]:
+    """Return the costs of a record.
+
+    Raises:
+        ValueError: they are no numbers.
+    """
+    if not isinstance(given, list) or not given or not all(type(each) in (int, float) for each in given):
+        raise ValueError(f"costs must be a list of numbers, got {str(given)[:SHOWN]}")
+    return [float(each) for each in given]
 
 
 def _key(settings: Mapping[str, Any]) -> str:
