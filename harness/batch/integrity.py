@@ -148,7 +148,7 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
 
 
 def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
-    """Write a manifest anew that is damaged or missing, if all tables say that they are of that batch.
+    """Write a manifest anew that is damaged or missing, if all intact tables say that they are of that batch.
 
     Args:
         folder: a folder that is locked.
@@ -172,7 +172,9 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
         return ""
     names = [results.part_name(index, RUNS) for index in results.part_indices(folder)]
     names += [RUNS] if (folder / RUNS).exists() else []
-    owners = {parquet.owner(folder, name).partition("@")[0] for name in names}
+    sums = read_sums(folder)
+    intact = [name for name in names if _fault(folder, name, sums) is None]  # the others are made again in any case
+    owners = {parquet.owner(folder, name).partition("@")[0] for name in intact}
     if owners - {manifest["campaign"]} or not owners:
         raise ConfigurationError(
             f"{folder / MANIFEST} {damage.what}, and the tables are not of this batch or do not say so; "

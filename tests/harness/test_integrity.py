@@ -193,6 +193,17 @@ def test_a_manifest_that_is_lost_is_written_anew_if_the_runs_are_those_asked_for
     assert_same(folder, whole)
 
 
+@pytest.mark.parametrize("what", DAMAGES)
+def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_the_other_parts_say(
+    half, whole, tmp_path, what
+):
+    folder = copy(half, tmp_path)
+    (folder / results.MANIFEST).unlink()
+    DAMAGES[what](folder / results.part_name(8, results.RUNS))
+    assert run(folder, resume=True).repeated == 16
+    assert_same(folder, whole)
+
+
 @pytest.mark.parametrize(
     ("key", "value", "wanted"),
     [
