@@ -15,7 +15,7 @@ import numpy as np
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.harness.run.tasks import PointTask, Scenario, find_task
+from servobench.harness.run.tasks import TASKS, PointTask, Scenario, find_task
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.robot.hand_eye import HandEyeModel
@@ -25,7 +25,6 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.signals import PlantSpec
 
-ON_PURPOSE: Final = "unreachable"  # the task whose target is out of reach
 ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be whatever the mismatch
 POINTS: Final = 12  # of a curve that are looked at
 
@@ -65,7 +64,7 @@ def check_reach(resolved: ResolvedRun, scenario: Scenario, robot: Robot, spec: P
         ConfigurationError: names the point that is farthest out of reach, and by how much.
     """
     task = resolved.request.task
-    if task == ON_PURPOSE or not find_task(task).any_robot:  # other targets are taught on the true robot
+    if find_task(task).out_of_reach or not find_task(task).any_robot:  # other targets are taught on the true robot
         return
     if resolved.request.sensing != DEFAULT_SENSING:  # the features are no places
         return
@@ -77,10 +76,11 @@ def check_reach(resolved: ResolvedRun, scenario: Scenario, robot: Robot, spec: P
     worst = int(beyond.argmax())
     if beyond[worst] > 0.0:
         where = ", ".join(f"{value:g}" for value in points[worst].round(3))
+        on_purpose = [entry.name for entry in TASKS.values() if entry.out_of_reach]
         what = "its target" if len(points) == 1 else "a point of its curve,"
         raise ConfigurationError(
             f"task {task}: {what} ({where}) m in the camera frame, is {distances[worst]:.2g} m out of the arm's reach; "
-            f"for a target out of reach on purpose there is the task {ON_PURPOSE}"
+            f"for a target out of reach on purpose there is the task {', '.join(on_purpose)}"
         )
 
 

@@ -220,6 +220,7 @@ class TaskEntry:
     default: Any  # its settings
     build: Callable[[Any, TaskSetting], Scenario]  # makes a scenario from settings and the setting of the run
     any_robot: bool = False  # it needs no known robot: no target is given as its joint positions
+    out_of_reach: bool = False  # its target is out of the arm's reach on purpose
 
 
 def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
@@ -330,7 +331,14 @@ _ENTRIES = (
     TaskEntry(
         "endurance", "half an hour on the circle or the lemniscate", EnduranceTask(), _build_endurance, any_robot=True
     ),
-    TaskEntry("unreachable", "a target 1.5 m away, out of the arm's reach", UNREACHABLE, _build_target, any_robot=True),
+    TaskEntry(
+        "unreachable",
+        "a target 1.5 m away, out of the arm's reach",
+        UNREACHABLE,
+        _build_target,
+        any_robot=True,
+        out_of_reach=True,
+    ),
     TaskEntry("singular_start", "a move that starts with the arm stretched", SINGULAR, _build_point),
     TaskEntry("axis_turn", "of a plate: a turn about the optical axis by 45°", PoseTask("axis_turn"), _build_pose),
     TaskEntry("retreat", "of a plate: away along the optical axis", PoseTask("retreat"), _build_pose),
