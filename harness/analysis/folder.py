@@ -62,11 +62,10 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
     for path in sorted(folder.iterdir()):
         if path.name in (results.RUNS, results.STEPS) or path.name.startswith("."):
             continue
-        read = {".parquet": pd.read_parquet, ".csv": pd.read_csv}.get(path.suffix)
-        if read is None:
+        if path.suffix not in (".parquet", ".csv"):
             continue
         try:
-            table = read(path)
+            table = pd.read_csv(path) if path.suffix == ".csv" else pd.read_parquet(path)
         except (OSError, ValueError, ArrowException, OverflowError) as error:
             why = " ".join(str(error).split())
             raise ConfigurationError(f"{path} is no table: {why}; move it elsewhere") from error

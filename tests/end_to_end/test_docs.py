@@ -63,13 +63,13 @@ def processor_time():
 
 
 def test_what_the_pages_say_that_commands_print_is_what_they_print_one_after_the_other_in_one_folder(
-    monkeypatch, capsys, tmp_path, record_property
+    monkeypatch, capsys, tmp_path, record_testsuite_property
 ):
     assert [page.stem for page in SITE[:4]] == ["five_minutes", "own_controller", "own_robot", "own_sensing"]
     for page in SITE:
         begin = processor_time()
         assert console.carry_out(page.read_text(encoding="utf-8"), monkeypatch, capsys, tmp_path) > 0
-        record_property(f"processor time of {page.stem}, s", round(processor_time() - begin, 1))
+        record_testsuite_property(f"processor time of {page.stem}, s", round(processor_time() - begin, 1))
 
 
 def test_what_the_readme_says_that_its_command_prints_is_what_it_prints(monkeypatch, capsys, tmp_path):

@@ -13,7 +13,7 @@ PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "fmus/README.md", "fmus/ur5_mismatched/readme.md")),
     *DOCS,
 ]
-FENCED = re.compile(r"^```([\w{}]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FENCED = re.compile(r"^```([\w{}]*)[^`\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PLACE = re.compile(r"`([\w/]+\.py):([\w.]+)`")
 
 
