@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from servobench.harness.cli import options
-from servobench.harness.cli.terminal import console
+from servobench.harness.cli.terminal import say
 
 PRINTED = Path("-")
 
@@ -58,4 +58,4 @@ def init(
         raise ConfigurationError(f"{file} exists already and is left as it is; name another file") from None
     except OSError as error:
         raise ConfigurationError(f"{file} cannot be written: {error.strerror}") from error
-    console.print(f"{file}: {', '.join(sections)}", soft_wrap=True, markup=False, highlight=False)
+    say(f"{file}: {', '.join(sections)}")

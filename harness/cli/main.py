@@ -18,9 +18,10 @@ from servobench.harness.cli import completion, lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
 from servobench.harness.cli.check import check
 from servobench.harness.cli.fmu import fmu_app
+from servobench.harness.cli.grouping import grouped
 from servobench.harness.cli.init import init
 from servobench.harness.cli.new import new
-from servobench.harness.cli.options import FAILED, INTERRUPTED, grouped
+from servobench.harness.cli.options import FAILED, INTERRUPTED
 from servobench.harness.cli.record import record
 from servobench.harness.cli.sweep import sweep
 from servobench.harness.cli.verify import verify

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 import typer
 
-from servobench.harness.cli.terminal import console
+from servobench.harness.cli.terminal import say
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
@@ -46,4 +46,4 @@ def new(
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
     lines = [f"wrote {file} and {test}; next:", *(f"    servobench {command.format(place)}" for command in NEXT[kind])]
-    console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)
+    say("\n".join(lines))

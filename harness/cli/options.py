@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import wraps
-from inspect import Parameter, Signature, signature
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -182,54 +180,17 @@ class Overrides:
         return read_settings(self.config, [*(self.set_ or []), *further])
 
 
-LIMITED, PLACE, RUNNING, JUDGING, OVERRIDES = (
-    Limited(),
-    Place(),
-    Running(),
-    Judging(),
-    Overrides(),
-)  # defaults of parameters
-
-
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that has, for each parameter that is a dataclass, the fields of this class as options."""
-    hints = get_type_hints(command, include_extras=True)
-    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
-    parameters = []
-    for name, parameter in signature(command).parameters.items():
-        if name in groups:
-            own = get_type_hints(groups[name], include_extras=True)
-            options: list[tuple[str, Any, Any]] = [
-                (each.name, each.default, own[each.name]) for each in fields(groups[name])
-            ]
-        else:
-            options = [(name, parameter.default, hints[name])]
-        parameters += [Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=hint)
-                       for key, default, hint in options]  # fmt: skip
-
-    @wraps(command)
-    def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
-        from servobench.harness.config.registry import offering
-
-        for name, group in groups.items():
-            values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
-        with offering():  # a user's own controllers have their names for as long as the command takes
-            command(**values)
-
-    vars(call).update(
-        __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
-    )
-    return call
+LIMITED, PLACE, RUNNING, JUDGING, OVERRIDES = Limited(), Place(), Running(), Judging(), Overrides()  # as defaults
 
 
 def known_robot(name: str) -> str:
     """Return the name of a robot that can be found, and print what was assumed about it."""
-    from servobench.harness.cli.terminal import console
+    from servobench.harness.cli.terminal import say
     from servobench.harness.config.robots import find_robot
 
     note = find_robot(name).note
     if note:
-        console.print(note, soft_wrap=True, markup=False, highlight=False)
+        say(note)
     return name
 
 
@@ -279,14 +240,12 @@ def split_sensings(text: str) -> tuple[str, ...]:
 
 def default_plant() -> str:
     """Return the plant of a run for which none is named; a line says if it is not the first choice, and why."""
-    from servobench.harness.cli.terminal import console
+    from servobench.harness.cli.terminal import say
     from servobench.harness.config.registry import default_plant
 
     name, why = default_plant()
     if why:
-        console.print(
-            f"no plant is named, so this run is on {name}: {why}", soft_wrap=True, markup=False, highlight=False
-        )
+        say(f"no plant is named, so this run is on {name}: {why}")
     return name
 
 

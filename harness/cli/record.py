@@ -10,7 +10,7 @@ import typer
 
 from servobench.harness.cli import completion
 from servobench.harness.cli.options import split_names
-from servobench.harness.cli.terminal import cleaning_up_when_terminated, console
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
 
 if TYPE_CHECKING:
     from servobench.harness.config.settings import Settings
@@ -80,7 +80,7 @@ def record(
                 raise ConfigurationError("--run names a run of a results folder, and no folder is given")
             chosen = {name: value for name, value in new.items() if value is not None}
             shown = _new_run(RECORDED | chosen, read_settings(config, set_ or []))
-        console.print(f"rendered by {rendering_engine()}", soft_wrap=True, markup=False, highlight=False)
+        say(f"rendered by {rendering_engine()}")
         paths = write_recording(
             stretch(shown, begin, length),
             (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"]),
@@ -88,7 +88,7 @@ def record(
             tell,
         )
     for path in paths:
-        console.print(f"{path}: {path.stat().st_size / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False)
+        say(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:

@@ -13,7 +13,7 @@ import typer
 
 from servobench.harness.cli import completion, options
 from servobench.harness.cli.show import make_report
-from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.terminal import console, print_tables, say
 from servobench.harness.cli.verdict import judge, print_faults
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def _ending_at_once(folder: Path, wanted: int) -> Iterator[None]:
             raise
         line = f"interrupted: {count} of {wanted} runs were finished and kept in {folder}; "
         line += "the same call with --resume and this --out continues"
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
+        say(line)
         sys.exit(options.INTERRUPTED)
 
 

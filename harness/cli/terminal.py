@@ -91,9 +91,14 @@ def _shares(names: list[str], least: dict[str, int], whole: dict[str, int], room
     return widths
 
 
+def say(line: str) -> None:
+    """Print a line as it is, however long: it may hold names, paths and brackets of users."""
+    console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
 def print_json(value: object) -> None:
     """Print a value as JSON."""
-    console.print(json.dumps(value, indent=2, ensure_ascii=False), soft_wrap=True, markup=False, highlight=False)
+    say(json.dumps(value, indent=2, ensure_ascii=False))
 
 
 def print_markdown(tables: Iterable[tuple[str, pd.DataFrame]]) -> None:
@@ -101,4 +106,4 @@ def print_markdown(tables: Iterable[tuple[str, pd.DataFrame]]) -> None:
     for title, rows in tables:
         lines = [f"{title}:", "", "| " + " | ".join(rows.columns) + " |", "|---" * len(rows.columns) + "|"]
         lines += ["| " + " | ".join(row) + " |" for row in rows.itertuples(index=False)]
-        console.print("\n".join(lines) + "\n", soft_wrap=True, markup=False, highlight=False)
+        say("\n".join(lines) + "\n")

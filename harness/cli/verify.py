@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from servobench.harness.cli import options
-from servobench.harness.cli.terminal import console
+from servobench.harness.cli.terminal import console, say
 
 
 def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
@@ -22,14 +22,14 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
 
     holder = current_holder(folder)
     if holder is not None:
-        console.print(f"{folder} is being written by {holder}", soft_wrap=True, markup=False, highlight=False)
+        say(f"{folder} is being written by {holder}")
     found = examine(folder)
     for finding in found.findings:
         line = f"{folder / finding.name} {finding.what}: {finding.remedy}"
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
+        say(line)
     if found.runs < found.wanted:
         wanting = f"{found.runs} of {found.wanted} runs are there: --resume carries out the others"
-        console.print(wanting, soft_wrap=True, markup=False, highlight=False)
+        say(wanting)
     if found.findings:
         sys.exit(options.FAILED)
     console.print(f"{found.files} files are what was written, {found.runs} runs", markup=False, highlight=False)
