@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def network_source(
     Args:
         nominal_jacobian: the model to train on.
         spec: of the plant.
-        keep: results folder in which a copy is kept beside the runs.
+        keep: results folder in which a copy is kept beside the runs, where that is possible.
         progress: called with the share that is done while training.
     """
 
@@ -48,7 +49,10 @@ def network_source(
         if keep is not None:
             path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"
             if not path.exists():
-                save_networks(networks, path)
+                with contextlib.suppress(
+                    OSError
+                ):  # a folder that takes no more files is told of where rows are written
+                    save_networks(networks, path)
         return networks
 
     return obtain

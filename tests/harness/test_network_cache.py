@@ -70,3 +70,15 @@ def test_a_damaged_file_is_trained_again_and_blocks_nobody(damage, trainings):
     np.testing.assert_array_equal(first.jacobian.weights, again.jacobian.weights)
     assert obtain().digest == again.digest
     assert len(trainings) == 2
+
+
+def test_a_results_folder_that_takes_no_copy_fails_no_run(trainings, tmp_path):
+    full = tmp_path / "out"
+    full.write_text("no folder, so that nothing can be written below it")
+    networks = network_source(planar_jacobian, SPEC, keep=full)(CONFIG)
+    assert len(trainings) == 1
+    full.unlink()
+    assert (
+        network_source(planar_jacobian, SPEC, keep=full)(CONFIG).digest == networks.digest
+    )  # the next run tries again
+    assert len(list((full / NETWORKS).glob("*.npz"))) == 1
