@@ -32,6 +32,7 @@ nightly: $(VENV)/ready
 	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
 	PYTHONPATH=tests $(BIN)/python -m kit.breaking
 	PYTHONPATH=tests $(BIN)/python -m kit.breaking --steps --runs 12
+	PYTHONPATH=tests $(BIN)/python -m kit.breaking --caches
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
 	$(BIN)/python benchmarks/hard_night.py --runs 10000

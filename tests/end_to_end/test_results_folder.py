@@ -83,8 +83,12 @@ def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refu
 
 @linux
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
-@pytest.mark.parametrize("arguments", [("--every", "40"), ("--steps", "--runs", "4", "--every", "40")])
-def test_a_batch_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(tmp_path, arguments):
+@pytest.mark.parametrize("arguments", [
+    ("--runs", "12", "--controllers", "constant", "--block", "4", "--every", "29"),
+    ("--steps", "--runs", "4", "--every", "40"),
+    ("--caches", "--every", "23"),
+])  # fmt: skip
+def test_a_batch_and_caches_whose_files_are_broken_at_any_operation_can_be_resumed_bit_for_bit(tmp_path, arguments):
     figures = breaking.start(tmp_path, *arguments, timeout=550)
     assert figures["failed"] == [], figures
     assert figures["points"] >= 10

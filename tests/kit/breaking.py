@@ -1,4 +1,4 @@
-"""Breaks every file operation of a batch, one after the other and in every way, and resumes each time.
+"""Breaks every file operation of a batch, or of caches, one after the other and in every way, and goes on each time.
 
 To be run by `start`, which builds the library of `break_files.c` and preloads it. Each point is a child of this
 process, which has all modules in memory, so that it takes a fraction of a second. The child is killed, or its operation
@@ -21,12 +21,19 @@ import sys
 import tempfile
 import time
 import traceback
+import zipfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
+import numpy as np
 import pandas as pd
 
 from kit.command import PACKAGE, judged
+from kit.foreign_fmu import packed
+from kit.toy import plant_spec
+from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.checksums import UnwritableFolder
@@ -35,7 +42,11 @@ from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import is_unused
 from servobench.harness.batch.sweep import SweepPlan
 from servobench.harness.batch.workers import Bounds
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
+from servobench.harness.run import network_cache
+from servobench.harness.run.network_cache import NETWORKS, network_source
+from servobench.plant import cache
+from servobench.plant.fmu.archive import extract_fmu
 
 SOURCE = Path(__file__).with_name("break_files.c")
 MODES = {"KILL": 1, "TORN": 2, "POWER": 3, "EIO": 4, "ENOSPC": 5}
@@ -44,7 +55,12 @@ SETTINGS = {
     "run": {"lost_after": 0.05},
     "kinematic": {"sensing": {"drop_probability": 0.05}},
 }
-REFUSAL = "results folder"  # how a line begins that says what cannot be written
+SMALL = TrainingConfig(
+    (0.5, 0.5),
+    (1.5, 1.5),
+    jacobian=JacobianTraining(centres=8, samples=60),
+    controller=ControllerTraining(hidden=4, samples=60),
+)
 
 
 def build(folder: Path) -> Path:
@@ -78,35 +94,104 @@ def campaign(steps: bool, controllers: tuple[str, ...], runs: int) -> Campaign:
     return Campaign(SweepPlan(batch).cells(), Settings(SETTINGS), steps)
 
 
+class Subject(Protocol):
+    """What is done below a folder, and can be done again after it was broken."""
+
+    def carry_out(self, point: Path, *, resume: bool = False) -> None:
+        """Do it, or what is left of it."""
+
+    def outcome(self, point: Path) -> object:
+        """Return what came of it; raise AssertionError where the folder is not as it should be."""
+
+    def look(self, point: Path) -> None:
+        """Read what an interrupted attempt has left."""
+
+    def refusal(self, error: Exception) -> str:
+        """Return the line that a user gets; empty for an error that none should end with."""
+
+
+@dataclass(frozen=True)
+class Batches:
+    """A batch into a results folder."""
+
+    batch: Campaign
+    block: int = 16  # runs that advance together at most
+
+    def carry_out(self, point: Path, *, resume: bool = False) -> None:
+        bounds = Bounds(isolate=False)
+        carry_out(self.batch, point, Execution(workers=1, block=self.block, resume=resume, bounds=bounds))
+
+    def outcome(self, point: Path) -> list[object]:
+        found = examine(point)
+        assert not found.findings, found.findings
+        left = {path.name for path in point.iterdir()} - {results.STEPS, results.RUNS, results.FAILURES, NETWORKS}
+        assert left == {results.MANIFEST, "SHA256SUMS"}, left
+        tables = [results.load_runs(point), *([results.load_steps(point)] if self.batch.steps else [])]
+        return [(list(table.columns), pd.util.hash_pandas_object(table).tolist()) for table in map(judged, tables)]
+
+    def look(self, point: Path) -> None:
+        if not is_unused(point) and results.part_indices(point):
+            results.load_runs(point)
+
+    def refusal(self, error: Exception) -> str:
+        line = str(error.strerror if isinstance(error, UnwritableFolder) else error)
+        return line if line.startswith("results folder") else ""
+
+
+class Caches:
+    """An FMU is extracted and networks are trained, each into its cache; whoever comes next has both whole."""
+
+    def carry_out(self, point: Path, *, resume: bool = False) -> None:
+        os.environ["XDG_CACHE_HOME"] = str(point)
+        cache._verified.clear()
+        network_cache._KEPT.clear()
+        archive_path = point.parent / "foreign.fmu"
+        if not archive_path.exists():
+            archive_path.write_bytes(packed(2, zipfile.ZIP_DEFLATED))
+        extract_fmu(archive_path)
+        network_source(lambda q: np.broadcast_to(np.eye(2), (len(q), 2, 2)), plant_spec(2, 2))(SMALL)
+
+    def outcome(self, point: Path) -> dict[str, bytes]:
+        entries = [entry for kind in ("extracted", NETWORKS) for entry in cache.cache_folder(kind).iterdir()]
+        whole = [entry for entry in entries if not entry.name.startswith((".lock", cache.UNFINISHED))]
+        assert len(whole) == 2, entries
+        assert all(map(cache.is_whole, whole))
+        files = [path for entry in whole for path in (entry / cache.FILES).rglob("*") if path.is_file()]
+        return {str(path.relative_to(point)): path.read_bytes() for path in files if path.suffix != ".npz"}
+
+    def look(self, point: Path) -> None:
+        """Nothing but the next use reads a cache."""
+
+    def refusal(self, error: Exception) -> str:
+        line = str(error)
+        return line if line.startswith(("cache folder", "fmu file")) else ""
+
+
 class Breaker:
-    """A batch whose operations are broken.
+    """Something whose operations on files are broken.
 
     Attributes:
         points: number of operations that were broken so far.
         failed: what went wrong, a line each.
     """
 
-    def __init__(self, folder: Path, batch: Campaign) -> None:
-        """Carry the batch out once, undisturbed."""
-        self._folder, self._batch = folder, batch
+    def __init__(self, folder: Path, subject: Subject) -> None:
+        """Carry it out once, undisturbed."""
+        self._point, self._subject = folder / "point", subject
         self._library = ctypes.CDLL(os.environ["BREAK_LIBRARY"])
         self.points, self.failed = 0, list[str]()
         self._clear()
-        self._carry_out()
-        self._wanted = self._tables()
-
-    @property
-    def _point(self) -> Path:
-        return self._folder / "point"
+        subject.carry_out(self._point)
+        self._wanted = subject.outcome(self._point)
 
     def operations(self) -> int:
-        """Return how many operations an undisturbed batch has."""
+        """Return how many operations an undisturbed attempt has."""
         self._clear()
         read, write = os.pipe()
 
         def count() -> None:
             self._library.break_at(-1, MODES["EIO"])
-            self._carry_out()
+            self._subject.carry_out(self._point)
             self._library.broken_count.restype = ctypes.c_long
             os.write(write, str(self._library.broken_count()).encode())
 
@@ -116,7 +201,7 @@ class Breaker:
             return int(pipe.read())
 
     def break_at(self, number: int, mode: str) -> None:
-        """Break one operation, and resume."""
+        """Break one operation, and go on."""
         self._clear()
         where = f"operation {number}, {mode}"
         status = self._in_child(lambda: self._broken(number, mode))
@@ -129,30 +214,16 @@ class Breaker:
     def _broken(self, number: int, mode: str) -> None:
         self._library.break_at(ctypes.c_long(number), MODES[mode])
         try:
-            self._carry_out()
-        except (UnwritableFolder, ConfigurationError) as error:
-            line = str(error.strerror if isinstance(error, UnwritableFolder) else error)
-            assert "\n" not in line
-            assert line.startswith(REFUSAL), line
+            self._subject.carry_out(self._point)
+        except (OSError, ValueError) as error:
+            line = self._subject.refusal(error)
+            if not line or "\n" in line:
+                raise
 
     def _resumed(self) -> None:
-        if not is_unused(self._point) and results.part_indices(self._point):
-            results.load_runs(self._point)  # what is finished can be read
-        self._carry_out(resume=True)
-        for table, wanted in zip(self._tables(), self._wanted, strict=True):
-            pd.testing.assert_frame_equal(table, wanted, check_exact=True)
-        found = examine(self._point)
-        assert not found.findings, found.findings
-        left = {path.name for path in self._point.iterdir()} - {results.STEPS, results.RUNS, results.FAILURES}
-        assert left == {results.MANIFEST, "SHA256SUMS"}, left
-
-    def _carry_out(self, *, resume: bool = False) -> None:
-        how = Execution(workers=1, block=16, resume=resume, bounds=Bounds(isolate=False))
-        carry_out(self._batch, self._point, how)
-
-    def _tables(self) -> tuple[pd.DataFrame, pd.DataFrame]:
-        steps = results.load_steps(self._point) if self._batch.steps else pd.DataFrame()
-        return judged(results.load_runs(self._point)), judged(steps)
+        self._subject.look(self._point)
+        self._subject.carry_out(self._point, resume=True)
+        assert self._subject.outcome(self._point) == self._wanted
 
     def _clear(self) -> None:
         shutil.rmtree(self._point, ignore_errors=True)
@@ -177,6 +248,8 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--controllers", default="constant,broyden")
+    parser.add_argument("--block", type=int, default=16, help="runs that advance together at most")
+    parser.add_argument("--caches", action="store_true", help="break caches of an FMU and of networks, and no batch")
     parser.add_argument("--steps", action="store_true", help="keep the table of steps, as compare does")
     parser.add_argument("--every", type=int, default=1, help="break each so many-th operation only")
     parser.add_argument("--modes", default=",".join(MODES))
@@ -188,7 +261,8 @@ def main() -> None:
         sys.exit(bool(figures["failed"]))
     begin = time.monotonic()
     folder = Path(os.environ["BREAK_LIBRARY"]).parent
-    breaker = Breaker(folder, campaign(chosen.steps, tuple(chosen.controllers.split(",")), chosen.runs))
+    batch = Batches(campaign(chosen.steps, tuple(chosen.controllers.split(",")), chosen.runs), chosen.block)
+    breaker = Breaker(folder, Caches() if chosen.caches else batch)
     total = breaker.operations()
     for place, mode in enumerate(chosen.modes.split(",")):
         for number in range(1 + 7 * place % chosen.every, total + 1, chosen.every):

@@ -8,6 +8,7 @@ error.
 
 from __future__ import annotations
 
+import io
 import shutil
 import subprocess
 import tempfile
@@ -109,3 +110,13 @@ def build_crane(path: Path, version: int, *, folder: str | None = None, descript
         archive.writestr("modelDescription.xml", description or describe(version))
         archive.writestr(f"binaries/{place}/crane{this_platform().suffix}", library(version))
     return path
+
+
+def packed(version: int, method: int) -> bytes:
+    """Return an archive of an FMU whose library is none."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", method) as archive:
+        archive.writestr("modelDescription.xml", describe(version))
+        archive.writestr("binaries/linux64/crane.so", b"\x7fELF" + bytes(64))
+        archive.writestr("resources/numbers.csv", "1,2,3\n" * 20)
+    return content.getvalue()

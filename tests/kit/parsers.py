@@ -6,7 +6,6 @@ plain `ValueError` of one line.
 
 from __future__ import annotations
 
-import io
 import shutil
 import tempfile
 import zipfile
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from kit.folder_readers import HOLDER, LEDGER, SEAL, files, journal, lock, of_runs, other_table, part_name, seal
-from kit.foreign_fmu import describe, describe_exchange
+from kit.foreign_fmu import describe, describe_exchange, packed
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from kit.toy import plant_spec
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
@@ -166,15 +165,6 @@ def _npz() -> bytes:
         return (Path(folder) / "networks.npz").read_bytes()
 
 
-def _packed(version: int, method: int) -> bytes:
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", method) as packed:
-        packed.writestr("modelDescription.xml", describe(version))
-        packed.writestr("binaries/linux64/crane.so", b"\x7fELF" + bytes(64))
-        packed.writestr("resources/numbers.csv", "1,2,3\n" * 20)
-    return content.getvalue()
-
-
 CONFIG = """
 [run]
 period = 0.05
@@ -269,7 +259,7 @@ FILES: dict[str, Parser] = {
         _description, (describe(2), describe(3), describe_exchange()), (*XML_WORDS, *NUMBERS), 0.3, error=ValueError
     ),
     "FMU archive": Parser(
-        _fmu, tuple(_packed(2 + i % 2, method) for i, method in enumerate(METHODS)), ZIP_WORDS, 0.3, error=ValueError
+        _fmu, tuple(packed(2 + i % 2, method) for i, method in enumerate(METHODS)), ZIP_WORDS, 0.3, error=ValueError
     ),
     "reference run": Parser(
         _reference, ("time,a[1],a[2]\n0,1,2\n0.05,1,2\n",), (",", "\n", '"', *NUMBERS), 2, error=ValueError
