@@ -190,13 +190,13 @@ class Servo:
     ) -> tuple[Any, FloatArray]:
         """Return the law's new state and the joint velocity that it wants, (..., n), rad/s.
 
-        A law that was trained on the nominal model works in its frame: what is seen is turned by the map's rotation.
+        A law that was trained on the nominal model works in its frame: what is seen is turned into it.
         """
         J = estimation.jacobian
         if self._turns:
-            R = estimation.learned.pair.rotation
-            J, reference = R.mT @ J, reference @ R
-            ahead = ahead.seen_as(ahead.joint_position, np.vecmat(ahead.feature, R))
+            T = self.estimation.into_model_frame(estimation, ahead)
+            J, reference = T @ J, reference @ T.mT
+            ahead = ahead.seen_as(ahead.joint_position, np.vecmat(ahead.feature, T.mT))
         return self.law.command(state.law, Estimate(J), ahead, reference)
 
     def diagnostics(self, state: ServoState) -> Diagnostics:

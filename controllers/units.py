@@ -44,6 +44,7 @@ def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
         knowledge,
         spec=replace(knowledge.spec, feature=natural),
         nominal_jacobian=_divided(knowledge.nominal_jacobian, scale),
+        nominal_sight=None if knowledge.nominal_sight is None else knowledge.nominal_sight.in_unit(scale),
         true_jacobian=_divided(knowledge.true_jacobian, scale),
         true_symbolic=_divided_expression(knowledge.true_symbolic, scale),
         unit=scale * knowledge.unit,

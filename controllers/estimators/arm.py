@@ -5,8 +5,11 @@
 The state x = [g, δ], (2n,), starts at g = 1, δ = 0 with a diagonal covariance. An extended Kalman filter corrects it by
 the motion of the feature between two poses that are at least `min_joint_step` apart:
 
-    Δy = ∫ J_n dq' from q'₀ to q'₁ + v,   q' = g ⊙ q + δ,   v ~ N(0, (2σ² + c² ‖Δy‖²) I)
-    H = [J_n(q'₁) diag(q₁) − J_n(q'₀) diag(q₀),  J_n(q'₁) − J_n(q'₀)]
+    Δy = B ∫ J_n dq' from q'₀ to q'₁ + v,   q' = g ⊙ q + δ,   v ~ N(0, (2σ² + c² ‖Δy‖²) I)
+    H = B [J_n(q'₁) diag(q₁) − J_n(q'₀) diag(q₀),  J_n(q'₁) − J_n(q'₀)]
+
+B is 1, or where it is known how cameras see points, the change of the features with the places of the points, of which
+J_n is the nominal motion.
 
 The integral is that of a position, so that it does not depend on the path: Gauss-Legendre quadrature along the straight
 line. Gear ratios and zeros are what a map of the feature cannot repair (`controllers.stages.estimation`).
@@ -86,7 +89,7 @@ class ArmEstimator(Estimator[ArmState]):
         """
         if knowledge.nominal_jacobian is None:
             raise ValueError("nominal_jacobian must be known for the estimator 'arm'; this plant has none")
-        self._config, self._nominal = config, knowledge.nominal_jacobian
+        self._config, self._nominal, self._sight = config, knowledge.nominal_jacobian, knowledge.nominal_sight
         self._n = knowledge.spec.n
 
     def start(self, jacobian: FloatArray) -> ArmState:
@@ -115,13 +118,18 @@ class ArmEstimator(Estimator[ArmState]):
         long = norm(state.joint_step) >= self._config.min_joint_step
         noise = np.asarray(self._config.feature_noise)[()] if motion.noise is None else motion.noise
         noise = np.broadcast_to(noise, np.shape(state.duration))[()]
-        return branch(long, self._correct, state._replace(updated=long), noise)
+        return branch(long, self._correct, state._replace(updated=long), noise, motion.seen)
 
-    def _correct(self, state: ArmState, noise: FloatArray) -> ArmState:
+    def _correct(self, state: ArmState, noise: FloatArray, seen: FloatArray | None) -> ArmState:
         config, n, way = self._config, self._n, state.joint_step
         g, offset = state.x[..., :n], state.x[..., n:]
         poses = state.begin[..., None, :] + SHARES[:, None] * way[..., None, :]
-        J = self._nominal(g[..., None, :] * poses + offset[..., None, :])
+        at = g[..., None, :] * poses + offset[..., None, :]
+        J = (
+            self._nominal(at)
+            if seen is None or self._sight is None
+            else seen[..., None, :, :] @ self._sight.motions(at)
+        )
         moved = np.matvec(J[..., 1:-1, :, :], (g * way)[..., None, :])
         predicted = np.vecmat(HALVES, moved)
         first, last = J[..., 0, :, :], J[..., -1, :, :]
@@ -141,6 +149,13 @@ class ArmEstimator(Estimator[ArmState]):
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
         g, offset = state.x[..., : self._n], state.x[..., self._n :]
         return np.asarray(self._nominal(g * joint_position + offset) * g[..., None, :])
+
+    def motions(self, state: ArmState, joint_position: FloatArray) -> FloatArray | None:
+        """Return how the points that cameras see move, (..., 3p, n) m/rad; None where that is not known."""
+        if self._sight is None:
+            return None
+        g, offset = state.x[..., : self._n], state.x[..., self._n :]
+        return np.asarray(self._sight.motions(g * joint_position + offset) * g[..., None, :])
 
     def diagnostics(self, state: ArmState) -> Diagnostics:
         """Return whether the last motion ended a way, and the largest gear error (1) and offset (rad)."""

@@ -28,6 +28,8 @@ class Motion:
         error: e = y_ref − y at the end of the motion, (..., m), m.
         duration: (...), s.
         noise: (...), standard deviation of the feature per axis, m; None where it is not identified.
+        seen: B, (..., m, 3p), the change of the features with the places of p points by what is known of the cameras;
+            None where the features' own Jacobian is all that is known.
     """
 
     joint_position: FloatArray
@@ -36,6 +38,7 @@ class Motion:
     error: FloatArray
     duration: FloatArray
     noise: FloatArray | None = None
+    seen: FloatArray | None = None
 
 
 class Estimator(ABC, Generic[State]):
@@ -68,6 +71,13 @@ class Estimator(ABC, Generic[State]):
         one_matrix: Any = state
         jacobian: FloatArray = one_matrix.J
         return jacobian
+
+    def motions(self, state: State, joint_position: FloatArray) -> FloatArray | None:
+        """Return how points move with the joints, (..., 3p, n) m/rad, where it estimates the arm itself; else None.
+
+        They are seen through `Motion.seen`.
+        """
+        return None
 
     def diagnostics(self, state: State) -> Diagnostics:
         """Return named numbers (...) about the last update, if there are any; for the log only."""

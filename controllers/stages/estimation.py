@@ -5,6 +5,13 @@
     map        Ĵ(q) = M̄ J_n(q) + E             E learns from (Δq, Δy − M̄ x)
     map        Ĵ(q) = M̄ E(q)                   E learns from (Δq, RᵀΔy), where E brings a model itself
 
+Where it is known how cameras see points, with L(y, z) of the features as they are seen and G(q) the nominal motions of
+the points (`sight_map`), a map stands between them:
+
+    map        Ĵ(q) = L M̄ G(q) + E             E learns from (Δq, Δy − L M̄ x)
+    map        Ĵ(q) = L M̄ G(q) + E(q) − E₀(q)  E learns from (Δq, Δy − L M̄ x + E₀ Δq), where E brings a model E₀
+    map        Ĵ(q) = L M̄ G_E(q)               E learns from (Δq, Δy, L M̄), where E estimates the arm
+
 with the estimator E, the nominal Jacobian J_n, or Ĵ₀ where there is none, and from the pair stage the joint motion Δq
 that belongs to the feature's motion Δy, its prediction x by the model, the map M̄ and the rotation R nearest to it.
 """
@@ -12,6 +19,7 @@ that belongs to the feature's motion Δy, its prediction x by the model, the map
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -19,10 +27,11 @@ import numpy as np
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
-from servobench.controllers.stages.pairing import Paired, Pairing, PairState, whole_periods
+from servobench.controllers.sight import of_points, seen_through, through
+from servobench.controllers.stages.pairing import NO_DEPTH, Paired, Pairing, PairState, whole_periods
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm
-from servobench.plant.signals import Observation
+from servobench.plant.lanes import branch, norm, transposed
+from servobench.plant.signals import BoolArray, Observation
 
 
 class Seen(NamedTuple):
@@ -32,12 +41,14 @@ class Seen(NamedTuple):
         time: (...) [s]; NaN before there is a valid feature.
         joint_position: (..., n) [rad].
         feature: (..., m).
+        valid: (..., m), which features were seen.
         jacobian: Ĵ, (..., m, n), which predicts the next motion; NaN before.
     """
 
     time: FloatArray
     joint_position: FloatArray
     feature: FloatArray
+    valid: BoolArray
     jacobian: FloatArray
 
 
@@ -89,7 +100,12 @@ class Estimation:
         self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
         self._adds = aids.model != "own" and not estimator.brings_model
         self._shortest = (max(1, whole_periods(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
-        self.pairing = Pairing(aids, knowledge.spec, delays.latency) if aids.looks_back else None
+        self._sight = knowledge.nominal_sight if aids.model == "map" else None
+        self.pairing = Pairing(aids, knowledge.spec, delays.latency, self._sight) if aids.looks_back else None
+        shape = knowledge.spec.m, knowledge.spec.n
+        self._first = estimator.start(np.zeros(shape)) if self._sight and estimator.brings_model else None
+        at_rest = np.zeros(knowledge.spec.n)
+        self._estimates_arm = self._first is not None and estimator.motions(self._first, at_rest) is not None
         asked = aids.model != "own" or (self.pairing is not None and self.pairing.learns)
         self._nominal = knowledge.nominal_jacobian if asked and not estimator.brings_model else None
         self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * knowledge.spec.period
@@ -99,13 +115,15 @@ class Estimation:
         lead, q = observation.feature.shape[:-1], observation.joint_position
         pair, own = None, jacobian
         if self.pairing is not None:
-            pair = self.pairing.start(observation, self._given_base(q, jacobian))
-            own = jacobian - pair.base if self._adds else jacobian
+            given = self._given_base(q, jacobian)
+            depth, motions = self._look(q)
+            pair = self.pairing.start(observation, given if self._sight is None else motions, depth)
+            own = jacobian - given if self._adds else jacobian
         estimator = self.estimator.start(own)
-        if pair is not None and self.estimator.brings_model:
+        if pair is not None and self.estimator.brings_model and self._sight is None:
             pair = pair._replace(base=self.estimator.jacobian(estimator, q))
         unknown, never = np.full(jacobian.shape, np.nan), np.full(lead, np.nan)[()]
-        seen = Seen(never, q, observation.feature, unknown)
+        seen = Seen(never, q, observation.feature, observation.valid, unknown)
         return EstimationState(Learned(estimator, pair, never), seen, unknown)
 
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
@@ -117,50 +135,94 @@ class Estimation:
             desired: y_ref, (..., m), of this period.
         """
         learned, seen, q = state.learned, state.seen, observation.joint_position
-        pairing = self.pairing
+        pairing, (depth, motions) = self.pairing, self._look(q)
         if pairing is not None:
-            learned = learned._replace(pair=pairing.advance(learned.pair, q))
-        duration = observation.time - seen.time
-        due = observation.feature_valid & ~(duration < self._shortest)  # also the first one, of unknown duration
-        known = due & (duration > 0.0) & (duration < self._longest)
-        learned = branch(known, self._learn, learned, seen, observation, desired)
+            learned = learned._replace(pair=pairing.advance(learned.pair, q, depth))
+        duration, both = observation.time - seen.time, observation.valid & seen.valid
+        due = np.logical_or.reduce(observation.valid, axis=-1) & ~(duration < self._shortest)  # also the first one
+        known = due & np.logical_or.reduce(both, axis=-1) & (duration > 0.0) & (duration < self._longest)
+        learned = branch(known, self._learn, learned, seen, observation, desired, both)
         if pairing is not None:
             pair = branch(due & np.logical_not(known), pairing.interrupt, learned.pair)
             learned = learned._replace(pair=pair)
-        pair, own = learned.pair, self.estimator.jacobian(learned.estimator, q)
-        jacobian = own
-        if pair is not None:
-            base = own if self.estimator.brings_model else self._given_base(q, pair.base)
-            learned = learned._replace(pair=pair._replace(base=base))
+        jacobian = own = self.estimator.jacobian(learned.estimator, q)
+        if pairing is not None and self._sight is not None:
+            base, jacobian = self._seen_jacobian(
+                learned, self._sight.rates(observation.feature, depth), motions, own, q
+            )
+            learned = learned._replace(pair=learned.pair._replace(base=base))
+        elif pairing is not None:
+            base = own if self.estimator.brings_model else self._given_base(q, learned.pair.base)
+            learned = learned._replace(pair=learned.pair._replace(base=base))
             if self._model != "own":
-                jacobian = pair.map @ base if self._model == "map" else base
+                jacobian = learned.pair.map @ base if self._model == "map" else base
                 jacobian = jacobian + own if self._adds else jacobian
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
-        seen = branch(due, _newer, seen, Seen(time, q, observation.feature, jacobian))
+        seen = branch(due, _newer, seen, Seen(time, q, observation.feature, observation.valid, jacobian))
         return EstimationState(learned, seen, jacobian)
+
+    def into_model_frame(self, state: EstimationState, observation: Observation) -> FloatArray:
+        """Return T, (..., m, m), that turns features as they are seen into those of the nominal cameras.
+
+        Where it is known how cameras see points, T = L Rᵀ L⁺ of each point, whose motion is taken to be across the
+        sight.
+        """
+        rotation: FloatArray = state.learned.pair.rotation
+        if self._sight is None:
+            return rotation.mT
+        depth = self._sight.depths_and_motions(observation.joint_position)[0]
+        rates = self._sight.rates(observation.feature, depth)
+        return np.asarray(seen_through(rates, transposed(rotation)) @ of_points(np.asarray(np.linalg.pinv(rates))))
+
+    def _look(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return depths (..., c p) [m] and G (..., 3 c p, n) [m/rad]; nothing without a sight."""
+        return (NO_DEPTH, NO_DEPTH) if self._sight is None else self._sight.depths_and_motions(joint_position)
+
+    def _seen_jacobian(
+        self, learned: Learned, rates: FloatArray, motions: FloatArray, own: FloatArray, joint_position: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return G by what is known now, and Ĵ."""
+        base = self.estimator.motions(learned.estimator, joint_position)
+        if base is not None:
+            return base, through(rates, learned.pair.map, base)
+        if self._first is not None:
+            own = own - self.estimator.jacobian(self._first, joint_position)
+        return motions, through(rates, learned.pair.map, motions) + own
 
     def _given_base(self, joint_position: FloatArray, otherwise: FloatArray) -> FloatArray:
         if self._nominal is None:
             return otherwise
         return np.asarray(self._nominal(joint_position), dtype=np.float64)
 
-    def _learn(self, learned: Learned, seen: Seen, observation: Observation, desired: FloatArray) -> Learned:
+    def _learn(
+        self, learned: Learned, seen: Seen, observation: Observation, desired: FloatArray, valid: BoolArray
+    ) -> Learned:
+        """Learn from a motion; features that were not `valid` at both ends are taken to move as predicted."""
         dy, error = observation.feature - seen.feature, desired - observation.feature
         duration = observation.time - seen.time
         if self.pairing is None:
             q = seen.joint_position
-            motion = Motion(q, observation.joint_position - q, dy, error, duration)
-            unexplained = norm(dy - np.matvec(seen.jacobian, motion.joint_step))
-            return Learned(self.estimator.update(learned.estimator, motion), None, unexplained)
-        pair, paired = self.pairing.learn(learned.pair, dy, duration)
-        unexplained = norm(dy - np.matvec(seen.jacobian, paired.joint_step))
+            step = observation.joint_position - q
+            predicted = np.matvec(seen.jacobian, step)
+            dy = np.where(valid, dy, predicted)
+            return Learned(
+                self.estimator.update(learned.estimator, Motion(q, step, dy, error, duration)),
+                None,
+                norm(dy - predicted),
+            )
+        middle = 0.5 * (seen.feature + observation.feature)
+        pair, paired = self.pairing.learn(learned.pair, dy, duration, middle, valid)
+        predicted = np.matvec(seen.jacobian, paired.joint_step)
+        dy = np.where(valid, dy, predicted)
         motion = self._own_motion(pair, paired, Motion(*paired[:2], dy, error, duration, self.pairing.noise(pair)))
         known = self.pairing.is_known(pair)
-        return Learned(branch(known, self.estimator.update, learned.estimator, motion), pair, unexplained)
+        return Learned(branch(known, self.estimator.update, learned.estimator, motion), pair, norm(dy - predicted))
 
     def _own_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
         """Return the motion as the estimator is to explain it."""
+        if self._sight is not None:
+            return self._seen_motion(pair, paired, motion)
         dy, error = motion.feature_step, motion.error
         if self._model == "map":
             if self._adds:
@@ -169,7 +231,18 @@ class Estimation:
                 dy, error = np.vecmat(dy, pair.rotation), np.vecmat(error, pair.rotation)
         elif self._adds:
             dy = dy - paired.predicted
-        return Motion(motion.joint_position, motion.joint_step, dy, error, motion.duration, motion.noise)
+        return replace(motion, feature_step=dy, error=error)
+
+    def _seen_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
+        rates, x = paired.rates, paired.predicted[..., None]
+        if self._first is None:
+            explained = through(rates, pair.map, x)[..., 0]
+        elif self._estimates_arm:
+            return replace(motion, seen=seen_through(rates, pair.map))
+        else:
+            nominal = self.estimator.jacobian(self._first, motion.joint_position)
+            explained = through(rates, pair.map, x)[..., 0] - np.matvec(nominal, motion.joint_step)
+        return replace(motion, feature_step=motion.feature_step - explained)
 
     def diagnostics(self, state: EstimationState) -> Diagnostics:
         """Return those of both stages, with ‖Δy − ĴΔq‖ of the last motion as `jacobian_prediction_error`."""

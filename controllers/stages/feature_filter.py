@@ -18,6 +18,7 @@ from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch
+from servobench.plant.signals import BoolArray
 
 REST_DRIFT = 4.472136e-4  # [m/√s] process noise of z at rest; r in the formula is that of a period
 RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y
@@ -57,16 +58,18 @@ class FeatureFilter(NamedTuple):
             variance=self.variance + error * uncertainty + REST_DRIFT**2 * period,
         )
 
-    def correct(self, feature: FloatArray, find_noise: bool) -> FeatureFilter:
-        """Return the filter after a valid frame.
+    def correct(self, feature: FloatArray, valid: BoolArray, find_noise: bool) -> FeatureFilter:
+        """Return the filter after a frame in which at least one feature was seen; the others stay as predicted.
 
         Args:
             feature: y, (..., m), m.
+            valid: which of them were seen, (..., m).
             find_noise: learn σ from y − z.
         """
         z, p, noise = self
+        feature = np.where(valid, feature, z)
         error, innovation_variance = feature - z, p + noise.variance
-        square = np.vecdot(error, error) / feature.shape[-1]
+        square = np.vecdot(error, error) / np.add.reduce(valid, axis=-1)
         share = p / innovation_variance
         if find_noise:
             noise = noise.learn(square, 1.0, p)

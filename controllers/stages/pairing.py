@@ -3,11 +3,13 @@
     x_d = Σ J_b Δq  over the joint motion that ended d periods ago         J_b the base: a model's Jacobian (m, n)
     Δy ≈ M x_d                                                             M a map (m, m), of a turned camera
 
-For each candidate delay d a filter holds a map (`map_bank`); the delay is that of the filter that predicts best:
+Where it is known how cameras see points, x_d has the motions of the points, and a map turns those of each camera
+(`sight_map`); else a map is a matrix between features (`feature_map`). For each candidate delay d a filter holds a map;
+the delay is that of the filter that predicts best:
 
-    P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← map_update(x_d, Δy)    for each delay d
+    P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← update(x_d, Δy)        for each delay d
     d = argmin ℓ_d, once it is better than the present one by a margin
-    M̄, R = near_rotation(M_d, P_d)
+    M̄, R = completed(M_d, P_d)
 
 P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
 explains, from which nothing is learned, or a CUSUM of innovations, C ← max(0, C + min(‖ν‖²/(s m), 10) − 3) beyond a
@@ -17,15 +19,18 @@ gate. M stays, as the best guess. The first sample of the noise σ is a guess (`
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.estimators.estimator import MOTION_TIME
-from servobench.controllers.stages.map_bank import fresh_bank, map_update, near_rotation
+from servobench.controllers.sight import Sight
+from servobench.controllers.stages.camera_map import CameraMap, Step, of_delay
+from servobench.controllers.stages.feature_map import FeatureMap
 from servobench.controllers.stages.noise_level import NoiseLevel
+from servobench.controllers.stages.sight_map import SightMap
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm, pick
 from servobench.plant.signals import BoolArray, Observation, PlantSpec
@@ -38,6 +43,8 @@ NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), 
 CUSUM_DRIFT = 3.0  # [1] NIS per feature that is subtracted at each motion; 1 is its expectation
 CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier cannot reach the gate
 NOW_AND_BEFORE = np.array([0, 1])
+NO_DEPTH = np.zeros(0)
+Bank: TypeAlias = Any  # of either form of map
 
 
 def whole_periods(time: float, period: float) -> int:
@@ -49,14 +56,14 @@ class PairState(NamedTuple):
     """The state of the stage.
 
     Attributes:
-        past: [q, Σ x] of the last periods, (..., H, n + m), the newest first.
-        base: J_b, (..., m, n), of the last period.
-        bank: each candidate's map M and noise e of the last frame above their covariance P, (..., D, 2m+1, m+1).
+        past: [q, Σ x, z] of the last periods, (..., H, n + columns + depths), the newest first.
+        base: J_b, (..., columns, n), of the last period.
+        bank: of the map; see `CameraMap`.
         scores: ℓ_d, (..., D).
         noise: σ².
         candidate: index of the delay, (...).
-        map: M̄, (..., m, m).
-        rotation: R, (..., m, m).
+        map: M̄, (..., m, m) or (..., c, 3, 3).
+        rotation: R, likewise.
         moves: how often the camera seems to have been moved, (...).
         nis: of the last motion per feature, (...).
         cusum: C, (...).
@@ -64,7 +71,7 @@ class PairState(NamedTuple):
 
     past: FloatArray
     base: FloatArray
-    bank: FloatArray
+    bank: Bank
     scores: FloatArray
     noise: NoiseLevel
     candidate: npt.NDArray[np.int_]
@@ -81,12 +88,14 @@ class Paired(NamedTuple):
     Attributes:
         joint_position: (..., n), rad, where the joint motion began.
         joint_step: Δq, (..., n), rad.
-        predicted: x, (..., m), the step that the base predicts.
+        predicted: x, (..., columns), the step that the base predicts.
+        rates: L, (..., c, p, k, 3), during it; empty without a sight.
     """
 
     joint_position: FloatArray
     joint_step: FloatArray
     predicted: FloatArray
+    rates: FloatArray
 
 
 @final
@@ -97,15 +106,17 @@ class Pairing:
         delays: the candidates, (D,), periods.
         learns: whether delay, map or noise are identified, for which the base Jacobian predicts motions.
         gap: the longest motion, from one valid feature to the next, of which the past is remembered, periods.
+        maps: the form of the map.
     """
 
-    def __init__(self, aids: AidsConfig, spec: PlantSpec, latency: float) -> None:
+    def __init__(self, aids: AidsConfig, spec: PlantSpec, latency: float, sight: Sight | None = None) -> None:
         """Take settings, sizes and period.
 
         Args:
             aids: the settings.
             spec: of the plant.
             latency: s, of a given delay.
+            sight: how cameras see points, where a map is to turn what they see.
         """
         self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
         motion = max(1, whole_periods(MOTION_TIME, spec.period))
@@ -118,39 +129,40 @@ class Pairing:
         self._rows = int(candidates[-1]) + self.gap + 2
         self._aligns = aids.model == "map"
         self.learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
-        self._eye = np.eye(spec.m)
-        self._P0 = aids.map_deviation**2 * self._eye
+        self._sight = sight
+        self.maps: CameraMap[Any] = FeatureMap(aids, spec.m) if sight is None else SightMap(aids, sight, spec.m)
+        self._end = spec.n + self.maps.columns
 
-    def start(self, observation: Observation, base: FloatArray) -> PairState:
-        """Return the state of an arm that has rested, with J_b (..., m, n) there."""
+    def start(self, observation: Observation, base: FloatArray, depth: FloatArray = NO_DEPTH) -> PairState:
+        """Return the state of an arm that has rested, with J_b (..., columns, n) and the depths (..., c p) there."""
         q, lead = observation.joint_position, observation.feature.shape[:-1]
         none = np.zeros(lead, dtype=np.int_)
-        row = np.concatenate([q, np.zeros((*lead, self._m))], axis=-1)
-        bank, eye = (
-            self._any_map(self._eye, self._aids.feature_noise**2),
-            np.broadcast_to(self._eye, (*lead, self._m, self._m)),
+        row = np.concatenate(
+            [q, np.zeros((*lead, self.maps.columns)), np.broadcast_to(depth, (*lead, depth.shape[-1]))], axis=-1
         )
+        bank, first = self.maps.start(lead, len(self.delays), self._aids.feature_noise**2)
         return PairState(
             past=np.repeat(row[..., None, :], self._rows, axis=-2),
             base=base,
-            bank=np.broadcast_to(bank, (*lead, len(self.delays), *bank.shape)),
+            bank=bank,
             scores=np.zeros((*lead, len(self.delays))),
             noise=NoiseLevel.guess(self._aids.feature_noise, lead),
             candidate=none,
-            map=eye,
-            rotation=eye,
+            map=first,
+            rotation=first,
             moves=none,
             nis=np.zeros(lead),
             cusum=np.zeros(lead),
         )
 
-    def advance(self, state: PairState, joint_position: FloatArray) -> PairState:
-        """Return the state one period later, with the arm at `joint_position` (..., n), rad."""
-        past, n = state.past, self._n
+    def advance(self, state: PairState, joint_position: FloatArray, depth: FloatArray = NO_DEPTH) -> PairState:
+        """Return the state one period later, with the arm at `joint_position` (..., n), rad, and depths (..., c p)."""
+        past, n, end = state.past, self._n, self._end
         new = np.empty_like(past)
         new[..., 1:, :] = past[..., :-1, :]
         new[..., 0, :n] = joint_position
-        new[..., 0, n:] = past[..., 0, n:] + np.matvec(state.base, joint_position - past[..., 0, :n])
+        new[..., 0, n:end] = past[..., 0, n:end] + np.matvec(state.base, joint_position - past[..., 0, :n])
+        new[..., 0, end:] = depth
         return state._replace(past=new)
 
     def delay(self, state: PairState) -> npt.NDArray[np.int_]:
@@ -167,39 +179,54 @@ class Pairing:
         """Return σ, (...), m; None where it is not identified."""
         return state.noise.deviation if self._aids.noise == "identified" else None
 
-    def learn(self, state: PairState, feature_step: FloatArray, duration: FloatArray) -> tuple[PairState, Paired]:
+    def learn(
+        self,
+        state: PairState,
+        feature_step: FloatArray,
+        duration: FloatArray,
+        feature: FloatArray,
+        valid: BoolArray,
+    ) -> tuple[PairState, Paired]:
         """Return the state after a motion of the feature, and the joint motion that belongs to it.
 
         Args:
             state: with the arm's present position.
             feature_step: Δy, (..., m).
             duration: that it took, (...), s, at most `gap` periods.
+            feature: in the middle of it, (..., m).
+            valid: features that were seen at both ends, (..., m).
         """
         n, periods = self._n, np.rint(duration / self._period).astype(np.int_)
-        end = self.delays
-        begin = pick(state.past, end + periods[..., None], axes=1)
-        passed = state.past[..., end, :] - begin
+        begin = pick(state.past, self.delays + periods[..., None], axes=1)
+        end = state.past[..., self.delays, :]
+        passed = end - begin
+        x, depth = passed[..., n : self._end], 0.5 * (begin + end)[..., self._end :]
+        rates = np.zeros((*feature.shape[:-1], 0))
+        if self._sight is not None:
+            rates = self._sight.rates(feature[..., None, :], depth)
         if self.learns:
-            state = self._identify(state, passed[..., n:], feature_step)
-        passed = pick(passed, state.candidate)
-        return state, Paired(pick(begin, state.candidate)[..., :n], passed[..., :n], passed[..., n:])
+            now = state.candidate
+            explained = self.maps.explained(state.map, pick(x, now), self._now(rates, now))
+            step = Step(x, np.where(valid, feature_step, explained), valid, rates)
+            state = self._identify(state, step)
+        now, passed = state.candidate, pick(passed, state.candidate)
+        begin, rates = pick(begin, now)[..., :n], self._now(rates, now)
+        return state, Paired(begin, passed[..., :n], passed[..., n : self._end], rates)
+
+    def _now(self, rates: FloatArray, candidate: npt.NDArray[np.int_]) -> FloatArray:
+        return rates if self._sight is None else pick(rates, candidate)
 
     def interrupt(self, state: PairState) -> PairState:
         """Return the state after a frame in which no motion ended: nothing is known of its noise."""
-        bank = state.bank.copy()
-        bank[..., -1], bank[..., -1, :] = 0.0, 0.0
-        bank[..., -1, -1] = state.noise.variance[..., None]
-        return state._replace(bank=bank)
+        return state._replace(bank=self.maps.interrupted(state.bank, state.noise.variance))
 
     def is_known(self, state: PairState) -> bool | BoolArray:
         """Return whether the map, where there is one, is known well enough to learn with it, (...)."""
         return not self._aligns or self.deviation(state) < self._aids.confidence
 
     def deviation(self, state: PairState) -> FloatArray:
-        """Return the deviation of an entry of the map, (...)."""
-        P = pick(state.bank, state.candidate)[..., self._m : -1, :-1]
-        deviation: FloatArray = np.sqrt(P.trace(axis1=-2, axis2=-1) / self._m)
-        return deviation
+        """Return how uncertain the map is, (...); see `CameraMap.deviation`."""
+        return self.maps.deviation(of_delay(state.bank, state.candidate), state.rotation)
 
     def diagnostics(self, state: PairState) -> dict[str, npt.ArrayLike]:
         """Return delay (s), rotation (rad), deviation and NIS of the map, moves of the camera, noise level (m)."""
@@ -207,50 +234,44 @@ class Pairing:
         if self.learns:
             found |= {"map_surprise": state.nis, "camera_moves": state.moves, "noise_level": state.noise.deviation}
         if self._aligns:
-            turned = (state.rotation - self._eye).reshape(*np.shape(state.candidate), -1)
-            found["map_rotation"] = np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0))
+            R = state.rotation
+            turned = (R - np.eye(R.shape[-1])).reshape(*R.shape[:-2], -1)
+            angle = np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0))
+            found["map_rotation"] = angle if self._sight is None else np.maximum.reduce(angle, axis=-1)
             found["map_deviation"] = self.deviation(state)
         return found
 
-    def _identify(self, state: PairState, x: FloatArray, feature_step: FloatArray) -> PairState:
-        lengths = norm(x)
+    def _identify(self, state: PairState, step: Step) -> PairState:
+        lengths = self.maps.lengths(step)
         if not self._aids.detect_moves:
-            return self._learn_map(state, x, lengths, feature_step)
+            return self._learn_map(state, step, lengths)
         reach = MIN_JUMP_RATIO * np.maximum.reduce(lengths, axis=-1) + MIN_JUMP_DEVIATIONS * state.noise.deviation
-        jumped = norm(feature_step) > reach
-        state = branch(jumped, self._jump, state, feature_step)
-        return branch(np.logical_not(jumped), self._learn_map, state, x, lengths, feature_step)
+        jumped = norm(step.feature_step) > reach
+        state = branch(jumped, self._jump, state, step.feature_step)
+        return branch(np.logical_not(jumped), self._learn_map, state, step, lengths)
 
     def _jump(self, state: PairState, feature_step: FloatArray) -> PairState:
         noise, zero = state.noise, np.zeros_like(state.cusum)
         if self._aids.noise == "identified":
             noise = noise.learn(np.vecdot(feature_step, feature_step) / self._m, 2.0, zero)
-        bank = self._any_map(self._maps(state.bank), noise.variance[..., None])
+        bank = self.maps.unknown(state.bank, noise.variance)
         return state._replace(bank=bank, cusum=zero, moves=state.moves + 1, noise=noise)
 
-    def _maps(self, bank: FloatArray) -> FloatArray:
-        return bank[..., : self._m, :-1]
-
-    def _any_map(self, maps: FloatArray, frame: FloatArray | float) -> FloatArray:
-        """Return a bank with M (..., m, m), P₀ for its covariance, and σ² (...) for that of the last frame."""
-        return fresh_bank(maps, self._P0, frame)
-
-    def _learn_map(self, state: PairState, x: FloatArray, lengths: FloatArray, feature_step: FloatArray) -> PairState:
+    def _learn_map(self, state: PairState, step: Step, lengths: FloatArray) -> PairState:
         """Update map, covariance and score of every delay, and choose among them."""
-        aids, m, noise, candidate = self._aids, self._m, state.noise, state.candidate
-        frame, model = noise.variance[..., None], aids.map_error**2 * (lengths * lengths)
-        before = self._walked(state.bank, lengths)
-        bank, nis, s = map_update(before, x, feature_step, frame, model)
-        surprise, expected = pick(nis, candidate) / m, pick(s, candidate)
+        aids, noise, candidate, frame = self._aids, state.noise, state.candidate, state.noise.variance
+        before = self.maps.walked(state.bank, step, lengths)
+        bank, said = self.maps.update(before, step, lengths, frame)
+        now = of_delay(said, candidate)
+        surprise = now.nis / np.maximum(np.add.reduce(step.valid, axis=-1), 1)
         if aids.noise == "identified":
-            frames = 1.0 + np.minimum(pick(before, candidate)[..., -1, -1] / noise.variance, 1.0)  # σ² in s
-            noise = noise.learn(surprise * expected, frames, expected - frames * noise.variance)
+            noise = noise.learn(surprise * now.variance, now.frames, now.variance - now.frames * noise.variance)
         cusum, moves = np.maximum(0.0, state.cusum + np.minimum(surprise, CUSUM_CAP) - CUSUM_DRIFT), state.moves
         if aids.detect_moves:
             moved = cusum > aids.move_gate
-            bank = branch(moved, self._learn_any_map, bank, before, x, feature_step, frame, model)
+            bank = branch(moved, self._learn_any_map, bank, before, step, lengths, frame)
             cusum, moves = cusum * ~moved, moves + moved
-        scores = aids.score_memory * state.scores + np.minimum(nis, NIS_CAP) + m * np.log(s)
+        scores = aids.score_memory * state.scores + np.minimum(said.nis, NIS_CAP) + said.spread
         best = scores.argmin(axis=-1)
         better = pick(scores, best) < pick(scores, candidate) - aids.delay_margin
         candidate = np.where(better, best, candidate)[()]
@@ -259,28 +280,8 @@ class Pairing:
         )
         if not self._aligns:
             return state
-        now = pick(bank, candidate)
-        nearest, rotation = near_rotation(self._maps(now), now[..., m:-1, :-1], aids.rotation_deviation)
+        nearest, rotation = self.maps.completed(of_delay(bank, candidate), state.rotation)
         return state._replace(map=nearest, rotation=rotation)
 
-    def _walked(self, bank: FloatArray, lengths: FloatArray) -> FloatArray:
-        """Return the bank with P_M ← P_M + w² ‖x_d‖ I, no larger than P₀."""
-        aids, m, walked = self._aids, self._m, bank.copy()
-        P = walked[..., m:, :]
-        P[..., :-1, :-1] += (aids.map_walk**2 * lengths)[..., None, None] * self._eye
-        larger = np.maximum(P[..., :-1, :-1].trace(axis1=-2, axis2=-1) / (m * aids.map_deviation**2), 1.0)
-        shrink = 1.0 / np.sqrt(larger)[..., None, None]  # of M in P = E[M; e][M; e]ᵀ
-        P[..., :-1, :] *= shrink
-        P[..., :-1] *= shrink
-        return walked
-
-    def _learn_any_map(
-        self,
-        bank: FloatArray,
-        before: FloatArray,
-        x: FloatArray,
-        feature_step: FloatArray,
-        frame: FloatArray,
-        model: FloatArray,
-    ) -> FloatArray:
-        return map_update(self._any_map(self._maps(before), frame), x, feature_step, frame, model)[0]
+    def _learn_any_map(self, bank: Bank, before: Bank, step: Step, lengths: FloatArray, frame: FloatArray) -> Bank:
+        return self.maps.update(self.maps.unknown(before, frame), step, lengths, frame)[0]

@@ -140,7 +140,7 @@ class Predictor:
     ) -> FeatureFilter:
         """Return the filter at the exposure."""
         same, y = past.delay == state.delay, observation.feature
-        found = branch(same, self._follow, state.filter, jacobian, past.before, y, observation.feature_valid)
+        found = branch(same, self._follow, state.filter, jacobian, past.before, y, observation.valid)
         return branch(np.logical_not(same), FeatureFilter.restart, found, y)
 
     def _follow(
@@ -149,10 +149,11 @@ class Predictor:
         jacobian: FloatArray,
         joint_step: FloatArray,
         feature: FloatArray,
-        valid: bool | BoolArray,
+        valid: BoolArray,
     ) -> FeatureFilter:
         state = state.advance(jacobian, joint_step, self._aids.filter_error, self._period)
-        return branch(valid, FeatureFilter.correct, state, feature, self._aids.noise == "identified")
+        seen = np.logical_or.reduce(valid, axis=-1)
+        return branch(seen, FeatureFilter.correct, state, feature, valid, self._aids.noise == "identified")
 
 
 def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:

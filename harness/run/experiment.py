@@ -11,6 +11,7 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
+from servobench.controllers.sight import Sight
 from servobench.controllers.units import in_natural_units
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
@@ -26,6 +27,7 @@ from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.draws import CameraDraws
+from servobench.plant.eyes.model import EyeModel
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
@@ -226,8 +228,16 @@ def _nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: R
         spec=spec,
         preview=run.preview_rows,
         nominal_jacobian=nominal.jacobian,
+        nominal_sight=_sight(nominal),
         region=(robot.workspace.lower, robot.workspace.upper),
     )
+
+
+def _sight(nominal: SensedArm) -> Sight | None:
+    """Return how the cameras of a nominal model see points, where its features are those of single points."""
+    if not (isinstance(nominal, EyeModel) and nominal.eye.single and nominal.eye.locate):
+        return None
+    return Sight(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
 
 
 def _in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:

@@ -16,13 +16,15 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.optics import Optics, project, project_rates
+from servobench.plant.eyes.optics import Optics, locate, project, project_rates
 from servobench.plant.signals import SETTLING_BAND, BoolArray, Channel
 
 Measure: TypeAlias = Callable[[FloatArray, Optics], FloatArray]
 """Points (..., c, p, 3) [m] in the frame of each camera, and the optics -> features (..., m)."""
 Rates: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
 """Points, their motions (..., c, p, 3, n) [m] and the optics -> the change of the features, (..., m, n)."""
+Locate: TypeAlias = Callable[[FloatArray, FloatArray, Optics], FloatArray]
+"""Features (..., m), depths (..., c, p) [m] and the optics -> the points that have them, (..., c, p, 3) [m]."""
 DIFFERENCE: Final = 1e-6  # share of the motions over which features are differentiated
 
 
@@ -48,6 +50,8 @@ class Eye:
         unit: of all features, such as "px".
         measure: makes features of points; pure, over leading axes.
         rates: its derivative along motions of the points; None: by central differences.
+        locate: its inverse for points of known depth; None where there is none. With it and `single`, controllers may
+            know how features change with motions of what is seen, wherever the camera is.
         scale: natural size of a feature, in its unit, for a focal length [px] and a working distance [m]: what a metre
             of motion across the optical axis changes.
         tolerance: the settling band as a share of the scale, for the norm of the error.
@@ -66,6 +70,7 @@ class Eye:
     unit: str
     measure: Measure
     rates: Rates | None = None
+    locate: Locate | None = None
     scale: Callable[[float, float], float] = one
     tolerance: float = SETTLING_BAND
     cameras: int = 1
@@ -111,6 +116,11 @@ def pixel_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Floa
     """Return the change of `pixels`, (..., 2 c p, n) px."""
     rates = project_rates(points, motions, optics)
     return rates.reshape(*rates.shape[:-4], -1, rates.shape[-1])
+
+
+def located(features: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
+    """Return the points that have given `pixels`, (..., c, p, 3) m."""
+    return locate(features.reshape(*features.shape[:-1], *depth.shape[-2:], 2), depth, optics)
 
 
 def _joined(values: FloatArray, axes: int) -> FloatArray:

@@ -29,6 +29,7 @@ from servobench.plant.signals import BoolArray, Channel
 
 Mount: TypeAlias = Literal["fixed", "hand"]
 """Whether the cameras are beside the arm and the target on it, or the reverse."""
+NEAREST: Final = 0.25  # of the planned distance, the least depth that an interaction matrix takes
 MIN_FACING: Final = 0.2  # cosine of the angle beyond which discs on a plate are not seen
 
 
@@ -118,6 +119,16 @@ class EyeModel(SensedArm):
 
     def look(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return features (..., m), Jacobian (..., m, n) and which features are seen (..., m), all read-only."""
+        points, motions = self.point_motions(joint_position)
+        y = self.eye.measure(points, self.optics)
+        J = self.eye.change(points, motions, self.optics)
+        seen = self._valid(points)
+        for array in (y, J, seen):
+            array.setflags(write=False)
+        return y, J, seen
+
+    def point_motions(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the target in each camera, (..., c, p, 3) m, and its motion with the joints, (..., c, p, 3, n)."""
         frames = self.arm.frames(joint_position)
         flange = frames[..., -1, :, :]
         at = self._in_base(flange)
@@ -127,12 +138,25 @@ class EyeModel(SensedArm):
         points = self._in_cameras(self._mounted(flange, at))
         # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
         turned = np.vecmat(motions[..., None, :, :, :], self.cameras[..., None, None, :3, :3])
-        y = self.eye.measure(points, self.optics)
-        J = self.eye.change(points, np.swapaxes(turned, -1, -2), self.optics)
-        seen = self._valid(points)
-        for array in (y, J, seen):
-            array.setflags(write=False)
-        return y, J, seen
+        return points, np.swapaxes(turned, -1, -2)
+
+    def interaction(self, feature: FloatArray, depth: FloatArray) -> FloatArray:
+        """Return L, (..., c, p, k, 3): how the k features of each point change with its place in the camera.
+
+        Args:
+            feature: (..., m), where the points are seen.
+            depth: (..., c, p) [m], of the points; at least `NEAREST` of the planned distance is taken.
+
+        Raises:
+            ValueError: the set-up has no such matrix.
+        """
+        eye = self.eye
+        if eye.locate is None or not eye.single:
+            raise ValueError(f"sensing {eye.name} has no interaction matrix: single and locate must be given")
+        points = eye.locate(feature, np.maximum(depth, NEAREST * self.distance), self.optics)
+        along = np.broadcast_to(np.eye(3), (*points.shape, 3))
+        rates = eye.change(points, along, self.optics)
+        return rates.reshape(*points.shape[:-1], -1, 3)
 
     def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
         """Return which features are seen, (..., m), of points in the frame of each camera, (..., c, p, 3) m."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from servobench.plant.eyes.eye import Eye, pixel_rates, pixels, pixels_per_metre
+from servobench.plant.eyes.eye import Eye, located, pixel_rates, pixels, pixels_per_metre
 
 PIXEL = Eye(
     name="pixel",
@@ -11,6 +11,7 @@ PIXEL = Eye(
     unit="px",
     measure=pixels,
     rates=pixel_rates,
+    locate=located,
     scale=pixels_per_metre,
     single=True,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from servobench.plant.eyes.eye import Eye, pixel_rates, pixels, pixels_per_metre
+from servobench.plant.eyes.eye import Eye, located, pixel_rates, pixels, pixels_per_metre
 from servobench.plant.signals import SETTLING_BAND
 
 HALF: Final = 0.12  # [m] half side of the square at whose corners the discs are
@@ -16,6 +16,7 @@ PLATE = Eye(
     unit="px",
     measure=pixels,
     rates=pixel_rates,
+    locate=located,
     scale=pixels_per_metre,
     tolerance=2.0 * SETTLING_BAND,  # four discs see a motion of the plate, as long as it does not turn
     target=((-HALF, -HALF, 0.0), (HALF, -HALF, 0.0), (HALF, HALF, 0.0), (-HALF, HALF, 0.0)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from servobench.plant.eyes.eye import Eye, pixel_rates, pixels, pixels_per_metre
+from servobench.plant.eyes.eye import Eye, located, pixel_rates, pixels, pixels_per_metre
 from servobench.plant.signals import SETTLING_BAND
 
 STEREO = Eye(
@@ -14,6 +14,7 @@ STEREO = Eye(
     unit="px",
     measure=pixels,
     rates=pixel_rates,
+    locate=located,
     scale=pixels_per_metre,
     tolerance=math.sqrt(2.0) * SETTLING_BAND,  # both cameras see a motion across both
     cameras=2,

@@ -240,7 +240,7 @@ def test_the_weighted_error_of_the_map_falls_by_each_innovation():
 def test_nothing_is_identified_where_nothing_is_asked_for():
     pairing = Pairing(AidsConfig(filter=True), SPEC, 0.0)
     state = pairing.advance(pairing.start(seen(np.zeros(N), np.zeros(M)), np.ones((M, N))), np.full(N, 0.01))
-    after, paired = pairing.learn(state, np.full(M, 0.3), np.float64(PERIOD))
+    after, paired = pairing.learn(state, np.full(M, 0.3), np.float64(PERIOD), np.zeros(M), np.full(M, True))
     assert after is state
     np.testing.assert_allclose(paired.joint_step, 0.01)
     np.testing.assert_allclose(paired.predicted, 0.05)

@@ -101,7 +101,7 @@ def filter_at(feature, noise=0.001):
 def test_the_filter_is_a_kalman_filter_by_hand():
     """σ = 0.1, c = 0.5, ‖Ĵ‖² = 5, ‖Δq‖² = 0.01, r² = 1e-8: p = 0.01 + 0.25·5·0.01/2 = 0.01625, z = 1.2 + L·0.1."""
     made = filter_at([1.0], 0.1).advance(np.array([[2.0, 1.0]]), np.array([0.1, 0.0]), 0.5, PERIOD)
-    made = made.correct(np.array([1.3]), False)
+    made = made.correct(np.array([1.3]), np.array([True]), False)
     p = 0.01625 + 1e-8
     np.testing.assert_allclose(made.feature, [1.2 + p / (p + 0.01) * 0.1])
     assert made.variance == pytest.approx(p * 0.01 / (p + 0.01))
@@ -119,15 +119,28 @@ def test_a_motion_of_which_the_jacobian_sees_nothing_makes_the_filter_unsure_too
 def test_at_rest_the_filter_averages_and_without_a_frame_it_follows_the_joints(noise):
     rng, made, errors = np.random.default_rng(5), filter_at(np.zeros(3)), []
     for _ in range(900):
-        made = made.advance(np.eye(3), np.zeros(3), 0.2, PERIOD).correct(rng.normal(scale=noise, size=3), True)
+        made = made.advance(np.eye(3), np.zeros(3), 0.2, PERIOD).correct(
+            rng.normal(scale=noise, size=3), np.full(3, True), True
+        )
         errors.append(made.feature)
     assert np.sqrt(np.mean(np.square(errors[300:]))) < 1.3 * np.sqrt(0.5 * 1e-4 * noise)  # L = r/σ: σ √(L/2)
     after = made.advance(np.eye(3), np.array([0.01, 0.0, 0.0]), 0.2, PERIOD)
     np.testing.assert_allclose(after.feature, made.feature + [0.01, 0.0, 0.0])
 
 
+def test_a_feature_that_is_not_seen_follows_the_joints_while_the_others_are_corrected():
+    made = filter_at(np.zeros(2)).advance(np.array([[0.0], [0.5]]), np.array([0.2]), 0.2, PERIOD)
+    made = made.correct(np.array([0.002, 9.0]), np.array([True, False]), True)
+    assert 0.0 < made.feature[0] < 0.002
+    assert made.feature[1] == pytest.approx(0.1)
+
+
 def test_a_feature_far_off_restarts_the_filter():
-    made = filter_at(np.zeros(2)).advance(np.eye(2), np.zeros(2), 0.2, PERIOD).correct(np.array([0.3, 0.1]), True)
+    made = (
+        filter_at(np.zeros(2))
+        .advance(np.eye(2), np.zeros(2), 0.2, PERIOD)
+        .correct(np.array([0.3, 0.1]), np.full(2, True), True)
+    )
     np.testing.assert_array_equal(made.feature, [0.3, 0.1])
     assert made.variance == made.noise.variance
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi
 import cv2
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ import pytest
 from kit.robots import FOUR_JOINTS
 from servobench.plant.eyes.draws import draw_cameras
 from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.eyes.optics import Optics, in_image, project
+from servobench.plant.eyes.model import NEAREST, EyeModel
+from servobench.plant.eyes.optics import Optics, in_image, locate, project
 from servobench.plant.eyes.placing import CAMERA, HAND_DISTANCE
 from servobench.plant.eyes.registry import EYES, FIXED, HAND, Sensing
 from servobench.plant.eyes.symbolic import symbolic_feature
@@ -57,6 +58,32 @@ def test_the_jacobian_is_that_of_casadi_and_of_finite_differences(word):
         columns = [(model.feature(posture + h * e) - model.feature(posture - h * e)) / (2 * h) for e in np.eye(6)]
         np.testing.assert_allclose(np.stack(columns, axis=-1), J, atol=1e-6 * model.channel.scale)
     assert checked >= 1
+
+
+@pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])
+def test_interaction_matrix_and_motions_of_points_make_the_jacobian_of_casadi(word):
+    """J = L(y, z) G(q), with L of the features and their depths alone, through distorted optics."""
+    model = true_model(word)
+    q = symbolic_feature(model)
+    jacobian = casadi.Function("J", [x := casadi.SX.sym("q", 6)], [casadi.jacobian(q(x), x)])
+    for posture in postures(10):
+        points, motions = model.point_motions(posture)
+        if (points[..., 2] < NEAREST * model.distance).any() or not model.visible(posture).all():
+            continue
+        made = model.interaction(model.feature(posture), points[..., 2]) @ motions
+        np.testing.assert_allclose(made.reshape(-1, 6), np.array(jacobian(posture)), rtol=1e-6, atol=1e-6)
+
+
+def test_features_without_an_inverse_have_no_interaction_matrix():
+    with pytest.raises(ValueError, match="position has no interaction matrix: single and locate must be given"):
+        true_model("position:hand").interaction(np.zeros(3), np.ones((1, 1)))
+
+
+@pytest.mark.parametrize("distortion", [0.0, -0.1, 0.1])
+def test_points_are_found_again_where_they_appear(distortion):
+    optics = Optics(np.array([208.0]), np.array([[163.0, 117.0]]), np.array([distortion]), (320.0, 240.0))
+    points = np.random.default_rng(0).uniform([-0.5, -0.4, 0.9], [0.5, 0.4, 1.5], (20, 1, 4, 3))
+    np.testing.assert_allclose(locate(project(points, optics), points[..., 2], optics), points, atol=1e-6)
 
 
 @pytest.mark.parametrize("word", ["pixel", "stereo", "plate", "pixel:hand", "stereo:hand", "plate:hand"])
