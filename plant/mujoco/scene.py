@@ -11,7 +11,9 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.mujoco.engine import mujoco, open_context
 from servobench.plant.mujoco.model import read_urdf
@@ -31,9 +33,9 @@ BALL_MESH = "ball.obj"
 SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
-BACKGROUND = (0.93, 0.94, 0.95)  # red, green, blue beyond the floor
+WHITE = (255, 255, 255, 0)  # beyond the floor; a sky of MuJoCo's would stand in front of far things
 MAX_PARTS = 1000  # that are drawn
-COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_FOG", "mjRND_HAZE")
+COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
 
 
 class MujocoScene(Scene):
@@ -94,6 +96,15 @@ class MujocoScene(Scene):
 
     def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
         """See `Scene.render`."""
+        rgb, depth = self.draw(camera, X_BC)
+        rgb = cv2.add(rgb, WHITE, dst=rgb, mask=cv2.inRange(depth, 0.0, 0.0))
+        return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
+
+    def draw(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, npt.NDArray[np.float32]]:
+        """Return colours (h, w, 3) and depths (h, w) as OpenGL has them, with the lowest row first.
+
+        Depths fall from 1 at the near plane to 0 at the far one, where float32 is finest.
+        """
         mujoco.mjv_updateScene(
             self._model, self._data, self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
         )
@@ -108,8 +119,7 @@ class MujocoScene(Scene):
                 mujoco.mjr_resizeOffscreen(*size, context)
             mujoco.mjr_render(area, self._drawn, context)
             mujoco.mjr_readPixels(rgb, depth, area, context)
-        # The first row is the lowest one. Depths are 1 at the near plane: so float32 resolves them best.
-        return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
+        return rgb, depth
 
     def close(self) -> None:
         """See `Scene.close`."""
@@ -141,14 +151,6 @@ def _compile(arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, *, scenery: b
         diffuse=[DIFFUSE] * 3,
         specular=[0.0] * 3,
         castshadow=False,
-    )
-    spec.add_texture(
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=BACKGROUND,
-        rgb2=BACKGROUND,
-        width=8,
-        height=8,
     )
     looks = spec.visual
     looks.headlight.active = 0

@@ -81,12 +81,13 @@ class MujocoSimulation(Simulation):
             return MujocoState(loops, joints.acceleration)
         model, data = self._model, self._data
         self._set(loops.angle, loops.speed, joints.acceleration)
+        angle, turning, compensation, applied = data.qpos, data.qvel, data.qfrc_gravcomp, data.qfrc_applied
         for _ in range(steps):
             mujoco.mj_step1(model, data)
-            torque, loops = drives.torque(drives.follow(loops, speed), data.qfrc_gravcomp)
-            data.qfrc_applied[:] = torque - data.qfrc_gravcomp  # MuJoCo adds the compensation itself
+            torque, loops = drives.torque(drives.follow(loops, speed), compensation)
+            np.subtract(torque, compensation, out=applied)  # MuJoCo adds the compensation itself
             mujoco.mj_step2(model, data)
-            loops = loops._replace(angle=data.qpos.copy(), speed=data.qvel.copy())
+            loops = DriveState(angle.copy(), turning.copy(), *loops[2:])
         return MujocoState(loops, data.qacc_warmstart.copy())
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:

@@ -150,6 +150,7 @@ class Drives:
         self._integral_gain = h * INTEGRAL_SHARE * pole * self._velocity_gain
         self._diagonal = np.diag_indices(n)
         self._rotor, self._limit = np.diag(rotor), np.broadcast_to(config.torque_limit, n)
+        self._least = -self._limit
         self._compensation = config.friction_compensation / h
         self._viscous = h * np.broadcast_to(config.viscous_friction, n)
         self._coulomb = h * np.broadcast_to(config.coulomb_friction, n)
@@ -169,7 +170,7 @@ class Drives:
         c = state.reference_speed + self._blend * (speed - state.reference_speed)
         wanted = state.reference + PHYSICS_STEP * c
         r = np.minimum(np.maximum(wanted, self._lower), self._upper)
-        return state._replace(reference=r, reference_speed=np.where(r == wanted, c, 0.0))
+        return DriveState(state.angle, state.speed, r, np.where(r == wanted, c, 0.0), state.integral)
 
     def track(self, state: DriveState) -> DriveState:
         """Return the state of joints that are exactly where their reference is."""
@@ -186,9 +187,9 @@ class Drives:
         error = state.reference_speed + self._position_gain * behind - state.speed
         friction = self._compensation * self._drag(state.reference_speed) * state.reference_speed
         asked = self._velocity_gain * error + state.integral + assumed_gravity + friction
-        torque = np.minimum(np.maximum(asked, -self._limit), self._limit)
+        torque = np.minimum(np.maximum(asked, self._least), self._limit)
         integral = state.integral + self._integral_gain * error * (asked == torque)
-        return torque, state._replace(reference=state.angle + behind, integral=integral)
+        return torque, DriveState(state.angle, state.speed, state.angle + behind, state.reference_speed, integral)
 
     def drive(self, state: DriveState, body: RigidBody) -> DriveState:
         """Return the state one physics step later under the loops' torques.
@@ -206,7 +207,7 @@ class Drives:
         moved = angle + h * speed
         angle_after = np.minimum(np.maximum(moved, self._lower), self._upper)
         speed = np.where(angle_after == moved, speed, 0.0)
-        return after._replace(angle=angle_after, speed=speed)
+        return DriveState(angle_after, speed, *after[2:])
 
     def _drag(self, speed: FloatArray) -> FloatArray:
         """Return friction over speed, times the physics step, at speeds (n,) [rad/s], (n,) [kg m²]."""

@@ -1,0 +1,112 @@
+"""What a period of the `mujoco` plant costs over the render and physics calls it needs, and beside one of `bullet`.
+
+All are measured in the same run, in turns: a whole `Bench.step` of `mujoco`; the calls of MuJoCo in it, which are the
+physics steps, contact, and one image with its depths from the same camera; and, where PyBullet is installed, a whole
+`Bench.step` of `bullet`, whose bare calls are in `bullet_period.py`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+
+import numpy as np
+
+from measuring import asked_to_be_quick, table
+from servobench.plant.checks import FloatArray, whole_steps
+from servobench.plant.mujoco.engine import mujoco
+from servobench.plant.mujoco.mujoco_plant import build_mujoco
+from servobench.plant.mujoco.scene import MujocoScene
+from servobench.plant.mujoco.simulation import MujocoSimulation
+from servobench.plant.plant import PlantSetup
+from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.world import CONTACT_STEPS
+from servobench.plant.robot import ur5
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.plant.signals import Command
+
+HOME = np.array(ur5.HOME)
+PERIOD = 0.05  # [s]
+
+
+class BareCalls:
+    """The calls of MuJoCo that a period needs, and nothing else."""
+
+    def __init__(self, config: RenderedConfig) -> None:
+        """Open a scene and a simulation of their own."""
+        self._model, self._camera = nominal_ur5(), config.camera()
+        arm, stops = self._model.arm, np.full(6, config.joint_range)
+        machine = Machine(arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
+        self._simulation = MujocoSimulation(machine)
+        self._scene = MujocoScene(arm, scenery=config.scenery, window=False)
+        self._simulation.start(HOME)
+        self._scene.place(HOME)
+
+    def period(self) -> None:
+        """Carry out a period."""
+        model, data = self._simulation._model, self._simulation._data
+        shapes, placed = self._simulation._shapes, self._simulation._placed
+        data.qpos[:], data.qvel[:] = HOME, 0.0
+        for step in range(whole_steps(PERIOD, PHYSICS_STEP)):
+            mujoco.mj_step1(model, data)
+            mujoco.mj_step2(model, data)
+            if step % CONTACT_STEPS == 0:
+                placed.qpos[:] = HOME
+                mujoco.mj_kinematics(shapes, placed)
+                mujoco.mj_comPos(shapes, placed)
+                mujoco.mj_collision(shapes, placed)
+        self._scene.draw(self._camera, self._model.X_BC)
+
+    def close(self) -> None:
+        """Free scene and simulation."""
+        self._scene.close()
+        self._simulation.close()
+
+
+def milliseconds(call: Callable[[], object]) -> float:
+    """Return how long a call takes, ms."""
+    start = time.perf_counter()
+    call()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def measure(config: RenderedConfig, repeats: int) -> FloatArray:
+    """Return the times of bare periods and of whole ones, of `mujoco` and of `bullet` if it is there, (k, repeats) ms."""
+    setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
+    plants = [build_mujoco(config, setup)]
+    if find_spec("pybullet") is not None:
+        from servobench.plant.bullet.bullet_plant import build_bullet
+
+        plants.append(build_bullet(config, setup))
+    for plant in plants:
+        plant.reset(0)
+    times = np.empty((1 + len(plants), repeats))
+    for k in range(repeats):
+        command = Command(0.2 * np.sin(0.3 * k) * np.ones(6))
+        for row, call in enumerate((bare.period, *(partial(plant.step, command) for plant in plants))):
+            times[row, k] = milliseconds(call)
+    for plant in plants:
+        plant.close()
+    bare.close()
+    return times
+
+
+def main() -> None:
+    """Print medians and ratios, with and without table and floor."""
+    repeats = 3 if asked_to_be_quick(__doc__) else 200
+    rows = []
+    for name, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
+        medians = np.median(measure(config, repeats), axis=1)
+        kinds = ("bare calls", "`Bench.step`", "`Bench.step` of `bullet`")
+        for kind, value in zip(kinds, medians, strict=False):
+            rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
+    print(table(["period of `mujoco`", "a period", "× bare calls"], rows))
+
+
+if __name__ == "__main__":
+    main()
