@@ -76,7 +76,7 @@ def milliseconds(call: Callable[[], object]) -> float:
 
 
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
-    """Return the times of bare periods and of whole ones, of `mujoco` and of `bullet` if it is there, (k, repeats) ms."""
+    """Return the times of bare periods, whole ones and, if it is there, those of `bullet`, (2 or 3, repeats) ms."""
     setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
     plants = [build_mujoco(config, setup)]
     if find_spec("pybullet") is not None:

@@ -33,7 +33,6 @@ BALL_MESH = "ball.obj"
 SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
-WHITE = (255, 255, 255, 0)  # beyond the floor; a sky of MuJoCo's would stand in front of far things
 MAX_PARTS = 1000  # that are drawn
 COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
 
@@ -97,7 +96,8 @@ class MujocoScene(Scene):
     def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
         """See `Scene.render`."""
         rgb, depth = self.draw(camera, X_BC)
-        rgb = cv2.add(rgb, WHITE, dst=rgb, mask=cv2.inRange(depth, 0.0, 0.0))
+        # Beyond the floor is black, to be white. A sky of MuJoCo's would stand in front of far things.
+        cv2.bitwise_not(rgb, dst=rgb, mask=cv2.inRange(depth, np.zeros(1), np.zeros(1)))
         return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
 
     def draw(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, npt.NDArray[np.float32]]:
