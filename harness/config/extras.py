@@ -14,6 +14,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "jinja2": "report",
     "optuna": "tune",
     "distributed": "cluster",
+    "gymnasium": "gym",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
 }

@@ -1,0 +1,155 @@
+"""A run as an environment of Gymnasium: the policy is the controller, everything else is the harness's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final, final
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+
+from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.config.settings import Settings
+from servobench.harness.gym.view import Floats32, View
+from servobench.harness.run.experiment import Experiment, build
+from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
+from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.faults import FeatureLost, RunFault
+from servobench.plant.seeds import named_seed
+from servobench.plant.signals import Command, Observation
+
+SEEDS: Final = 2**31  # that an environment draws from where it is given none
+PLACEHOLDER: Final = "constant"  # the harness builds every run with a controller; this one costs least
+
+
+def resolve_environment(
+    plant: str, task: str, mismatch: str, robot: str, sensing: str, settings: Mapping[str, Mapping[str, Any]] | None
+) -> ResolvedRun:
+    """Return what the runs of an environment have in common, with seed 0; arguments as in `ServoEnv`.
+
+    Raises:
+        ConfigurationError: a name, setting or mismatch that cannot be used.
+    """
+    request = RunRequest(plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing)
+    given = Settings(settings or {})
+    check_settings(given, [plant, task])
+    return resolve(request, given)
+
+
+def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
+    """Return the same run with another seed, and so another robot, target and noise."""
+    return replace(resolved, request=replace(resolved.request, seed=seed))
+
+
+@final
+class ServoEnv(gymnasium.Env[Floats32, Floats32]):
+    """One run of a task, of which each episode draws a new robot, target and noise.
+
+    An action is a joint velocity as a share of the joints' limits, held for a control period; `View` says what the
+    policy sees. The reward of a period is
+
+        r = −‖y* − y‖ T
+
+    with the true feature y at its end in natural sizes and the period T [s], so that a return is the error's integral.
+    The episode is truncated at the end of the task. A run that fails (a feature that is lost, a contact) terminates
+    it, and its last error is charged for the rest of the task.
+
+    Attributes:
+        observation: of the plant, as controllers get it; None before the first `reset`.
+        natural_size: of a feature, in its unit.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - declared so by Gymnasium
+
+    def __init__(
+        self,
+        plant: str = "kinematic",
+        task: str = "random",
+        mismatch: str = "moderate",
+        robot: str = DEFAULT_ROBOT,
+        sensing: str = DEFAULT_SENSING,
+        settings: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Look everything up; names and settings are those of `servobench.run`.
+
+        Raises:
+            ConfigurationError: a name, setting or mismatch that cannot be used.
+        """
+        self.observation: Observation | None = None
+        self._resolved = resolve_environment(plant, task, mismatch, robot, sensing, settings)
+        self._experiment: Experiment | None = build(self._resolved)
+        self._view = View(self._experiment.plant.spec, self._resolved.run.preview_rows)
+        self.natural_size = self._view.spec.feature.scale
+        self.observation_space, self.action_space = self._view.observations, self._view.actions
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats32, dict[str, Any]]:
+        """Begin a run.
+
+        Args:
+            seed: of the run, with the same robot, target and noise as `servobench run --seed`; None draws one.
+            options: none are known.
+
+        Returns:
+            What the policy sees, and `seed` and `robot`, the drawn values.
+        """
+        super().reset(seed=seed)
+        run_seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
+        self.close()
+        self._experiment = experiment = build(with_seed(self._resolved, run_seed))
+        rows = experiment.periods + 1 + experiment.run.preview_rows  # also those after the last period
+        self._desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
+        self._k = self._lost = 0
+        self._action = np.zeros(self._view.spec.n)
+        self.observation = experiment.plant.reset(named_seed(run_seed, "plant"))
+        return self._see(), {"seed": run_seed, "robot": experiment.drawn.as_record()}
+
+    def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, dict[str, Any]]:
+        """Hold an action for a period.
+
+        Args:
+            action: (n,), share of the joints' speed limits; clipped to it.
+
+        Returns:
+            What the policy sees, the reward, whether the run failed, whether the task is over, and `time` [s], `error`
+            (true, in natural sizes) and, of a run that failed, `reason`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+        """
+        experiment, reason = self._experiment, None
+        if experiment is None or self.observation is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        plant, loop = experiment.plant, experiment.loop
+        if loop.camera_move is not None and self._k == loop.camera_move.period:
+            plant.move_camera(loop.camera_move.X_BC)
+        self._action = np.asarray(action, dtype=np.float64)
+        try:
+            self.observation = plant.step(Command(self._view.command(self._action)))
+            self._lost = 0 if self.observation.feature_valid else self._lost + 1
+            if self._lost >= loop.lost_after_periods:
+                raise FeatureLost(f"no valid feature for {self._lost} periods")
+        except RunFault as fault:
+            reason = str(fault)
+        self._k += 1
+        error = float(self._view.error(plant.truth(), self._desired[self._k]))
+        periods = 1 if reason is None else experiment.periods - self._k + 1
+        info = {"time": self._k * self._view.spec.period, "error": error} | ({"reason": reason} if reason else {})
+        ended = reason is None and self._k >= experiment.periods
+        return self._see(), -error * periods * self._view.spec.period, reason is not None, ended, info
+
+    def _see(self) -> Floats32:
+        if self.observation is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        rows = self._resolved.run.preview_rows + 1
+        return self._view.see(self.observation, self._desired[self._k : self._k + rows], self._action)
+
+    def close(self) -> None:
+        """Free the plant; calling it twice is allowed."""
+        if self._experiment is not None:
+            self._experiment.plant.close()
+            self._experiment = None

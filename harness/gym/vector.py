@@ -1,0 +1,136 @@
+"""Runs side by side as a vector environment of Gymnasium: one plant with a lane for each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.gym.environment import SEEDS, ServoEnv, resolve_environment, with_seed
+from servobench.harness.gym.view import Floats32, View
+from servobench.harness.run.together import Together, build_together, side_by_side_key
+from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.seeds import named_seed
+from servobench.plant.signals import BoolArray, Command, Observation
+
+
+@final
+class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
+    """Many runs of a task that advance together, each with a robot, a target and noise of its own.
+
+    A lane is the same run, to the bit, as a `ServoEnv` with its seed. All episodes have the same length and are reset
+    together: if a run fails, it is terminated and the others are truncated. The step after the end resets all lanes and
+    ignores the actions, as Gymnasium's own vector environments do.
+
+    Attributes:
+        observation: of the plant, as controllers get it; arrays have a leading axis.
+    """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - declared so by Gymnasium
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        plant: str = "kinematic",
+        task: str = "random",
+        mismatch: str = "moderate",
+        robot: str = DEFAULT_ROBOT,
+        sensing: str = DEFAULT_SENSING,
+        settings: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Look everything up; arguments as in `ServoEnv`.
+
+        Raises:
+            ConfigurationError: a name, setting or mismatch that cannot be used, or a plant that carries out one run
+                at a time.
+        """
+        self._resolved = resolve_environment(plant, task, mismatch, robot, sensing, settings)
+        if side_by_side_key(self._resolved) is None:
+            raise ConfigurationError(
+                f"plant {plant} carries out one run at a time: gymnasium.make_vec(..., vectorization_mode='async')"
+            )
+        self.num_envs = num_envs
+        single = ServoEnv(plant, task, mismatch, robot, sensing, settings)
+        single.close()
+        self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._many: Together | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats32, dict[str, Any]]:
+        """Begin a run in every lane.
+
+        Args:
+            seed: of the first lane, from which the others count on; None draws one for each.
+            options: none are known.
+
+        Returns:
+            What the policies see, (num_envs, k), and `seed`, (num_envs,).
+        """
+        super().reset(seed=seed)
+        count = self.num_envs
+        seeds = self.np_random.integers(SEEDS, size=count) if seed is None else seed + np.arange(count)
+        self.close_extras()
+        self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
+        self._view = View(many.bench.spec, many.loop.preview)
+        rows = many.loop.periods + 1 + many.loop.preview  # also those after the last period
+        period = many.bench.spec.period
+        self._desired = np.stack([each.scenario.reference.sampled(period, rows) for each in many.drawn])
+        self._k, self._ended = 0, False
+        self._lost = np.zeros(self.num_envs, dtype=np.intp)
+        self._action: FloatArray = np.zeros((self.num_envs, many.bench.spec.n))
+        self.observation: Observation = many.bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
+        return self._see(many), {"seed": seeds}
+
+    def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Hold an action in every lane for a period; see `ServoEnv.step`.
+
+        Args:
+            actions: (num_envs, n).
+
+        Raises:
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+        """
+        many = self._many
+        if many is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        if self._ended:
+            none = np.zeros(self.num_envs, dtype=np.bool_)
+            seen, info = self.reset()
+            return seen, np.zeros(self.num_envs), none, none.copy(), info
+        move = many.loop.camera_move
+        if move is not None and self._k == move.period:
+            many.bench.move_camera(move.X_BC)
+        self._action = np.asarray(actions, dtype=np.float64)
+        self.observation = many.bench.step(Command(self._view.command(self._action)))
+        self._lost = np.where(self.observation.feature_valid, 0, self._lost + 1)
+        self._k += 1
+        failed = self._lost >= many.loop.lost_after_periods
+        failed[list(many.bench.faults)] = True
+        error = self._view.error(many.bench.truth(), self._desired[:, self._k])
+        over = self._k >= many.loop.periods
+        self._ended = over or bool(failed.any())
+        period = self._view.spec.period
+        periods = np.where(failed, many.loop.periods - self._k + 1, 1)
+        info = {"time": self._k * period, "error": error}
+        return self._see(many), -error * periods * period, failed, ~failed & self._ended, info
+
+    def _see(self, many: Together) -> Floats32:
+        rows = self._desired[:, self._k : self._k + 1 + many.loop.preview]
+        return self._view.see(self.observation, rows, self._action)
+
+    def close_extras(self, **_options: Any) -> None:  # noqa: ANN401 - Gymnasium's
+        """Free the plant."""
+        if self._many is not None:
+            self._many.bench.close()
+            self._many = None

@@ -1,0 +1,133 @@
+"""The environment of Gymnasium: what its checker says, and that episodes are runs of the bench, to the bit."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from kit.documents import blocks
+from servobench.harness.batch.api import run
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.gym import ENVIRONMENT
+from servobench.harness.gym.environment import ServoEnv
+from servobench.harness.gym.vector import ServoVectorEnv
+
+
+def test_gymnasium_finds_nothing_to_warn_of():
+    env = gymnasium.make(ENVIRONMENT)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+
+
+@pytest.mark.parametrize("sensing", ["position", "pixel:hand"])
+def test_an_episode_under_the_commands_of_a_run_is_that_run(sensing):
+    ran = run("ukf_mfac", task="random", mismatch="moderate+camera_move=5deg", sensing=sensing, seed=3)
+    steps = ran.steps
+    env = ServoEnv(task="random", mismatch="moderate+camera_move=5deg", sensing=sensing)
+    _, info = env.reset(seed=3)
+    assert info["seed"] == 3
+    limit = 1.0  # [rad/s] of every joint of the UR5
+    commands = steps.filter(regex="^joint_velocity_command_").to_numpy()
+    features = steps.filter(regex="^feature_.*_(m|px)$").to_numpy()
+    scale, period = env.unwrapped.natural_size, 0.05
+    for k, command in enumerate(commands):
+        np.testing.assert_array_equal(env.observation.feature, features[k])
+        seen, reward, terminated, truncated, info = env.step(command / limit)
+        assert seen in env.observation_space
+        assert (terminated, truncated) == (False, k == len(commands) - 1)
+        if k + 1 < len(commands):
+            assert reward == pytest.approx(-steps["error_norm"][k + 1] / scale * period, rel=1e-12)
+    env.close()
+
+
+def test_lanes_are_single_episodes_to_the_bit_and_are_reset_together():
+    many = gymnasium.make_vec(ENVIRONMENT, num_envs=3, vectorization_mode="vector_entry_point", task="exp1")
+    singles = [ServoEnv(task="exp1") for _ in range(3)]
+    seen, info = many.reset(seed=5)
+    assert info["seed"].tolist() == [5, 6, 7]
+    alone = [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
+    np.testing.assert_array_equal(seen, alone)
+    generator = np.random.default_rng(0)
+    over = False
+    while not over:
+        actions = generator.uniform(-1.0, 1.0, (3, 6))
+        seen, rewards, terminated, truncated, _ = many.step(actions)
+        steps = [env.step(action) for env, action in zip(singles, actions, strict=True)]
+        np.testing.assert_array_equal(seen, [step[0] for step in steps])
+        np.testing.assert_array_equal(rewards, [step[1] for step in steps])
+        assert not terminated.any()
+        assert truncated.tolist() == [step[3] for step in steps]
+        over = truncated.all()
+    again, rewards, terminated, truncated, info = many.step(actions)
+    assert not np.any([rewards, terminated, truncated])
+    assert len(set(info["seed"].tolist()) | {5, 6, 7}) == 6
+    assert again.shape == seen.shape
+    many.close()
+
+
+def test_a_run_that_fails_terminates_and_is_charged_for_the_rest():
+    sections = {"kinematic": {"sensing": {"drop_probability": 0.999}}, "run": {"lost_after": 0.2}}
+    env = ServoEnv(task="exp1", settings=sections)
+    env.reset(seed=0)
+    terminated, k = False, 0
+    while not terminated:
+        _, reward, terminated, truncated, info = env.step(np.zeros(6))
+        k += 1
+    assert not truncated
+    assert "no valid feature for 4 periods" in info["reason"]
+    periods = round(-reward / (info["error"] * 0.05))
+    assert reward == pytest.approx(-info["error"] * 0.05 * periods)
+    assert periods > 50
+    many = ServoVectorEnv(2, task="exp1", settings=sections)
+    many.reset(seed=0)
+    ended = np.zeros(2, dtype=bool)
+    while not ended.any():
+        _, _, terminated, truncated, _ = many.step(np.zeros((2, 6)))
+        ended = terminated | truncated
+    assert ended.all()
+    assert terminated.any()
+    env.close(), many.close()
+
+
+def test_bad_environments_are_refused():
+    with pytest.raises(ConfigurationError, match="unknown plant"):
+        ServoEnv(plant="no such plant")
+    env = ServoEnv()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(6))
+    env.close()
+
+
+def test_version_0_still_gives_what_it_gave():
+    """A change of these figures is another environment: raise its version, so that results stay comparable."""
+    env = ServoEnv()
+    env.reset(seed=0)
+    rewards = [env.step(np.full(6, 0.1))[1] for _ in range(20)]
+    assert ENVIRONMENT.endswith("-v0")
+    np.testing.assert_allclose([rewards[0], sum(rewards)], [-0.028570258752639313, -0.5935999997431326], rtol=1e-9)
+    env.close()
+
+
+def test_the_policy_of_the_page_gives_the_same_run_as_a_controller_and_in_the_environment():
+    page = (Path(__file__).parents[2] / "docs" / "learning.md").read_text(encoding="utf-8")
+    episode, policy = blocks(page, "python")
+    spaces: dict[str, object] = {"__name__": "learned"}
+    exec(compile(episode, "learning.md", "exec"), spaces)
+    assert spaces["truncated"]
+    exec(compile(policy, "learning.md", "exec"), spaces)
+    kind = spaces["Learned"]
+    steps = run(kind, task="exp2", seed=2).steps
+    env = ServoEnv(task="exp2")
+    seen, _ = env.reset(seed=2)
+    weights = np.random.default_rng(0).normal(0.0, 0.05, (6, len(seen)))
+    for feature in steps.filter(regex="^feature_.*_m$").to_numpy()[:40]:
+        np.testing.assert_array_equal(env.observation.feature, feature)
+        seen, *_ = env.step(np.tanh(weights @ seen))
+    env.close()
