@@ -30,10 +30,11 @@ def rendering_engine() -> str:
 
 ENTRY = PlantEntry(
     name="bullet",
-    summary="PyBullet arm with dynamics; the ball is found in the rendered images of a depth camera",
+    summary="PyBullet arm with dynamics; ball or discs are found in the rendered images of its cameras",
     config=RenderedConfig,
     build=build_bullet,
     needs=("pybullet",),
     engine=rendering_engine,
     config_for=rendered_config,
+    any_sensing=True,
 )

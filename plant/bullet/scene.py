@@ -17,7 +17,8 @@ import numpy as np
 from servobench.plant.bullet.engine import pybullet
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.meshes import sphere_obj
-from servobench.plant.rendered.urdf import Box, arm_urdf, bench_files, boxes_urdf
+from servobench.plant.rendered.rig import Rig, arm_files
+from servobench.plant.rendered.urdf import Box, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
 from servobench.plant.robot.catalogue import UR5, find_robot
 
@@ -48,6 +49,7 @@ class BulletScene(Scene):
         window: bool,
         boxes: tuple[Box, ...] = (),
         robot: Robot | None = None,
+        rig: Rig | None = None,
     ) -> None:
         """Open a world and load the arm; see `OpenScene`.
 
@@ -61,7 +63,7 @@ class BulletScene(Scene):
         if self._client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
-            self._load(arm, boxes, robot or find_robot(UR5), scenery=scenery)
+            self._load(arm, boxes, robot or find_robot(UR5), rig, scenery=scenery)
             if window:
                 self._aim_window()
         except BaseException:
@@ -71,11 +73,11 @@ class BulletScene(Scene):
         self._joints = list(range(n))
         self._ball_link = n + 1
 
-    def _load(self, arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, *, scenery: bool) -> None:
+    def _load(self, arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, rig: Rig | None, *, scenery: bool) -> None:
         client = self._client
         # With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
-        files = {"arm.urdf": arm_urdf(arm, BALL_MESH, robot), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
+        files = {**arm_files(arm, BALL_MESH, robot, rig), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
         if scenery:
             files |= bench_files(robot.workspace.scale)
         if boxes:

@@ -16,12 +16,12 @@ from typing import Final
 import numpy as np
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import outer
+from servobench.plant.lanes import norm, outer
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.signals import BoolArray
 
 NEAR: Final = 0.02  # [m] least depth: a point behind it is not seen, and its features are those of this depth
-UNDISTORTING: Final = 10  # iterations; each of them shrinks what is left by about 2 k r²
+NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
 def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
     """Return the points that appear at given pixels, (..., c, p, 3) m: the inverse of `project` for known depths.
 
-    Radial distortion is undone by fixed-point iteration, as OpenCV does.
+    Where the distortion shows no point at all, it is one at the edge of what it shows.
 
     Args:
         pixels: (..., c, p, 2) [px].
@@ -90,12 +90,21 @@ def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
         optics: of the cameras.
     """
     bent = (pixels - optics.centre[..., None, :]) / optics.focal[..., None, None]
-    a = bent
-    for _ in range(UNDISTORTING if optics.distortion.any() else 0):
-        a = bent / (1.0 + optics.distortion[..., None] * np.vecdot(a, a))[..., None]
+    a = _undistorted(bent, optics.distortion[..., None]) if optics.distortion.any() else bent
     z = depth[..., None]
     across = a * z
     return np.concatenate([across, np.broadcast_to(z, (*across.shape[:-1], 1))], axis=-1)
+
+
+def _undistorted(bent: FloatArray, k: FloatArray) -> FloatArray:
+    """Return a, (..., c, p, 2), of which (1 + k r²) a = `bent`; Newton's method on r."""
+    wanted = norm(bent)
+    most = np.where(k < 0.0, 1.0 / np.sqrt(3.0 * np.maximum(-k, 1e-12)), np.inf)  # where r (1 + k r²) turns back
+    r = np.minimum(wanted, 0.9 * most)
+    for _ in range(NEWTON_STEPS):
+        slope = np.maximum(1.0 + 3.0 * k * r**2, 1e-3)
+        r = np.minimum(np.maximum(r - (r * (1.0 + k * r**2) - wanted) / slope, 0.0), most)
+    return np.asarray(bent * (r / np.maximum(wanted, 1e-12))[..., None])
 
 
 def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArray:

@@ -39,11 +39,12 @@ def rendering_engine() -> str:
 
 ENTRY = PlantEntry(
     name="mujoco",
-    summary="MuJoCo arm with dynamics; the ball is found in the rendered images of a depth camera",
+    summary="MuJoCo arm with dynamics; ball or discs are found in the rendered images of its cameras",
     config=RenderedConfig,
     build=build_mujoco,
     needs=("mujoco",),
     lacking=lacking,
     engine=rendering_engine,
     config_for=rendered_config,
+    any_sensing=True,
 )

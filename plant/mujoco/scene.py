@@ -19,13 +19,15 @@ from servobench.plant.mujoco.engine import mujoco, open_context
 from servobench.plant.mujoco.model import read_urdf
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.meshes import sphere_obj
-from servobench.plant.rendered.urdf import BALL_LINK, Box, arm_urdf, bench_files, boxes_urdf
+from servobench.plant.rendered.rig import arm_files
+from servobench.plant.rendered.urdf import BALL_LINK, Box, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
 from servobench.plant.robot.catalogue import UR5, find_robot
 
 if TYPE_CHECKING:
     from servobench.plant.checks import FloatArray
     from servobench.plant.rendered.detection import ByteArray
+    from servobench.plant.rendered.rig import Rig
     from servobench.plant.robot.arm import SerialArm
     from servobench.plant.robot.robot import Robot
 
@@ -48,6 +50,7 @@ class MujocoScene(Scene):
         window: bool,
         boxes: tuple[Box, ...] = (),
         robot: Robot | None = None,
+        rig: Rig | None = None,
     ) -> None:
         """Load the arm; see `OpenScene`.
 
@@ -57,7 +60,7 @@ class MujocoScene(Scene):
         """
         if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
             raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
-        self._model = _compile(arm, boxes, robot or find_robot(UR5), scenery=scenery)
+        self._model = _compile(arm, boxes, robot or find_robot(UR5), rig, scenery=scenery)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)  # places the light
         self._ball = self._model.body(BALL_LINK).id
@@ -133,10 +136,12 @@ class MujocoScene(Scene):
             self._gl = None
 
 
-def _compile(arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, *, scenery: bool) -> Any:  # noqa: ANN401
+def _compile(arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, rig: Rig | None, *, scenery: bool) -> Any:  # noqa: ANN401
     """Return the model of all that is drawn, an `MjModel`."""
-    spec = read_urdf(arm_urdf(arm, BALL_MESH, robot), {BALL_MESH: sphere_obj()})
-    rooms = []
+    ball = {BALL_MESH: sphere_obj()}
+    texts = arm_files(arm, BALL_MESH, robot, rig)
+    spec = read_urdf(texts["arm.urdf"], ball)
+    rooms = [("target", texts["target.urdf"], ball)] if "target.urdf" in texts else []
     if scenery:
         files = bench_files(robot.workspace.scale)
         rooms.append(("bench", files.pop("bench.urdf"), files))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -24,11 +25,13 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.robot.camera import IntArray, PinholeCamera
 
 ByteArray = npt.NDArray[np.uint8]
-COLOUR_MARGIN = 4  # [px] around all red, in which colour noise can matter
+HueRange: TypeAlias = tuple[tuple[int, int, int], tuple[int, int, int]]
+"""Lowest and highest hue, saturation and brightness of a colour, as OpenCV has them."""
+COLOUR_MARGIN = 4  # [px] around all of a colour, in which colour noise can matter
 
 # OpenCV reads the channels as blue, green, red. Fed with red, green, blue, red lands at hue 120 of 180 instead of at
 # both ends 0 and 180, and one range covers purplish and orange reds.
-RED_LOWER, RED_UPPER = (111, 120, 40), (129, 255, 255)
+RED_RANGE: HueRange = (111, 120, 40), (129, 255, 255)
 FULL_BOX = 0.6  # share of red pixels above which a box holds one patch; a disc fills π/4
 MIN_PIXELS = 16  # fewer pixels do not determine three coordinates under noise
 MIN_VISIBLE = 0.4  # share of the ball's disc that must be seen
@@ -84,37 +87,51 @@ def find_patch(rgb: ByteArray) -> Patch | None:
     Returns:
         The patch, or None where there is none, it is too small, or the image's border cuts it.
     """
-    mask = cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), RED_LOWER, RED_UPPER)
+    return largest_patch(np.asarray(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), *RED_RANGE), dtype=np.uint8))
+
+
+def largest_patch(mask: ByteArray) -> Patch | None:
+    """Return the largest connected part of a mask.
+
+    Args:
+        mask: (h, w), above 0 where pixels have the colour that is looked for.
+
+    Returns:
+        The patch, or None where there is none, it is too small, or the image's border cuts it.
+    """
     x, y, width, height = cv2.boundingRect(mask)
     if width * height < MIN_PIXELS:
         return None
-    # Only the box around all red is looked at. A full one holds one patch; the search for connected parts is slow.
-    red = mask[y : y + height, x : x + width] > 0
-    if np.count_nonzero(red) < FULL_BOX * width * height:
-        _, labels, statistics, _ = cv2.connectedComponentsWithStats(red.astype(np.uint8), connectivity=8)
-        red = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
-    rows, columns = np.nonzero(red)
+    # Only the box around all of the colour is looked at. A full one holds one patch; to search for parts is slow.
+    coloured = mask[y : y + height, x : x + width] > 0
+    if np.count_nonzero(coloured) < FULL_BOX * width * height:
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(coloured.astype(np.uint8), connectivity=8)
+        coloured = labels == 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+    rows, columns = np.nonzero(coloured)
     rows, columns = rows + y, columns + x
     image_height, image_width = mask.shape
     cut = rows[0] == 0 or rows[-1] == image_height - 1 or columns.min() == 0 or columns.max() == image_width - 1
     return None if cut or len(rows) < MIN_PIXELS else Patch(rows, columns)
 
 
-def add_colour_noise(rgb: ByteArray, deviation: float, generator: np.random.Generator) -> ByteArray:
-    """Return an image with white noise on each channel around all that is red; nothing is drawn elsewhere.
+def add_colour_noise(
+    rgb: ByteArray, deviation: float, generator: np.random.Generator, colour: HueRange = RED_RANGE
+) -> ByteArray:
+    """Return an image with white noise on each channel around all of a colour; nothing is drawn elsewhere.
 
-    Noise turns pixels of other things red by chance, but never as many together as the ball's, so only the box around
-    what is red without noise matters.
+    Noise gives pixels of other things this colour by chance, but never as many together as the mark's, so only the box
+    around what has it without noise matters.
 
     Args:
         rgb: (h, w, 3 or 4).
         deviation: standard deviation of the noise, of 255.
         generator: of the noise.
+        colour: around which there is noise; red by default.
 
     Returns:
-        A new image, or `rgb` itself where nothing is red.
+        A new image, or `rgb` itself where nothing has the colour.
     """
-    x, y, width, height = cv2.boundingRect(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), RED_LOWER, RED_UPPER))
+    x, y, width, height = cv2.boundingRect(cv2.inRange(cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV), *colour))
     if width * height < MIN_PIXELS:
         return rgb
     rows = slice(max(0, y - COLOUR_MARGIN), y + height + COLOUR_MARGIN)

@@ -19,6 +19,7 @@ from servobench.plant.robot.robot import Robot
 if TYPE_CHECKING:
     from servobench.plant.rendered.detection import ByteArray
     from servobench.plant.rendered.drives import DriveConfig
+    from servobench.plant.rendered.rig import Rig
 
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
@@ -47,7 +48,14 @@ class OpenScene(Protocol):
     """The constructor of an engine's scene."""
 
     def __call__(
-        self, arm: SerialArm, *, scenery: bool, window: bool, boxes: tuple[Box, ...] = (), robot: Robot | None = None
+        self,
+        arm: SerialArm,
+        *,
+        scenery: bool,
+        window: bool,
+        boxes: tuple[Box, ...] = (),
+        robot: Robot | None = None,
+        rig: Rig | None = None,
     ) -> Scene:
         """Open a world and load the arm.
 
@@ -57,6 +65,7 @@ class OpenScene(Protocol):
             window: whether to open the engine's window.
             boxes: what else is in the room.
             robot: by its maker's description, for the looks; None for the UR5.
+            rig: in place of the ball on the flange; None for the ball.
 
         Raises:
             ValueError: a robot with another number of joints, or a window is wanted where there is no display.

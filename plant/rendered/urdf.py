@@ -73,7 +73,7 @@ def arm_urdf(arm: SerialArm, ball_mesh: str, robot: Robot | None = None) -> str:
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    return text(_arm(arm, ball_mesh, robot or find_robot(UR5)))
+    return text(arm_tree(arm, ball_mesh, robot or find_robot(UR5)))
 
 
 def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot | None = None) -> str:
@@ -89,7 +89,7 @@ def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot 
         ValueError: the arm has another number of joints than the robot.
     """
     described = robot or find_robot(UR5)
-    tree = _arm(arm, "", described)
+    tree = arm_tree(arm, "", described)
     for link in tree.iter("link"):
         for visual in link.findall("visual"):
             if not shapes:
@@ -135,8 +135,8 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     return text(robot)
 
 
-def _arm(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
-    """Return the tree of `arm_urdf`."""
+def arm_tree(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
+    """Return the tree of `arm_urdf`; arguments and errors are its own."""
     own, ball_radius = described.links, described.workspace.ball_radius
     if arm.n != described.n:
         raise ValueError(f"arm must have {described.n} joints like the {described.title}, got {arm.n}")

@@ -1,34 +1,37 @@
-"""The world of a rendered plant: an arm with dynamics, seen by an RGB-D camera in whose image the ball is found.
+"""The world of a rendered plant: an arm with dynamics, seen by cameras in whose images the target is found.
 
 A physics engine (`servobench.plant.rendered.engine`) moves the arm under the drives of
 `servobench.plant.rendered.drives`, at 1 kHz, and renders it. Controllers see and command reported positions q, which
 are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link that meets another one, the table, the floor
-or an obstacle ends the run. The feature is the ball's centre as fitted to noisy depths; it is missing where the ball is
-hidden, out of sight or cut by the image's border. Delay, latency and lost frames are those of `servobench.plant.bench`.
+or an obstacle ends the run. What is measured, and when it is missing, is in `servobench.plant.rendered.ball_sight` for
+the ball in 3-D and in `servobench.plant.rendered.mark_sight` for other sensing set-ups. Delay, latency and lost frames
+are those of `servobench.plant.bench`.
 """
 
 from __future__ import annotations
 
-import copy
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from servobench.plant.bench import Bench, build_bench
 from servobench.plant.checks import FloatArray, as_vector, whole_steps
+from servobench.plant.eyes.model import EyeModel
 from servobench.plant.faults import Collision, PlantDiverged
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.contact import Contacts
-from servobench.plant.rendered.detection import ByteArray, Patch, add_colour_noise, draw_detection, find_ball
+from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Engine, Joints, Machine
+from servobench.plant.rendered.mark_sight import open_sight
+from servobench.plant.rendered.rig import Rig
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.seeds import named_generator
-from servobench.plant.signals import Truth
+from servobench.plant.signals import BoolArray, Truth
 from servobench.plant.world import World
 
 CONTACT_STEPS = 10  # physics steps between two looks for contact, 10 mm at 1 m/s; and at the end of a period
@@ -41,18 +44,18 @@ class RenderedState:
     Attributes:
         joints: angles, speeds and loops of the joints.
         periods: number of periods since the reset.
-        X_BC: (4, 4), pose of the camera.
-        noise: generators of the depth and the colour noise.
+        camera: (4, 4), pose of the first camera.
+        noise: of the sight.
     """
 
     joints: Joints
     periods: int
-    X_BC: FloatArray
-    noise: tuple[np.random.Generator, np.random.Generator]
+    camera: FloatArray
+    noise: Any
 
 
 class RenderedWorld(World):
-    """An arm with drives under a fixed RGB-D camera; y = centre of the ball it sees."""
+    """An arm with drives and its cameras."""
 
     def __init__(self, engine: Engine, config: RenderedConfig, setup: PlantSetup) -> None:
         """Open worlds of its own and load the arm.
@@ -61,7 +64,7 @@ class RenderedWorld(World):
             ValueError: a start of the wrong size, a period that physics steps do not divide, a list that does not
                 fit the joints, a gear ratio of 0, or a window without a display.
         """
-        model, start = setup.ball_robot()
+        model, start = setup.robot()
         self._config, self._model, arm = config, model, model.arm
         self.lag = config.lag
         self.spec = hand_eye_spec(model, setup.period, config.max_joint_speed, config.joint_range, setup.limits)
@@ -69,15 +72,15 @@ class RenderedWorld(World):
         self._steps = whole_steps(setup.period, PHYSICS_STEP)
         if not arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {arm.gear_ratio.tolist()}")
-        self._camera, self._depth_noise = config.camera(), config.noise()
-        self._X_BC = model.X_BC
+        self._camera = model.camera
         boxes, robot = config.boxes(), setup.nominal or find_robot(UR5)
-        self._ball_radius = robot.workspace.ball_radius
-        self._scene = engine.scene(arm, scenery=config.scenery, window=config.view, boxes=boxes, robot=robot)
+        rig = Rig.of(model, robot) if isinstance(model, EyeModel) else None
+        self._scene = engine.scene(arm, scenery=config.scenery, window=config.view, boxes=boxes, robot=robot, rig=rig)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
         ordered = np.minimum(*stops), np.maximum(*stops)
         angle = arm.joint_angle(self._start)
         try:
+            self._sight = open_sight(model, self._scene, config, robot)
             self._simulation = engine.simulation(Machine(arm, robot, boxes, config.drives, config.lag, angle, ordered))
         except BaseException:
             self._scene.close()
@@ -85,13 +88,13 @@ class RenderedWorld(World):
         self._contacts = Contacts(self._simulation.overlaps, arm, robot)
 
     def reset(self, seed: int) -> FloatArray:
-        """Go back to the start at rest; depth and colour noise get random streams of their own. See `World.reset`.
+        """Go back to the start at rest. See `World.reset`.
 
         Raises:
             Collision: the arm overlaps with itself or the room at the start.
         """
-        self._noise, self._colour_noise = named_generator(seed, "depth_noise"), named_generator(seed, "colour_noise")
-        self.move_camera(self._X_BC)
+        self._sight.reset(seed)
+        self.move_camera(self._camera)
         self._periods = 0
         angle = self._model.arm.joint_angle(self._start)
         self._joints = self._simulation.start(angle)
@@ -131,54 +134,39 @@ class RenderedWorld(World):
             raise Collision(f"{touching[0]} meets {touching[1]} at {seconds:.3f} s")
 
     def see(self) -> FloatArray | None:
-        """Return the ball's centre as the sensor sees it, or None; noise is drawn only where the ball's colour is."""
-        rgba, buffer = self._render()
-        deviation = self._config.colour_noise * self._config.sensing.noise_factor
-        if deviation > 0.0:
-            rgba = add_colour_noise(rgba, deviation, self._colour_noise)
-        found = find_ball(rgba, buffer, self._camera, self._ball_radius, self._sense)
-        if found is None:
-            return None
-        found.centre.setflags(write=False)
-        return found.centre
+        """Return the features as the cameras see them now, (m,); None if nothing is found."""
+        return self._sight.see(self._model, self._joint_position())
+
+    def visible(self) -> BoolArray | None:
+        """Return which features of what was seen last are measured, (m,); None for all of them."""
+        return self._sight.visible()
 
     def why_unseen(self) -> str:
-        """Return where the ball is and would appear."""
-        true = self._model.to_camera(self._scene.ball_position())
-        return (
-            f"the ball is not visible at the start {self._start.tolist()}: it is at {true.round(3).tolist()} m in "
-            f"the camera frame, column and row {self._camera.project(true).round(1).tolist()} of an image of "
-            f"{self._camera.width} x {self._camera.height}; it is hidden, out of sight, too small or cut "
-            "by the border"
-        )
+        """Return where the target is and would appear."""
+        return self._sight.why_unseen(self._model, self._joint_position())
 
     def save(self) -> RenderedState:
         """See `Plant.save`; measured: joints, detections and images continue with the same bits."""
-        return RenderedState(
-            self._joints, self._periods, self._model.X_BC, copy.deepcopy((self._noise, self._colour_noise))
-        )
+        return RenderedState(self._joints, self._periods, self._model.camera, self._sight.save())
 
     def restore(self, state: RenderedState) -> None:
         """See `Plant.restore`."""
         self._joints, self._periods = state.joints, state.periods
         self._scene.place(state.joints.angle)
-        self.move_camera(state.X_BC)
-        self._noise, self._colour_noise = copy.deepcopy(state.noise)
+        self.move_camera(state.camera)
+        self._sight.restore(state.noise)
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
-        self._model = replace(self._model, X_BC=X_BC)
+        self._model = self._model.with_camera(X_BC)
 
     def truth(self) -> Truth:
-        """Return the feature by the simulator's own ball, and the Jacobian of the true model at the present joints."""
-        feature = self._model.to_camera(self._scene.ball_position())
-        return Truth(feature, self._model.jacobian(self._joint_position()))
+        """Return true features and Jacobian at the present joints."""
+        return self._sight.truth(self._model, self._joint_position())
 
     def picture(self) -> ByteArray:
-        """Return what the camera sees now with the detected ball marked, (h, w, 3)."""
-        rgba, buffer = self._render()
-        found = find_ball(rgba, buffer, self._camera, self._ball_radius)
-        return draw_detection(rgba[..., :3], found, self._camera, self._ball_radius)
+        """Return what the cameras see now with what is found marked, (h, w, 3)."""
+        return self._sight.picture(self._model, self._joint_position())
 
     def close(self) -> None:
         """Leave the engine's worlds."""
@@ -199,12 +187,6 @@ class RenderedWorld(World):
         lower, upper, half = self.spec.joint_lower, self.spec.joint_upper, resolution / 2.0
         steps = np.where(q >= upper - half, upper, np.round(q / resolution) * resolution)
         return np.where(q <= lower + half, lower, steps)
-
-    def _render(self) -> tuple[ByteArray, FloatArray]:
-        return self._scene.render(self._camera, self._model.X_BC)
-
-    def _sense(self, depth: FloatArray, patch: Patch) -> FloatArray:
-        return self._depth_noise.apply(depth, (patch.rows, patch.columns), self._camera, self._noise)
 
     def _keep_pace(self) -> None:
         """Wait until the wall clock has come as far as the run; only with a window."""

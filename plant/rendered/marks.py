@@ -1,0 +1,146 @@
+"""Coloured marks, the ball or discs, in an image: which one is where, by nothing but its pixels.
+
+Colour tells marks apart, so none is taken for another. A mark is seen if its pixels fill an ellipse. With their mean μ
+and covariance Σ, the pixels x of a whole ellipse are those with
+
+    (x − μ)ᵀ Σ⁻¹ (x − μ) ≤ 4
+
+and a mark that something hides in part, that the border cuts or that touches another mark is not measured. A pixel at
+its edge counts by the share w that the mark has of it: how far its colour c is from grey towards the mark's paint e,
+
+    a = max(0, (c − c̄) · (e − ē)),        w = a / (largest a among its neighbours)
+
+The centre of a disc is the mean of its pixels. A sphere shows a little more of its outer side: its centre lies in the
+direction of Σ w r / |r|⁴ over the rays r = (x/z, y/z, 1) through its pixels, the mean direction over the solid angle
+that they cover, by the intrinsics that are planned.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from servobench.plant.checks import FloatArray
+from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, Patch, largest_patch
+from servobench.plant.rendered.urdf import RED
+from servobench.plant.rendered.urdf_elements import Colour
+from servobench.plant.robot.camera import IntArray, PinholeCamera
+
+
+class MarkColour(NamedTuple):
+    """The colour of a mark.
+
+    Attributes:
+        paint: red, green, blue and opacity.
+        hues: in which its pixels are, if OpenCV is fed with red, green, blue; no two overlap.
+    """
+
+    paint: Colour
+    hues: HueRange
+
+
+MARK_COLOURS: Final = (
+    MarkColour(RED, RED_RANGE),
+    MarkColour((0.90, 0.80, 0.05, 1.0), ((84, 120, 40), (102, 255, 255))),  # yellow
+    MarkColour((0.05, 0.75, 0.15, 1.0), ((46, 120, 40), (65, 255, 255))),  # green
+    MarkColour((0.85, 0.05, 0.80, 1.0), ((139, 120, 40), (157, 255, 255))),  # magenta
+)
+EDGE = 1.0  # [px] how far the outline of a whole mark may be from its ellipse
+MIN_HALF_AXIS = 1.5  # [px] of the ellipse of a mark
+NEIGHBOURS = np.ones((3, 3), dtype=np.uint8)
+ELLIPSE = 2.0  # standard deviations of a filled ellipse from its middle to its edge
+
+
+class Mark(NamedTuple):
+    """The pixels of a mark and their neighbours.
+
+    Attributes:
+        rows: (k,) [px].
+        columns: (k,) [px].
+        shares: (k,), of each of them that the mark has.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    shares: FloatArray
+
+
+def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | None]:
+    """Return the mark of each colour, or None where it is not wholly seen.
+
+    Args:
+        rgb: (h, w, 3 or 4).
+        colours: of the marks.
+    """
+    hsv = cv2.cvtColor(rgb, cv2.COLOR_BGR2HSV)
+    masks = [np.asarray(cv2.inRange(hsv, *colour.hues), dtype=np.uint8) for colour in colours]
+    found: list[Mark | None] = []
+    for number, mask in enumerate(masks):
+        patch = largest_patch(mask)
+        others = masks[:number] + masks[number + 1 :]
+        if patch is None or not fills_ellipse(patch) or _touches(patch, others):
+            found.append(None)
+        else:
+            found.append(_with_shares(patch, rgb, colours[number].paint))
+    return found
+
+
+def fills_ellipse(patch: Patch) -> bool:
+    """Return whether pixels are all that is in an ellipse and nothing beyond it, up to `EDGE`."""
+    x = np.stack([patch.columns, patch.rows], axis=-1).astype(np.float64)
+    middle = x.mean(axis=0)
+    sizes, axes = np.linalg.eigh(np.cov(x.T, bias=True))
+    half = ELLIPSE * np.sqrt(np.maximum(sizes, 0.0))
+    if half[0] < MIN_HALF_AXIS:
+        return False
+    lower = np.array([patch.columns.min(), patch.rows.min()])
+    width, height = np.array([patch.columns.max(), patch.rows.max()]) - lower + 1
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + lower
+    inner = (((grid - middle) @ axes / (half - EDGE).clip(0.1)) ** 2).sum(axis=-1) <= 1.0
+    outer = (((grid - middle) @ axes / (half + EDGE)) ** 2).sum(axis=-1) <= 1.0
+    filled = np.zeros((height, width), dtype=np.bool_)
+    filled[patch.rows - lower[1], patch.columns - lower[0]] = True
+    return bool((filled | ~inner).all() and (outer | ~filled).all())
+
+
+def _with_shares(patch: Patch, rgb: ByteArray, paint: Colour) -> Mark:
+    """Return the mark that a patch shows, with the share that it has of each pixel of the patch and beside it."""
+    top, left = patch.rows.min() - 1, patch.columns.min() - 1
+    box = rgb[top : patch.rows.max() + 2, left : patch.columns.max() + 2, :3].astype(np.float64)
+    towards = np.array(paint[:3]) - np.mean(paint[:3])
+    amount = np.maximum((box - box.mean(axis=-1, keepdims=True)) @ towards, 0.0)
+    near = np.zeros(amount.shape, dtype=np.uint8)
+    near[patch.rows - top, patch.columns - left] = 1
+    rows, columns = np.nonzero(cv2.dilate(near, NEIGHBOURS))
+    most = np.asarray(cv2.dilate(amount, NEIGHBOURS))[rows, columns]
+    return Mark(rows + top, columns + left, amount[rows, columns] / np.maximum(most, 1e-9))
+
+
+def disc_centre(mark: Mark, camera: PinholeCamera) -> FloatArray:
+    """Return where the middle of a disc appears, (2,) px from the image's upper left corner."""
+    return _in_image(mark.shares @ camera.rays(mark.columns, mark.rows), camera)
+
+
+def sphere_centre(mark: Mark, camera: PinholeCamera) -> FloatArray:
+    """Return where the centre of a sphere appears, (2,) px from the image's upper left corner."""
+    rays = camera.rays(mark.columns, mark.rows)
+    length2 = np.vecdot(rays, rays)
+    return _in_image((mark.shares / (length2 * length2)) @ rays, camera)
+
+
+def _in_image(direction: FloatArray, camera: PinholeCamera) -> FloatArray:
+    """Return where a direction (3,) appears, (2,) px."""
+    half = np.array([camera.width, camera.height]) / 2.0
+    return np.asarray(half + camera.focal * direction[:2] / direction[2])
+
+
+def _touches(patch: Patch, others: list[ByteArray]) -> bool:
+    """Return whether a pixel beside those of a patch, which the border does not cut, belongs to another mark."""
+    return any(
+        other[patch.rows + down, patch.columns + right].any()
+        for other in others
+        for down in (-1, 0, 1)
+        for right in (-1, 0, 1)
+    )

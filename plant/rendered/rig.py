@@ -1,0 +1,113 @@
+"""What a sensing set-up brings into a rendered room: a plate with coloured discs, a target in the world, cameras.
+
+A target of one point is the red ball, one of three or four points a plate with a disc for each of them. The plate is a
+cross of thin rods with a white pad behind each disc, so that it hides nothing and a disc stands out in every posture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.model import EyeModel
+from servobench.plant.rendered.marks import MARK_COLOURS
+from servobench.plant.rendered.urdf import BALL_LINK, BASE_PART, DARK_GREY, RED, arm_tree, arm_urdf
+from servobench.plant.rendered.urdf_elements import add_joint, add_link, draw_cylinder, draw_mesh, text
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.robot import Robot
+
+WHITE: Final = (0.97, 0.97, 0.97, 1.0)
+DISC_RADIUS: Final = 0.02  # [m] for a UR5
+PAD_RADIUS: Final = 0.035  # [m] of the white pad behind a disc, for a UR5
+LAYER: Final = 0.001  # [m] thickness of discs and pads, for a UR5
+ROD_RADIUS: Final = 0.004  # [m] for a UR5
+HOUSING: Final = (0.02, 0.06)  # [m] radius and length of a camera on the hand, for a UR5; too near to see itself
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Where target and cameras of a set-up are.
+
+    Attributes:
+        target: (p, 3) [m], in the flange frame, or with cameras on the hand in the base frame.
+        hand: (c, 4, 4), poses of the cameras in the flange frame; None where they are beside the arm and not drawn.
+        scale: of all lengths, over those of a UR5's bench.
+        ball_radius: [m].
+    """
+
+    target: FloatArray
+    hand: FloatArray | None
+    scale: float
+    ball_radius: float
+
+    @classmethod
+    def of(cls, model: EyeModel, robot: Robot) -> Rig | None:
+        """Return the rig of a set-up; None where it is the ball on the flange, which every arm carries.
+
+        Raises:
+            ValueError: a target that cannot be drawn.
+        """
+        on_hand = model.mount == "hand"
+        count = len(model.target)
+        if count == 1 and not on_hand:
+            return None
+        if count > len(MARK_COLOURS) or (count > 1 and not np.any(_normal(model.target))):
+            raise ValueError(
+                f"sensing {model.eye.name} has a target of {count} points, and what can be drawn is a ball, of one "
+                "point, or a plate with three or four discs that are not in line"
+            )
+        return cls(model.target, model.cameras if on_hand else None, robot.workspace.scale, robot.workspace.ball_radius)
+
+
+def arm_files(arm: SerialArm, ball_mesh: str, robot: Robot, rig: Rig | None) -> dict[str, str]:
+    """Return the files, text by name, of an arm with what is on it, `arm.urdf`, and of a target in the world, if any.
+
+    Args:
+        arm: the kinematics, mismatch included.
+        ball_mesh: name of a file beside them that holds a mesh of the unit sphere.
+        robot: by its maker's description.
+        rig: of the set-up; None for the ball on the flange.
+    """
+    if rig is None:
+        return {"arm.urdf": arm_urdf(arm, ball_mesh, robot)}
+    tree = arm_tree(arm, ball_mesh, robot)
+    (carried,) = (link for link in tree.iter("link") if link.get("name") == BALL_LINK)
+    for visual in carried.findall("visual"):
+        carried.remove(visual)
+    if rig.hand is None:
+        _draw_target(carried, rig, rig.target - arm.tool, ball_mesh)
+        return {"arm.urdf": text(tree)}
+    radius, length = rig.scale * np.array(HOUSING)
+    for pose in rig.hand:
+        lens = pose[:3, 3] - arm.tool
+        draw_cylinder(carried, DARK_GREY, lens - length * pose[:3, 2], lens, radius)
+    body = ET.Element("robot", name="target")
+    middle = rig.target.mean(axis=0)
+    add_link(body, "world", *BASE_PART)
+    _draw_target(add_link(body, "target", *BASE_PART), rig, rig.target - middle, ball_mesh)
+    add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
+    return {"arm.urdf": text(tree), "target.urdf": text(body)}
+
+
+def _draw_target(link: ET.Element, rig: Rig, points: FloatArray, ball_mesh: str) -> None:
+    """Draw ball or plate at points (p, 3) [m] of a link's frame."""
+    if len(points) == 1:
+        draw_mesh(link, RED, ball_mesh, rig.ball_radius)
+        return
+    scale = rig.scale
+    back, middle = LAYER * scale * _normal(points), points.mean(axis=0)
+    for point, colour in zip(points, MARK_COLOURS, strict=False):
+        draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
+        draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
+        draw_cylinder(link, DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
+
+
+def _normal(points: FloatArray) -> FloatArray:
+    """Return the unit normal of a plate, (3,), away from whoever sees its discs; zeros where there is none."""
+    normal = np.cross(points[1] - points[0], points[2] - points[0]) if len(points) > 2 else np.zeros(3)
+    length = np.linalg.norm(normal)
+    return np.asarray(normal / length if length > 1e-9 else np.zeros(3))

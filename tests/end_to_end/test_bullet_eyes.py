@@ -1,0 +1,125 @@
+"""Sensing set-ups in rendered images, against the closed form of `kinematic`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
+
+from kit.bullet import IDEAL
+from servobench.plant.bullet.bullet_plant import build_bullet
+from servobench.plant.bullet.scene import BulletScene
+from servobench.plant.eyes.eye import Eye
+from servobench.plant.eyes.registry import Sensing
+from servobench.plant.faults import FeatureLost
+from servobench.plant.plant import PlantSetup
+from servobench.plant.rendered.mark_sight import open_sight
+from servobench.plant.rendered.rig import Rig
+from servobench.plant.rendered.settings import rendered_config
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+from servobench.plant.signals import Command
+
+UR5 = find_robot("ur5")
+HOME = UR5.workspace.home
+MODERATE = Mismatch.parse("moderate")
+IN_PIXELS = ("pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand")
+
+
+def true_model(word, robot=UR5):
+    arm, sample = sample_mismatch(MODERATE, robot, 3)
+    return Sensing.parse(word).true(robot, arm, sample, MODERATE, 3)[0]
+
+
+@pytest.fixture
+def open_eye():
+    """A builder of noiseless plants under a sensing set-up, which are closed after the test."""
+    plants = []
+
+    def build(model, config=IDEAL, start=HOME):
+        plants.append(build_bullet(config, PlantSetup(model, start, 0.05, UR5)))
+        return plants[-1]
+
+    yield build
+    for plant in plants:
+        plant.close()
+
+
+@pytest.mark.parametrize("word", IN_PIXELS)
+def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word):
+    model, rng = true_model(word), np.random.default_rng(5)
+    scene = BulletScene(model.arm, scenery=False, window=False, robot=UR5, rig=Rig.of(model, UR5))
+    sight, errors, poses = open_sight(model, scene, IDEAL, UR5), [], 0
+    sight.reset(0)
+    while poses < 25:
+        q = rng.uniform(UR5.workspace.lower, UR5.workspace.upper)
+        true, _, in_view = model.look(q)
+        if not in_view.all():
+            continue
+        poses += 1
+        scene.place(model.arm.joint_angle(q))
+        found, seen = sight.see(model, q), sight.visible()
+        errors += [np.linalg.norm(each) for each in (found - true)[seen].reshape(-1, 2)]
+    scene.close()
+    assert len(errors) > 0.6 * poses * model.eye.m / 2
+    assert np.median(errors) <= 0.2
+    assert max(errors) < 5.0  # discs are 30 px apart or more
+
+
+@pytest.mark.parametrize("word", [*IN_PIXELS, "position:hand"])
+def test_a_plant_sees_its_target_from_the_start_and_follows_it(word, open_eye):
+    model = true_model(word)
+    plant = open_eye(model)
+    observation = plant.reset(0)
+    assert observation.feature_valid
+    for _ in range(4):
+        observation = plant.step(Command(np.full(6, 0.1)))
+    truth = plant.truth()
+    np.testing.assert_allclose(truth.feature, model.feature(observation.joint_position), atol=1e-9)
+    assert np.linalg.norm(observation.feature - truth.feature) < (0.003 if word == "position:hand" else 1.0)
+    assert plant.picture().shape == (240, 320 * model.eye.cameras, 3)
+
+
+def test_another_arm_carries_the_plate_at_its_own_scale():
+    panda, model = find_robot("panda"), true_model("plate", find_robot("panda"))
+    plant = build_bullet(rendered_config(panda), PlantSetup(model, panda.workspace.home, 0.05, panda))
+    assert plant.reset(0).feature_valid
+    plant.close()
+
+
+def test_a_hidden_disc_is_lost_alone_and_held(open_eye):
+    model = true_model("plate")
+    points = model.points(HOME)
+    towards = model.cameras[0][:3, 3] - points[2]
+    box = (*(points[2] + 0.1 * towards), 0.03, 0.03, 0.03)
+    plant = open_eye(model, replace(IDEAL, obstacles=(box,), room_contact=False))
+    with pytest.raises(FeatureLost, match="u3, v3 cannot be seen at the start"):
+        plant.reset(0)
+    sight = plant.world
+    np.testing.assert_array_equal(sight.visible(), [True] * 4 + [False] * 2 + [True] * 2)
+    assert np.isfinite(sight.see()).all()
+
+
+def test_a_saved_state_goes_on_with_the_same_bits(open_eye):
+    plant = open_eye(true_model("stereo"), replace(IDEAL, colour_noise=3.0))
+    plant.reset(4)
+    turn = Command(np.full(6, 0.2))
+    plant.step(turn)
+    state = plant.save()
+    first = [plant.step(turn).feature for _ in range(3)]
+    plant.restore(state)
+    np.testing.assert_array_equal(first, [plant.step(turn).feature for _ in range(3)])
+    assert np.std(np.subtract(first, [plant.step(turn).feature for _ in range(3)])) > 0.0
+
+
+def test_what_cannot_be_rendered_is_refused():
+    model = true_model("pixel")
+    with pytest.raises(ValueError, match="the images of pixel have 320 x 240 px and 60 deg"):
+        build_bullet(replace(IDEAL, width=640), PlantSetup(model, HOME, 0.05, UR5))
+    two = Eye("two", "", ("a", "b", "c", "d"), "px", model.eye.measure, target=((0.0,) * 3, (0.1, 0.0, 0.0)))
+    with pytest.raises(ValueError, match="a ball, of one point, or a plate with three or four discs"):
+        build_bullet(IDEAL, PlantSetup(replace(model, eye=two, target=np.array(two.target)), HOME, 0.05, UR5))
+    deep = replace(model.eye, name="deep", measure=lambda points, optics: optics.focal * points[..., 0, 0, :2])
+    with pytest.raises(ValueError, match="sensing deep needs depth, and the intrinsics"):
+        build_bullet(IDEAL, PlantSetup(replace(model, eye=deep), HOME, 0.05, UR5))
