@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
 
 RECORDED = {
-    "plant": "bullet",
     "controller": "rbfnn_mfac",
     "task": "circle",
     "mismatch": "moderate",
@@ -36,7 +35,12 @@ def record(
         Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
     ] = None,
     run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
-    plant: Annotated[str | None, _new("plant", completion.plants)] = None,
+    plant: Annotated[
+        str | None,
+        typer.Option(
+            help="New run: plant, default bullet, or mujoco without PyBullet.", autocompletion=completion.plants
+        ),
+    ] = None,
     controller: Annotated[str | None, _new("controller", completion.controllers)] = None,
     task: Annotated[str | None, _new("task", completion.tasks)] = None,
     mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None,
@@ -60,14 +64,12 @@ def record(
     They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
-    from servobench.harness.config.extras import check_installed
+    from servobench.harness.config.registry import engine_of, rendered_plant
     from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
-    from servobench.plant.bullet.bullet_plant import rendering_engine
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
-    check_installed(("pybullet",), "a film of the rendered arm")
     new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "robot": robot, "seed": seed}
     given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
@@ -78,9 +80,10 @@ def record(
         else:
             if run is not None:
                 raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+            shown_as = rendered_plant(plant)
             chosen = {name: value for name, value in new.items() if value is not None}
-            shown = _new_run(RECORDED | chosen, read_settings(config, set_ or []))
-        say(f"rendered by {rendering_engine()}")
+            shown = _new_run({"plant": shown_as, **RECORDED, **chosen}, read_settings(config, set_ or []))
+        say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
         paths = write_recording(
             stretch(shown, begin, length),
             (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"]),
@@ -94,6 +97,7 @@ def record(
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.replay import logged_run
     from servobench.plant.settings import suggest
@@ -107,12 +111,12 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
         raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
     row = {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
     configuration = results.read_manifest(folder).get("configuration", {})
-    return logged_run(row, results.load_steps(folder, [chosen]), configuration.get("bullet", {}))
+    return logged_run(row, results.load_steps(folder, [chosen]), configuration.get(rendered_plant(row["plant"]), {}))
 
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.config.registry import choose_controller, choose_plant
+    from servobench.harness.config.registry import choose_controller, choose_plant, rendered_plant
     from servobench.harness.config.settings import ConfigurationError, flatten
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
@@ -130,4 +134,5 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
         raise ConfigurationError(f"seed must not be negative, got {request.seed}")
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
-    return logged_run(result.row, result.steps, flatten(settings.resolve("bullet", RenderedConfig())))
+    shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))
+    return logged_run(result.row, result.steps, shown_as)

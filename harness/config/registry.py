@@ -205,6 +205,18 @@ def default_plant() -> tuple[str, str]:
     return UNRENDERED, missing[RENDERED[has_no_wheel()]]
 
 
+def rendered_plant(named: str | None = None) -> str:
+    """Return the plant whose engine shows runs of the plant `named`: itself if it renders, or else one that is there.
+
+    Raises:
+        ConfigurationError: the engine is missing, or all of them are; the message says what to install.
+    """
+    name, why = (named, "") if named is not None and named in RENDERED else default_plant()
+    if name == UNRENDERED:
+        raise ConfigurationError(why)
+    return installed_plant(name).name
+
+
 def find_controller(name: str) -> ControllerEntry:
     """Return the controller called `name`, or the one composed for a name like `mfac+rls` (law + estimator).
 

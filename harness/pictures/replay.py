@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from servobench.harness.config.registry import rendered_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
@@ -31,7 +32,7 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_seed
 
 if TYPE_CHECKING:
-    from servobench.plant.bullet.scene import BulletScene
+    from servobench.plant.rendered.engine import OpenScene
 
 JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
 EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame of a UR5: from the front right, down to it
@@ -107,7 +108,7 @@ def logged_run(row: dict[str, Any], steps: pd.DataFrame | None, settings: dict[s
     try:
         config = RenderedConfig(**{name: value for name, value in settings.items() if name in known})
     except (ValueError, TypeError) as error:
-        raise ConfigurationError(f"run {run_id}: settings of bullet in the manifest: {error}") from error
+        raise ConfigurationError(f"run {run_id}: settings of the camera in the manifest: {error}") from error
     q, ball = steps[names].to_numpy(dtype=np.float64), track.vectors("true_feature_")
     moved_from = len(q) if moved is None else _first_seen_by(moved, model, q, ball)
 
@@ -153,10 +154,9 @@ class Replay:
             run: what to show.
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
-        from servobench.plant.bullet.scene import BulletScene  # noqa: PLC0415 - PyBullet loads slowly
-
         self._run, self._fineness, scale = run, fineness, run.robot.workspace.scale
-        self._scene: BulletScene = BulletScene(run.model.arm, scenery=True, window=False, robot=run.robot)
+        open_scene = _scene_of(rendered_plant(str(run.track.row["plant"])))
+        self._scene = open_scene(run.model.arm, scenery=True, window=False, robot=run.robot)
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]
@@ -212,6 +212,17 @@ class Replay:
                 cv2.line(layer, corners[i].tolist(), corners[i + 1].tolist(), trail.colour, width, cv2.LINE_AA, 4)
             if wanted:
                 cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
+
+
+def _scene_of(plant: str) -> OpenScene:
+    """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
+    if plant == "mujoco":
+        from servobench.plant.mujoco.scene import MujocoScene  # noqa: PLC0415
+
+        return MujocoScene
+    from servobench.plant.bullet.scene import BulletScene  # noqa: PLC0415
+
+    return BulletScene
 
 
 def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:

@@ -67,7 +67,6 @@ def test_without_any_extra_a_run_works_and_everything_can_be_listed(tmp_path):
             ("record", "--plant", "kinematic", "--set", "circle.laps=1"),
             marks=NEEDS_BULLET,
         ),
-        ("pybullet", "bullet", ("record", "--plant", "kinematic")),
         ("pybullet", "bullet", ("run", "--plant", "bullet")),
         ("pybullet", "bullet", ("compare", "--plants", "kinematic,bullet")),
         ("mujoco", "mujoco", ("run", "--plant", "mujoco")),
@@ -81,6 +80,14 @@ def test_a_missing_extra_is_one_line_that_says_what_to_install(tmp_path, module,
     assert done.stderr.startswith("servobench: ")
     assert done.stderr.count("\n") == 1
     assert f" needs {module}: pip install 'servobench[{extra}]'" in done.stderr
+
+
+def test_without_an_engine_no_film_is_made_and_a_line_says_what_to_install(tmp_path):
+    done = servobench_without(("pybullet", "mujoco"), ("record", "--plant", "kinematic"), tmp_path)
+    extra, module = ("mujoco", "mujoco") if extras.has_no_wheel() else ("bullet", "pybullet")
+    assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
+    assert done.stderr.startswith(f"servobench: plant '{extra}' needs {module}: pip install 'servobench[{extra}]'")
+    assert done.stderr.count("\n") == 1
 
 
 def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and_says_why(tmp_path):

@@ -272,7 +272,7 @@ def test_runs_that_cannot_be_shown_are_refused(result):
         logged_run(row | {"mismatch_values": json.dumps(other)}, steps, {})
     with pytest.raises(ConfigurationError, match="'mild' is not known"):
         logged_run(row | {"mismatch": "mild"}, steps, {})
-    with pytest.raises(ConfigurationError, match="settings of bullet in the manifest: width must be"):
+    with pytest.raises(ConfigurationError, match="settings of the camera in the manifest: width must be"):
         logged_run(row, steps, {"width": -1})
 
 
