@@ -2,10 +2,11 @@
 
 Their settings are kept: gain 0.2 per second, 15 s, 20 Hz, 100 episodes a level, a first Jacobian that is right, and
 noise that is white, a mixture, bimodal, stable or uniform, of deviation, scale or width 1 px, displaced by 20 px. What
-differs: uniform noise is centred; the arm, the moves, and the feature, which is that of a set-up in `SETUPS`, with a
-size for 1 px. Their measures are of the error of the features over time; here it is the RMS error over the run, of the
-true feature, over that of a run with the same noise and the true Jacobian, so that neither the length of a move nor
-what the law does with the noise hides the filters.
+differs: uniform noise is centred; the moves; and in the first set-up of `SETUPS` the arm and the feature, with a size
+for 1 px. The second one has their UR10, the camera in its hand and four circles, in pixels. Their measures are of the
+error of the features over time; here it is the RMS error over the run, of the true feature, over that of a run with the
+same noise and the true Jacobian, so that neither the length of a move nor what the law does with the noise hides the
+filters.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -39,6 +41,8 @@ from servobench.harness.pictures.style import (
     figure_style,
 )
 from servobench.harness.run.ending import COMPLETED
+from servobench.plant.eyes.registry import Sensing
+from servobench.plant.robot.catalogue import find_robot
 
 LAW: Final = "pid"
 REFERENCE: Final = "true"
@@ -61,6 +65,9 @@ TITLES: Final = {
     "stable": "exponent α of stable noise",
 }
 SINGLE: Final = "white and uniform noise"
+PURPOSE: Final = (
+    "filters of the Jacobian under noise of five families, 100 episodes a level, as Leite and others did it"
+)
 GROUP: Final = 0.84  # width of the boxes of a level
 
 
@@ -69,18 +76,32 @@ class SetUp:
     """A sensing set-up in which the study is carried out.
 
     Attributes:
-        name: of the set-up, in the name of the study.
-        pixel: what 1 px of the original is, in the unit of the feature.
+        study: name of the study, of its first table and of its picture.
+        errors: name of its table of the Jacobian's errors.
+        pixel: what 1 px of the original is, in the unit of settings of noise.
         options: of the sweep, which choose it.
+        where: the set-up in words, after the purpose of the study.
     """
 
-    name: str
+    study: str
+    errors: str
     pixel: float
     options: Words = ()
+    where: str = ""
 
 
-POSITION: Final = SetUp("position", 0.001)
-SETUPS: Final = (POSITION,)
+POSITION: Final = SetUp("noise", "noise_jacobian", 0.001)
+UR10: Final = find_robot("ur10")
+FOUR_CIRCLES: Final = Sensing.parse("plate:hand")
+PLATE: Final = SetUp(
+    "noise_plate",
+    "noise_plate_jacobian",
+    1.0 / FOUR_CIRCLES.nominal(UR10).noise_unit,
+    ("--robot", UR10.name, "--sensing", str(FOUR_CIRCLES)),
+    ", on their arm and in pixels",
+)
+"""As in the original: a UR10, the camera in its hand, four circles, pixels."""
+SETUPS: Final = (POSITION, PLATE)
 
 
 class Measure(NamedTuple):
@@ -125,17 +146,17 @@ def ratios(folder: Path) -> dict[str, pd.DataFrame]:
     return found
 
 
-def tables(folder: Path) -> Mapping[str, pd.DataFrame]:
+def tables(setup: SetUp, folder: Path) -> Mapping[str, pd.DataFrame]:
     """Return median and 95th percentile of the ratio, and the median error of the Jacobian, a row a level."""
-    made: dict[str, list[dict[str, str]]] = {"noise": [], "noise_jacobian": []}
+    ratio_rows, error_rows = [], []
     for family, runs in ratios(folder).items():
         for level, own in runs.groupby("level"):
             place = {"noise": family, "level": f"{level:g} {own['unit'].iloc[0]}".strip() if LEVELS[family] else ""}
             cells = {name: own[own["estimator"] == name] for name in ESTIMATORS if name != REFERENCE}
-            made["noise"].append(place | {f"`{name}`": spread(each["ratio"]) for name, each in cells.items()})
+            ratio_rows.append(place | {f"`{name}`": spread(each["ratio"]) for name, each in cells.items()})
             errors = {f"`{name}`": f"{each['jacobian_error_mean'].median():.2f}" for name, each in cells.items()}
-            made["noise_jacobian"].append(place | errors)
-    return {name: pd.DataFrame(rows) for name, rows in made.items()}
+            error_rows.append(place | errors)
+    return {setup.study: pd.DataFrame(ratio_rows), setup.errors: pd.DataFrame(error_rows)}
 
 
 def spread(values: pd.Series) -> str:
@@ -144,11 +165,11 @@ def spread(values: pd.Series) -> str:
     return f"{median:.2f} ({high:.2f})".replace("inf", "∞")
 
 
-def pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
+def pictures(setup: SetUp, folder: Path) -> Iterator[tuple[str, bytes]]:
     """Yield the box plots."""
     stream = io.BytesIO()
     boxes(ratios(folder)).savefig(stream, format="png", dpi=140)
-    yield "pictures/noise.png", stream.getvalue()
+    yield f"pictures/{setup.study}.png", stream.getvalue()
 
 
 def boxes(runs: Mapping[str, pd.DataFrame]) -> Figure:
@@ -191,12 +212,12 @@ def draw_groups(axes: Axes, groups: Mapping[str, pd.DataFrame], shown: Mapping[s
 
 NOISE_STUDIES: Final = tuple(
     Study(
-        "noise" if setup.name == "position" else f"noise_{setup.name}",
-        "filters of the Jacobian under noise of five families, 100 episodes a level, as Leite and others did it",
+        setup.study,
+        f"{PURPOSE}{setup.where}",
         1,
         {family: family_sweep(setup, family) for family in LEVELS},
-        tables,
-        pictures,
+        partial(tables, setup),
+        partial(pictures, setup),
     )
     for setup in SETUPS
 )

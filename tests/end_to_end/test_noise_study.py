@@ -6,10 +6,12 @@ import io
 
 import numpy as np
 import pandas as pd
+import pytest
 from PIL import Image
 
 from page_studies import noise
-from page_studies.noise import ESTIMATORS, LEVELS, POSITION, SetUp, family_sweep, pictures, tables
+from page_studies.noise import ESTIMATORS, LEVELS, PLATE, POSITION, SetUp, family_sweep, pictures, tables
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import parse_magnitudes
 
 
@@ -30,15 +32,23 @@ def made_up(path):
 
 
 def test_a_set_up_brings_its_size_of_a_pixel_and_its_options():
-    words = family_sweep(SetUp("other", 0.5, ("--new", "word")), "stable")
+    words = family_sweep(SetUp("other", "other_errors", 0.5, ("--new", "word")), "stable")
     assert words[-2:] == ("--new", "word")
     assert {"kinematic.sensing.noise_offset=10", "kinematic.sensing.feature_noise=0.707107"} <= set(words)
     assert "kinematic.sensing.feature_noise=0.001" in family_sweep(POSITION, "white")
 
 
+def test_a_pixel_of_the_plate_is_one_of_its_cameras():
+    """Settings of noise are what metres are at the distance of the planned fixed camera."""
+    robot = find_robot("ur10")
+    distance = 1.3 * robot.workspace.scale
+    assert PLATE.pixel * 120.0 / np.tan(np.radians(30.0)) / distance == pytest.approx(1.0, rel=1e-6)
+
+
 def test_tables_are_of_ratios_to_the_true_jacobian_of_the_same_run(monkeypatch, tmp_path):
     monkeypatch.setattr(noise, "load_runs", made_up)
-    made = tables(tmp_path)
+    made = tables(POSITION, tmp_path)
+    assert list(tables(PLATE, tmp_path)) == ["noise_plate", "noise_plate_jacobian"]
     row = made["noise"].iloc[0]
     assert (row["noise"], row["level"]) == ("white", "")
     assert row["`constant`"] == "1.01 (1.01)"
@@ -49,7 +59,7 @@ def test_tables_are_of_ratios_to_the_true_jacobian_of_the_same_run(monkeypatch, 
 
 def test_the_picture_has_a_column_for_each_measure(monkeypatch, tmp_path):
     monkeypatch.setattr(noise, "load_runs", made_up)
-    ((name, content),) = pictures(tmp_path)
+    ((name, content),) = pictures(POSITION, tmp_path)
     assert name == "pictures/noise.png"
     assert len(content) < 300e3
     with Image.open(io.BytesIO(content)) as picture:
