@@ -96,11 +96,12 @@ def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
 
 
 def _variable(variable: Any) -> VariableInformation:  # noqa: ANN401 - as above
-    dimensions = [dimension.start for dimension in variable.dimensions or ()]
+    axes = variable.dimensions or ()
+    sizes = [each.start if each.start is not None else getattr(each.variable, "start", None) for each in axes]
     return VariableInformation(
         name=variable.name,
         type=variable.type,
-        shape=tuple(int(start) for start in dimensions if start is not None),
+        shape=tuple(int(size) for size in sizes if size is not None),
         causality=variable.causality or "local",
         variability=variable.variability or "continuous",
         unit=variable.unit or "",

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeAlias, TypeVar, cast, dataclass_transform, get_type_hints
 
 import numpy as np
+import numpy.typing as npt
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import AllowInfNan, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -62,10 +63,22 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
         raise PydanticCustomError("numbers", "numbers below 1e308") from error
 
 
+def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - what a file holds
+    if isinstance(value, np.ndarray) and value.dtype.kind in "bU":
+        return value
+    entries = value if isinstance(value, list | tuple) else [value]
+    for kind in (str, bool):
+        if entries and all(isinstance(entry, kind) for entry in entries):
+            return np.array(value)
+    return _as_numbers(value)
+
+
 Names: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(lambda name: (name,) if isinstance(name, str) else name)]
 """One name or several."""
 Numbers: TypeAlias = Annotated[FloatArray, BeforeValidator(_as_numbers)]
 """An array of numbers; in a file, a number or a list of numbers."""
+Values: TypeAlias = Annotated[npt.NDArray[Any], BeforeValidator(_as_values)]
+"""An array of numbers, of truth values or of texts; in a file, one of them or a list."""
 File: TypeAlias = Annotated[Path, BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)]
 """The path of a file."""
 

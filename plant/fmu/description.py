@@ -6,11 +6,13 @@ that one mapping serves both versions of a model.
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from math import prod
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Final
@@ -18,7 +20,7 @@ from typing import Any, Final
 from servobench.plant.fmu.archive import DESCRIPTION
 from servobench.plant.settings import suggest
 
-REAL_TYPES = ("Real", "Float64")
+REAL_TYPES: Final = ("Real", "Float64", "Float32")
 MAX_NUMBERS: Final = 1_000_000  # that a variable holds
 IDENTIFIER: Final = re.compile(
     r"(?!\.)[\w.+ -]{1,200}"
@@ -27,19 +29,23 @@ IDENTIFIER: Final = re.compile(
 
 @dataclass(frozen=True)
 class Variable:
-    """A real variable of an FMU.
+    """A variable of an FMU.
 
     Attributes:
         name: as in the description.
         reference: value reference.
-        size: how many numbers it holds.
-        causality: parameter, input, output, local or independent.
+        size: how many values it holds.
+        causality: parameter, structuralParameter, input, output, local or independent.
+        type: such as Real, Float32, Int64, Boolean or String.
+        dimensions: sizes of its axes: numbers, or names of structural parameters with their start values.
     """
 
     name: str
     reference: int
     size: int
     causality: str
+    type: str = "Real"
+    dimensions: tuple[tuple[str, int], ...] = ()
 
     def labels(self) -> list[str]:
         """Return a name for each of its numbers."""
@@ -59,8 +65,9 @@ class FmuDescription:
         can_save: states can be saved and restored.
         can_serialise: saved states can be turned into bytes.
         once_per_process: its library bears one instance only.
-        variables: the real ones, in order.
-        other_types: type by name of all others.
+        variables: all of them, in order.
+        needs_tool: it calls the tool that made it, which has to be installed.
+        internal_step: its own fixed step size, s, of which steps must be multiples; None for none.
     """
 
     path: Path
@@ -72,7 +79,8 @@ class FmuDescription:
     can_serialise: bool
     once_per_process: bool
     variables: tuple[Variable, ...]
-    other_types: Mapping[str, str]
+    needs_tool: bool = False
+    internal_step: float | None = None
 
     @cached_property
     def _by_name(self) -> dict[str, Variable]:
@@ -91,30 +99,40 @@ class FmuDescription:
             for name, members in families.items()
         }
 
-    def find(self, name: str, role: str) -> list[Variable]:
+    def find(self, name: str, role: str, types: Container[str] | None = REAL_TYPES) -> list[Variable]:
         """Return the variables that `name` stands for.
 
         Args:
             name: of a scalar, of an array, or of a family of scalars.
             role: what the mapping uses it for, for the message.
+            types: that may be used there; None for all.
 
         Raises:
-            ValueError: no such real variable; lists those there, with the nearest name.
+            ValueError: no such variable, which lists those there, with the nearest name; or one of another type.
         """
-        if name in self._by_name:
-            return [self._by_name[name]]
-        if name in self._families:
-            return self._families[name]
-        if name in self.other_types:
-            raise ValueError(
-                f"{role} names {name!r}, which is of type {self.other_types[name]}; wanted a real variable"
-            )
-        known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
-        raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}")
+        found = [self._by_name[name]] if name in self._by_name else self._families.get(name)
+        if found is None:
+            known = [*self._families, *(each.name for each in self.variables if "[" not in each.name)]
+            raise ValueError(f"{role} names {name!r}, which {self.path.name} does not have: {suggest(name, known)}")
+        for variable in found:
+            if types is not None and variable.type not in types:
+                raise ValueError(f"{role} names {name!r}, which is of type {variable.type}; wanted a real variable")
+        return found
 
     def select(self, names: Iterable[str], role: str) -> tuple[Variable, ...]:
-        """Return the variables that `names` stand for, in order."""
+        """Return the real variables that `names` stand for, in order."""
         return tuple(variable for name in names for variable in self.find(name, role))
+
+    def resized(self, sizes: Mapping[str, int]) -> FmuDescription:
+        """Return the description with other values of structural parameters, which give the sizes of arrays."""
+        if not sizes:
+            return self
+
+        def resize(variable: Variable) -> Variable:
+            axes = tuple((name, sizes.get(name, size)) for name, size in variable.dimensions)
+            return replace(variable, size=prod(size for _, size in axes), dimensions=axes) if axes else variable
+
+        return replace(self, variables=tuple(resize(variable) for variable in self.variables))
 
 
 def total_size(variables: Iterable[Variable]) -> int:
@@ -135,7 +153,6 @@ def read_description(path: Path, root: Path) -> FmuDescription:
     if interface is None:
         offered = "model exchange" if description.modelExchange is not None else "scheduled execution"
         raise ValueError(f"fmu file {path} offers {offered} only; wanted co-simulation")
-    reals = [each for each in description.modelVariables if each.type in REAL_TYPES]
     return FmuDescription(
         path=path,
         version=int(version[0]),
@@ -145,9 +162,20 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         can_save=bool(interface.canGetAndSetFMUstate),
         can_serialise=bool(interface.canSerializeFMUstate),
         once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
-        variables=tuple(_variable(each, path) for each in reals),
-        other_types={v.name: v.type for v in description.modelVariables if v.type not in REAL_TYPES},
+        variables=tuple(_variable(each, path) for each in description.modelVariables),
+        needs_tool=bool(interface.needsExecutionTool),
+        internal_step=_internal_step(root),
     )
+
+
+def _internal_step(root: Path) -> float | None:
+    """Return the fixed step size of the FMU's own solver, which fmpy does not read."""
+    element = ET.parse(root / DESCRIPTION).getroot().find("CoSimulation")
+    try:
+        step = float("nan" if element is None else element.get("fixedInternalStepSize", "nan"))
+    except ValueError:
+        return None
+    return step if 0.0 < step < math.inf else None
 
 
 def read_exchange(path: Path, root: Path) -> None:
@@ -214,24 +242,30 @@ def _variable(variable: Any, path: Path) -> Variable:  # noqa: ANN401 - fmpy's v
             f"fmu file {path} has a variable {_line(repr(name))} with the value reference {_line(reference)}; wanted a "
             "name and 32 bits"
         )
-    return Variable(name, reference, _size(variable, path), variable.causality or "local")
+    axes = tuple(_axis(dimension, variable, path) for dimension in variable.dimensions or ())
+    size = prod(each for _, each in axes)
+    if size > MAX_NUMBERS:
+        raise _bad_size(variable, path, size)
+    return Variable(name, reference, size, variable.causality or "local", variable.type, axes)
 
 
-def _size(variable: Any, path: Path) -> int:  # noqa: ANN401 - as above
-    size = 1
-    for dimension in variable.dimensions or ():
-        start = dimension.start if dimension.start is not None else getattr(dimension.variable, "start", None)
-        if start is None:
-            raise ValueError(
-                f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value"
-            )
-        try:
-            size *= int(start)
-        except (TypeError, ValueError):
-            size = -1
-        if not 0 <= size <= MAX_NUMBERS:
-            raise ValueError(
-                f"fmu file {path}: the size of {_line(repr(variable.name))} must be a whole number up to "
-                f"{MAX_NUMBERS:,}, got {_line(start)}"
-            )
-    return size
+def _axis(dimension: Any, variable: Any, path: Path) -> tuple[str, int]:  # noqa: ANN401 - as above
+    """Return the structural parameter that gives the size of an axis, or no name, and its size."""
+    named = dimension.start is None
+    start = getattr(dimension.variable, "start", None) if named else dimension.start
+    if start is None:
+        raise ValueError(f"fmu file {path}: the size of {variable.name!r} is given by a variable without a start value")
+    try:
+        size = int(start)
+    except (TypeError, ValueError):
+        size = -1
+    if not 0 <= size <= MAX_NUMBERS:
+        raise _bad_size(variable, path, start)
+    return (str(dimension.variable.name) if named else "", size)
+
+
+def _bad_size(variable: Any, path: Path, came: object) -> ValueError:  # noqa: ANN401 - as above
+    return ValueError(
+        f"fmu file {path}: the size of {_line(repr(variable.name))} must be a whole number up to {MAX_NUMBERS:,}, got "
+        f"{_line(came)}"
+    )

@@ -11,12 +11,13 @@ import ctypes
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
@@ -26,6 +27,7 @@ from servobench.plant.fmu.library import condemn, is_condemned, load_library, un
 logger = logging.getLogger("servobench.fmu")
 
 Call: TypeAlias = Callable[[], None]
+Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # of numbers: the word in the names of functions, the type in memory
 RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
 STATUS_WORDS = ("ok", "warning", "discard", "error", "fatal", "pending")
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
@@ -39,12 +41,13 @@ class Port:
 
     Attributes:
         values: (..., size), the buffer.
+        members: the variables themselves.
         variables: value references and their number, for C.
     """
 
     def __init__(self, variables: Sequence[Variable], lead: tuple[int, ...] = ()) -> None:
         """Prepare the buffer, whose leading axis is `lead`."""
-        self._variables = variables
+        self.members = tuple(variables)
         self.values: FloatArray = np.zeros((*lead, total_size(variables)))
         self._address = self.values.ctypes.data
         count = len(variables)
@@ -54,7 +57,7 @@ class Port:
     @property
     def labels(self) -> tuple[str, ...]:
         """A name for each number of a row, for messages."""
-        return tuple(label for variable in self._variables for label in variable.labels())
+        return tuple(label for variable in self.members for label in variable.labels())
 
     @property
     def summary(self) -> str:
@@ -100,6 +103,7 @@ class Instance(ABC):
     Attributes:
         prefix: of the names of all functions in the library.
         real: what the functions that read and write real numbers call these.
+        kinds: what they call variables of each numeric type, and how these lie in memory.
         state: what the functions for states call these.
         deserialise: the verb of the function that reads a state from bytes.
         early: word for a step that ended early.
@@ -107,6 +111,7 @@ class Instance(ABC):
 
     prefix: ClassVar[str]
     real: ClassVar[str]
+    kinds: ClassVar[Kinds]
     state: ClassVar[str]
     deserialise: ClassVar[str]
     early: ClassVar[str]
@@ -209,13 +214,57 @@ class Instance(ABC):
         self._begun = False
 
     @abstractmethod
-    def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
-        """Return the arguments that pass a row of a port's buffer to C."""
+    def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
+        """Return the arguments that pass a buffer of `size` values to C."""
 
     def access(self, verb: Literal["Get", "Set"], port: Port, row: int = 0) -> RawCall:
         """Return a function that reads or writes the port's variables by a row of its buffer, for the inner loop."""
-        function = self.function(f"{verb}{self.real}")
-        return partial(function, self._component, *port.variables, *self._buffer(port, row))
+        if all(self.kinds[variable.type] == self.kinds[self.real] for variable in port.members):
+            function = self.function(f"{verb}{self.real}")
+            return partial(function, self._component, *port.variables, *self._row(port, row))
+        values = port.values.reshape(-1, port.values.shape[-1])[row]
+        ends = np.cumsum([variable.size for variable in port.members]).tolist()
+        calls = [
+            self._converted(verb, variable, values[end - variable.size : end])
+            for variable, end in zip(port.members, ends, strict=True)
+        ]
+        return lambda: max(call() for call in calls)
+
+    def _row(self, port: Port, row: int) -> tuple[Any, ...]:
+        return self._buffer(port.pointer(row), port.values.shape[-1])
+
+    def _converted(self, verb: Literal["Get", "Set"], variable: Variable, values: FloatArray) -> RawCall:
+        """Return a function that reads or writes one variable of any numeric type by `values`."""
+        word, kind = self.kinds[variable.type]
+        buffer: npt.NDArray[Any] = np.zeros(variable.size, dtype=kind)
+        reference = (ctypes.c_uint32 * 1)(variable.reference)
+        place = self._buffer(ctypes.c_void_p(buffer.ctypes.data), variable.size)
+        call = partial(self.function(f"{verb}{word}"), self._component, reference, ctypes.c_size_t(1), *place)
+
+        def convert() -> int:
+            if verb == "Set":
+                buffer[:] = values
+            status: int = call()
+            if verb == "Get":
+                values[:] = buffer
+            return status
+
+        return convert
+
+    def set_texts(self, variables: Sequence[Variable], texts: Sequence[str]) -> None:
+        """Give values to variables of text."""
+        references = (ctypes.c_uint32 * len(variables))(*(variable.reference for variable in variables))
+        values = (ctypes.c_char_p * len(texts))(*(text.encode() for text in texts))
+        place = self._buffer(ctypes.cast(values, ctypes.c_void_p), len(texts))
+        self.call("SetString", references, ctypes.c_size_t(len(variables)), *place)
+
+    def configure(self, port: Port) -> None:
+        """Set structural parameters, which give the sizes of arrays, before `start`.
+
+        Raises:
+            ValueError: this version of FMI has none.
+        """
+        raise ValueError(f"{self.description.path.name} has no structural parameters")
 
     def reader(self, port: Port) -> Call:
         """Return a function that reads the port's variables into its buffer and checks the status."""
@@ -235,7 +284,7 @@ class Instance(ABC):
 
     def derivative(self, unknowns: Port, knowns: Port) -> None:
         """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
-        buffers = (*self._buffer(knowns, 0), *self._buffer(unknowns, 0))
+        buffers = (*self._row(knowns, 0), *self._row(unknowns, 0))
         self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
 
     def save(self) -> ctypes.c_void_p:

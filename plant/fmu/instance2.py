@@ -5,9 +5,11 @@ from __future__ import annotations
 import ctypes
 import weakref
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
-from servobench.plant.fmu.instance import DISCARD, Instance, MessageLog, Port, RawCall
+import numpy as np
+
+from servobench.plant.fmu.instance import DISCARD, OK, Instance, Kinds, MessageLog, RawCall
 
 CO_SIMULATION = 1
 LAST_SUCCESSFUL_TIME = 2
@@ -43,6 +45,12 @@ class Instance2(Instance):
     """One instance of an FMI 2.0 FMU."""
 
     prefix, real, state, deserialise, early = "fmi2", "Real", "FMUstate", "DeSerialize", "discard"
+    kinds: ClassVar[Kinds] = {
+        "Real": ("Real", np.float64),
+        "Integer": ("Integer", np.int32),
+        "Enumeration": ("Integer", np.int32),
+        "Boolean": ("Boolean", np.int32),
+    }
 
     def _instantiate(self) -> int | None:
         self._callbacks = _callbacks(self.log)
@@ -75,11 +83,13 @@ class Instance2(Instance):
             self.check("fmi2DoStep", status)
             return None
         reached = ctypes.c_double()
-        self.call("GetRealStatus", ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached))
+        asked = ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
+        if self.function("GetRealStatus")(self._component, *asked) != OK:
+            raise self.log.failure("fmi2DoStep", "discard and not how far it came")
         return reached.value
 
-    def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
-        return (port.pointer(row),)
+    def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
+        return (pointer,)
 
 
 def _callbacks(log: MessageLog) -> _Callbacks:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import ctypes
 import os
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
+
+import numpy as np
 
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.instance import OK, WARNING, Instance, Port, RawCall
+from servobench.plant.fmu.instance import OK, WARNING, Instance, Kinds, Port, RawCall
 
 LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 
@@ -17,6 +19,17 @@ class Instance3(Instance):
     """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
 
     prefix, real, state, deserialise, early = "fmi3", "Float64", "FMUState", "Deserialize", "early"
+    kinds: ClassVar[Kinds] = {
+        "Float64": ("Float64", np.float64),
+        "Float32": ("Float32", np.float32),
+        **{
+            f"{sign}Int{bits}": (f"{sign}Int{bits}", f"{sign}int{bits}".lower())
+            for sign in ("", "U")
+            for bits in (8, 16, 32, 64)
+        },
+        "Enumeration": ("Int64", np.int64),
+        "Boolean": ("Boolean", np.bool_),
+    }
 
     def _instantiate(self) -> int | None:
         log = self.log
@@ -63,5 +76,11 @@ class Instance3(Instance):
             raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
         return self._last_time.value if self._early.value else None
 
-    def _buffer(self, port: Port, row: int) -> tuple[Any, ...]:
-        return port.pointer(row), ctypes.c_size_t(port.values.shape[-1])
+    def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
+        return pointer, ctypes.c_size_t(size)
+
+    def configure(self, port: Port) -> None:
+        """See `Instance.configure`."""
+        self.call("EnterConfigurationMode")
+        self.writer(port)()
+        self.call("ExitConfigurationMode")

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 from annotated_types import MinLen
@@ -22,8 +22,10 @@ from annotated_types import MinLen
 from servobench.plant.checks import FloatArray
 from servobench.plant.files import read_toml
 from servobench.plant.fmu.description import FmuDescription, total_size
-from servobench.plant.settings import File, Names, Numbers, Positive, nested, override, settings
+from servobench.plant.settings import File, Names, Numbers, Positive, Values, nested, override, settings
 from servobench.plant.signals import PlantSpec
+
+STEP_TOLERANCE: Final = 1e-6  # share of a step by which it may differ from a multiple of the FMU's own
 
 
 @settings
@@ -98,8 +100,8 @@ class FmuMapping:
     """Two parameters that take the camera's position, m, and roll, pitch and yaw, rad, in the base frame."""
     start: Numbers | None = None
     """(n,) [rad] at time 0, for an FMU with a home or without joints; None for the FMU's own."""
-    parameters: Mapping[str, Numbers] = nested(dict)
-    """Values by name, set before every run."""
+    parameters: Mapping[str, Values] = nested(dict)
+    """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
     nominal: Mapping[str, Numbers] | None = None
     """What controllers believe where it differs; needs directional derivatives. None: there is no nominal model."""
     period: Positive | None = None
@@ -133,8 +135,14 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     """Return the spec of a plant whose variables `mapping` names.
 
     Raises:
-        ValueError: a name that the FMU does not have, or sizes that do not fit together.
+        ValueError: a name that the FMU does not have, sizes that do not fit together, or a step that it cannot take.
     """
+    step, own = mapping.period or period, description.internal_step
+    if own is not None and abs(round(step / own) * own - step) > STEP_TOLERANCE * step:
+        raise ValueError(
+            f"{description.path.name} takes steps of multiples of {own:g} s only (fixedInternalStepSize), so period "
+            f"must be one, got {step:g} s"
+        )
     inputs, features = description.select(mapping.inputs, "inputs"), description.select(mapping.features, "features")
     for variable in inputs:
         if variable.causality != "input":

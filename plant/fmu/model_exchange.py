@@ -91,7 +91,9 @@ def mapped_model(
         raise ValueError("truth.states must name the states of the FMU that are the joint positions, got none")
     values: dict[str, float] = {}
     for name, value in {**mapping.parameters, **(parameters or {})}.items():
-        variables = description.find(name, "parameters")
+        variables = description.find(name, "parameters", None)
+        if variables[0].type == "String":
+            raise ValueError(f"parameter {name!r} is a text, which CasADi cannot give to the FMU's model")
         if np.shape(value) not in ((), (len(variables),)):
             raise ValueError(f"parameter {name!r} must have {len(variables)} values, got {np.size(value)}")
         scalars = np.broadcast_to(value, (len(variables),)).tolist()

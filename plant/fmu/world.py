@@ -7,7 +7,7 @@ FMU is stepped with its own period, which divides that of the world; commands ar
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -18,11 +18,12 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray, as_array, is_finite, whole_steps
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.description import read_description
-from servobench.plant.fmu.instance import Instance, Port
+from servobench.plant.fmu.description import Variable, read_description
+from servobench.plant.fmu.instance import Instance, Port, logger
 from servobench.plant.fmu.instances import Instances, Lane
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec
 from servobench.plant.fmu.model_exchange import mapped_model
+from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.plant import TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.seeds import Seeds
@@ -68,7 +69,10 @@ class FmuWorld(World):
         self._own_step, self._period = mapping.period or period, period
         self._mapping, self.lag = mapping, lag
         root = extract_fmu(mapping.file)
-        self.description = read_description(mapping.file, root)
+        description = read_description(mapping.file, root)
+        self.description = description.resized(structural_sizes(description, mapping.parameters))
+        if description.needs_tool:
+            logger.warning("%s calls the tool that made it, which has to be installed here", mapping.file.name)
         self.spec = mapping_spec(mapping, self.description, period)
         self._has_start = start is not None
         start = np.zeros(self.spec.n) if start is None else start
@@ -98,9 +102,11 @@ class FmuWorld(World):
         self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
         self._split = self._result.values.shape[-1] - self.spec.m
         self._now = ctypes.c_double()
-        self._parameters = [self._parameter(name, values) for name, values in mapping.parameters.items()]
-        if mapping.home is not None and self._has_start:
-            self._parameters.append(self._parameter(mapping.home, self._start))
+        setters = {
+            name: (variables[0], setter(variables, name, value, self.lead)) for name, variables, value in self._values()
+        }
+        sizes_first = sorted(setters.values(), key=lambda pair: pair[0].causality != STRUCTURAL)
+        self._setters = [act for _, act in sizes_first]
         self._camera = [self._port("camera", (name,)) for name in mapping.camera or ()]
         self._true = mapped_model(mapping, self.description) if truth.states else None
         nominal = mapping.nominal
@@ -119,12 +125,13 @@ class FmuWorld(World):
     def _port(self, role: str, names: Names) -> Port:
         return Port(self.description.select(names, role), self.lead)
 
-    def _parameter(self, name: str, values: FloatArray) -> Port:
-        port = self._port("parameters", (name,))
-        if np.shape(values) not in ((), port.values.shape[-1:], port.values.shape):
-            raise ValueError(f"parameter {name!r} must have {port.values.shape[-1]} values, got {np.size(values)}")
-        port.values[...] = values
-        return port
+    def _values(self) -> Iterator[tuple[str, list[Variable], npt.NDArray[Any]]]:
+        """Yield names, variables and values of the parameters, and of the start where a parameter takes it."""
+        mapping = self._mapping
+        for name, value in mapping.parameters.items():
+            yield name, self.description.find(name, "parameters", None), value
+        if mapping.home is not None and self._has_start:
+            yield mapping.home, self.description.find(mapping.home, "home"), self._start
 
     def reset(self, seed: Seeds) -> FloatArray:
         """Go back to the start; nothing here is random."""
@@ -139,8 +146,8 @@ class FmuWorld(World):
         """Set the parameters of fresh instances and begin at time 0."""
 
         def begin(lane: Lane) -> None:
-            for port in self._parameters:
-                lane.instance.writer(port, lane.row)()
+            for act in self._setters:
+                act(lane.instance, lane.row)
             lane.instance.start(0.0)
 
         self._instances.each(begin)

@@ -70,6 +70,16 @@ def describe(version: int) -> str:
         rows.append(
             '<UInt64 name="size" valueReference="60" causality="structuralParameter" variability="fixed" start="2"/>'
         )
+        common = 'causality="parameter" variability="fixed"'
+        rows += [
+            f'<Int8 name="gear" valueReference="70" {common} start="1"/>',
+            f'<Boolean name="on" valueReference="80" {common} start="true"/>',
+            f'<String name="mood" valueReference="90" {common}><Start value=""/></String>',
+            f'<Float32 name="trim" valueReference="100" {common} start="1"/>',
+            '<Float32 name="shade" valueReference="110" causality="output"><Dimension start="2"/></Float32>',
+            '<UInt64 name="samples" valueReference="120" causality="structuralParameter" start="1"/>',
+            '<Float64 name="probe" valueReference="130" causality="output"><Dimension valueReference="120"/></Float64>',
+        ]
         head = 'fmiVersion="3.0" modelName="Crane" instantiationToken="x"'
     else:
         rows.append(
@@ -80,6 +90,11 @@ def describe(version: int) -> str:
             '<ScalarVariable name="gear" valueReference="70" causality="parameter" variability="tunable">'
             '<Integer start="1"/></ScalarVariable>'
         )
+        common = 'causality="parameter" variability="fixed"'
+        rows += [
+            f'<ScalarVariable name="on" valueReference="80" {common}><Boolean start="true"/></ScalarVariable>',
+            f'<ScalarVariable name="mood" valueReference="90" {common}><String start=""/></ScalarVariable>',
+        ]
         head = 'fmiVersion="2.0" modelName="Crane" guid="x"'
     return (
         f'<?xml version="1.0"?><fmiModelDescription {head}><CoSimulation modelIdentifier="crane"/>'
@@ -107,8 +122,9 @@ def build_crane(path: Path, version: int, *, folder: str | None = None, descript
     """Write the foreign FMU to `path`."""
     place = folder or this_platform().folder(version)
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", description or describe(version))
-        archive.writestr(f"binaries/{place}/crane{this_platform().suffix}", library(version))
+        # Without the time: equal content is unpacked once.
+        archive.writestr(zipfile.ZipInfo("modelDescription.xml"), description or describe(version))
+        archive.writestr(zipfile.ZipInfo(f"binaries/{place}/crane{this_platform().suffix}"), library(version))
     return path
 
 

@@ -3,6 +3,7 @@
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdlib.h>
+#include <string.h>
 
 enum { STEP_FAILS = 1, RESULT_IS_NAN, ENDS_HALF_WAY, NO_PROGRESS, NO_START, ENDS_SIMULATION, BECOMES_NAN, CREEPS, DIES };
 
@@ -11,6 +12,11 @@ static bool dead;
 
 typedef struct {
     double time, wheel[2], push[2], place[2], arm[2], quirk, rate[2];
+    int gear; /* times the speed */
+    bool on, configuring;
+    float trim; /* times the speed, too */
+    char mood[16]; /* "contrary" turns it round */
+    unsigned long long samples;
 } Crane;
 
 static void place(Crane *c)
@@ -27,13 +33,25 @@ static void init(Crane *c)
     c->arm[0] = 0.5;
     c->arm[1] = 0.4;
     c->quirk = 0;
+    c->gear = 1;
+    c->on = true;
+    c->trim = 1.0f;
+    c->mood[0] = 0;
+    c->samples = 1;
 }
 
 static void move(Crane *c, double h)
 {
-    for (int i = 0; i < 2; i++) c->wheel[i] += h * c->push[i];
+    const double share = c->on * c->gear * (double)c->trim * (strcmp(c->mood, "contrary") == 0 ? -1 : 1);
+    for (int i = 0; i < 2; i++) c->wheel[i] += h * share * c->push[i];
     c->time += h;
     place(c);
+}
+
+static int set_mood(Crane *c, size_t n, const char *const values[])
+{
+    strncpy(c->mood, values[0], sizeof c->mood - 1);
+    return n == 1 ? 0 : 3;
 }
 
 /* References: 10 and 11 wheel, 20 and 21 push, 30 and 31 place, 40 and 41 arm, 50 quirk, 60 and 61 rate. */

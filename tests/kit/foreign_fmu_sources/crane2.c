@@ -55,6 +55,23 @@ int fmi2SetReal(void *c, const unsigned *references, size_t n, const double *val
     return 0;
 }
 
+int fmi2SetInteger(void *c, const unsigned *references, size_t n, const int *values)
+{
+    if (n > 0) ((Crane *)c)->gear = values[0];
+    return n == 0 || (n == 1 && references[0] == 70) ? 0 : 3;
+}
+
+int fmi2SetBoolean(void *c, const unsigned *references, size_t n, const int *values)
+{
+    if (n > 0) ((Crane *)c)->on = values[0] != 0;
+    return n == 0 || (n == 1 && references[0] == 80) ? 0 : 3;
+}
+
+int fmi2SetString(void *c, const unsigned *references, size_t n, const char *const values[])
+{
+    return n == 0 ? 0 : references[0] == 90 ? set_mood(c, n, values) : 3;
+}
+
 int fmi2GetReal(void *component, const unsigned *references, size_t n, double *values)
 {
     Crane *c = component;
@@ -167,6 +184,3 @@ int fmi2GetDirectionalDerivative(void *component, const unsigned *unknowns, size
 UNUSED(fmi2GetInteger, int *)
 UNUSED(fmi2GetBoolean, int *)
 UNUSED(fmi2GetString, const char **)
-UNUSED(fmi2SetInteger, const int *)
-UNUSED(fmi2SetBoolean, const int *)
-UNUSED(fmi2SetString, const char *const *)

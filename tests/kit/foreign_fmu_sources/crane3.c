@@ -49,6 +49,10 @@ static int copy(Crane *c, const unsigned *references, size_t n, double *values, 
 {
     size_t k = 0;
     for (size_t i = 0; i < n; i++) {
+        if (references[i] == 130) { /* as many samples as configured */
+            for (unsigned j = 0; j < c->samples; j++, k++) values[k] = c->place[0] + j;
+            continue;
+        }
         for (unsigned j = 0; j < (references[i] == 50 ? 1 : 2); j++, k++) {
             if (k == n_values) return 3;
             if (out) values[k] = at(c, references[i])[j];
@@ -66,6 +70,48 @@ int fmi3SetFloat64(void *c, const unsigned *references, size_t n, const double *
 int fmi3GetFloat64(void *c, const unsigned *references, size_t n, double *values, size_t n_values)
 {
     return copy(c, references, n, values, n_values, true);
+}
+
+#define SETTER(Type, type, wanted, field)                                                                  \
+    int fmi3Set##Type(void *c, const unsigned *references, size_t n, const type *values, size_t n_values) \
+    {                                                                                                      \
+        ((Crane *)c)->field = values[0];                                                                   \
+        return n == 1 && n_values == 1 && references[0] == wanted ? 0 : 3;                                 \
+    }
+
+SETTER(Int8, signed char, 70, gear)
+SETTER(Boolean, bool, 80, on)
+SETTER(Float32, float, 100, trim)
+
+int fmi3SetString(void *c, const unsigned *references, size_t n, const char *const values[], size_t n_values)
+{
+    return references[0] == 90 && n_values == 1 ? set_mood(c, n, values) : 3;
+}
+
+int fmi3GetFloat32(void *component, const unsigned *references, size_t n, float *values, size_t n_values)
+{
+    Crane *c = component;
+    for (size_t i = 0; i < n_values; i++) values[i] = (float)c->place[i];
+    return n == 1 && n_values == 2 && references[0] == 110 ? 0 : 3;
+}
+
+int fmi3EnterConfigurationMode(void *c)
+{
+    ((Crane *)c)->configuring = true;
+    return 0;
+}
+
+int fmi3ExitConfigurationMode(void *c)
+{
+    ((Crane *)c)->configuring = false;
+    return 0;
+}
+
+int fmi3SetUInt64(void *component, const unsigned *references, size_t n, const unsigned long long *values, size_t n_values)
+{
+    Crane *c = component;
+    c->samples = values[0];
+    return c->configuring && n == 1 && n_values == 1 && references[0] == 120 ? 0 : 3;
 }
 
 int fmi3DoStep(void *component, double time, double h, bool unused, bool *event, bool *end, bool *early, double *last)
