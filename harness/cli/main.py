@@ -17,6 +17,7 @@ from rich.markup import escape
 from servobench.harness.cli import completion, lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
 from servobench.harness.cli.check import check
+from servobench.harness.cli.export import export
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.grouping import grouped
 from servobench.harness.cli.init import init
@@ -37,7 +38,7 @@ PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in 
     "Your own controller": (new, check),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, init),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
-    "Tools": (runs.train, runs.collect, verify),
+    "Tools": (runs.train, runs.collect, export, verify),
 }
 COMPLETION_HELP = {  # by the option that typer adds
     "install_completion": "Let this shell complete names.",

@@ -15,6 +15,7 @@ EXTRAS: Final = {  # top-level module -> extra
     "optuna": "tune",
     "distributed": "cluster",
     "gymnasium": "gym",
+    "mcap": "mcap",
     "imageio_ffmpeg": "animation",
     "yourdfpy": "urdf",
 }

@@ -30,6 +30,7 @@ ONLY_READ = {
     "analyse": "logs runs of each method, which test_analyse.py does",
     "report": "needs the folder of a run, which test_report.py makes",
     "statistics": "needs the folder of a run; docs/five_minutes.md carries it out",
+    "export": "needs the folder of a batch; tests/harness/test_exports.py exports one",
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }

@@ -1,0 +1,145 @@
+"""Takes the steps of runs elsewhere: CSV, MCAP for Foxglove and ROS 2, time responses for python-control."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Hashable, Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.batch import results
+from servobench.harness.config.extras import check_installed
+from servobench.harness.config.settings import ConfigurationError
+
+if TYPE_CHECKING:
+    from control import TimeResponseData
+
+CSV, MCAP = "csv", "mcap"
+FORMATS: Final = (CSV, MCAP)
+NANOSECONDS: Final = 1e9  # in a second
+TOPICS: Final = ("reference", "feature", "true_feature", "joint_position", "joint_velocity_command", "diagnostic")
+KEYS: Final = ("run_id", "step", "time_s")  # columns that say where a row belongs
+
+
+def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
+    """Write the steps of every run of a results folder into a file of its own.
+
+    Args:
+        folder: a results folder.
+        out: new folder for the files; CSV also has the table of runs, `runs.csv`.
+        kind: of `FORMATS`.
+
+    Returns:
+        The files.
+
+    Raises:
+        ConfigurationError: an unknown format, no steps, a folder that exists already, or the extra `mcap` is missing.
+    """
+    if kind not in FORMATS:
+        raise ConfigurationError(f"format must be one of {', '.join(FORMATS)}, got {kind!r}")
+    if kind == MCAP:
+        check_installed((MCAP,), "the format mcap")
+    runs = results.load_runs(folder)
+    if not results.has_steps(folder):
+        raise ConfigurationError(f"{folder} keeps no steps: a sweep does not; use run or compare")
+    try:
+        out.mkdir(parents=True)
+    except FileExistsError:
+        raise ConfigurationError(f"{out} exists already; name a new folder") from None
+    files = [out / "runs.csv"] if kind == CSV else []
+    for file in files:
+        runs.to_csv(file, index=False)
+    for row in runs.to_dict("records"):
+        if row["periods"] > 0:
+            steps = results.load_steps(folder, [row["run_id"]])
+            files.append(out / f"{row['run_id']}.{kind}")
+            if kind == CSV:
+                steps.to_csv(files[-1], index=False)
+            else:
+                write_mcap(files[-1], steps, row)
+    return files
+
+
+def time_response(steps: pd.DataFrame) -> TimeResponseData:
+    """Return a run as python-control's `TimeResponseData`: inputs are commands, states joints, outputs features.
+
+    Args:
+        steps: the table of steps of one run.
+
+    Raises:
+        ConfigurationError: steps of several runs, or none.
+    """
+    from control import TimeResponseData  # noqa: PLC0415 - a second of imports, for the caller who wants it
+
+    if steps["run_id"].nunique() != 1:
+        raise ConfigurationError(f"steps must be those of one run, got {steps['run_id'].nunique()}")
+    topics = _topics(steps)
+    parts = {role: topics[name] for role, name in (
+        ("output", "feature"), ("state", "joint_position"), ("input", "joint_velocity_command"))}  # fmt: skip
+    values = {f"{role}s": steps[list(columns)].to_numpy().T for role, columns in parts.items()}
+    labels = {f"{role}_labels": list(columns) for role, columns in parts.items()}
+    return TimeResponseData(steps["time_s"].to_numpy(), **values, **labels, title=str(steps["run_id"].iloc[0]))
+
+
+def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> None:
+    """Write one run as an MCAP file: a topic for each group of columns, a JSON message a period, time from 0.
+
+    Args:
+        path: the file.
+        steps: the run's table of steps.
+        run: its row in the table of runs, which becomes the metadata `run`.
+    """
+    from mcap.writer import Writer  # noqa: PLC0415 - of the extra mcap
+
+    topics = _topics(steps)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library=f"servobench {version('servobench')}")
+        writer.add_metadata("run", {str(name): str(value) for name, value in run.items()})
+        channels = {}
+        for topic, columns in topics.items():
+            data = json.dumps(_schema(topic, columns)).encode()
+            schema = writer.register_schema(f"servobench.{topic}", "jsonschema", data)
+            channels[topic] = writer.register_channel(f"/{topic}", "json", schema)
+        for k, row in enumerate(steps.to_dict("records")):
+            time = round(row["time_s"] * NANOSECONDS)
+            for topic, columns in topics.items():
+                message = {"time_s": row["time_s"]} | {name: _plain(row[column]) for column, name in columns.items()}
+                data = json.dumps(message, allow_nan=False).encode()
+                writer.add_message(channels[topic], log_time=time, data=data, publish_time=time, sequence=k)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _topics(steps: pd.DataFrame) -> dict[str, dict[str, str]]:
+    """Return the columns of each topic with their names there; what belongs to no group is in `run`."""
+    grouped: dict[str, dict[str, str]] = {topic: {} for topic in (*TOPICS, "run")}
+    for column in map(str, steps.columns):
+        if column not in KEYS:
+            topic, name = next(_places(column), ("run", column))
+            grouped[topic][column] = name
+    return {topic: names for topic, names in grouped.items() if names}
+
+
+def _places(column: str) -> Iterator[tuple[str, str]]:
+    """Yield the topic whose name a column begins with, and the rest of it; `feature_valid` is no feature."""
+    for topic in TOPICS:
+        if column.startswith(f"{topic}_") and column != "feature_valid":
+            yield topic, column.removeprefix(f"{topic}_")
+
+
+def _schema(topic: str, columns: Mapping[str, str]) -> dict[str, Any]:
+    kinds = {name: {"type": ["number", "boolean", "null"]} for name in columns.values()}
+    return {"title": topic, "type": "object", "properties": {"time_s": {"type": "number"}} | kinds}
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of a table
+    """Return a cell for JSON, which has no word for what is not a number."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    number = float(value)
+    return number if math.isfinite(number) else None

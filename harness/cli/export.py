@@ -1,0 +1,24 @@
+"""The command `servobench export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from servobench.harness.cli.terminal import console
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
+    out: Annotated[Path, typer.Option(help="New folder for the files.")],
+    format_: Annotated[
+        str, typer.Option("--format", help="csv, or mcap (Foxglove, tools of ROS 2; extra mcap).")
+    ] = "csv",
+) -> None:
+    """Write the steps of runs for other tools, a file a run."""
+    from servobench.harness.analysis.exports import export_folder
+
+    files = export_folder(folder, out, format_)
+    console.print(f"{len(files)} files in {out}", markup=False, highlight=False)
