@@ -147,7 +147,8 @@ def _within_spans(length: int, span: int) -> FloatArray:
     ages = 1.0 + np.arange(length * span)
     between = np.stack([np.interp(ages, middles, row) for row in np.eye(length + 1)])
     mean = between.reshape(length + 1, length, span).mean(axis=-1)
-    return between + np.repeat(np.eye(length + 1)[:, 1:] - mean, span, axis=-1)
+    weights: FloatArray = between + np.repeat(np.eye(length + 1)[:, 1:] - mean, span, axis=-1)
+    return weights
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:
