@@ -25,7 +25,7 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, transposed
 
-SPAN = 0.02  # [s] of an entry of g, and no shorter than a period
+SPAN = 0.004  # [s] of an entry of g, and no shorter than a period
 PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of spans of a second; one step of some milliradians outweighs it
 PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
 MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
@@ -140,11 +140,14 @@ def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
 def _within_spans(length: int, span: int) -> FloatArray:
     """Return the weights (N + 1, N r) by which what is left is interpolated between spans.
 
-    An entry of g is fitted to all commands of its span, so that the sum up to it holds for the middle of the span.
+    An entry of g is fitted to all commands of its span, so that the sum up to it is the mean of what is left of them.
+    It is interpolated between the middles of the spans, and moved within each span so that this mean holds.
     """
     middles = np.concatenate([[0.0], span * np.arange(length) + (span + 1) / 2])
     ages = 1.0 + np.arange(length * span)
-    return np.stack([np.interp(ages, middles, row) for row in np.eye(length + 1)])
+    between = np.stack([np.interp(ages, middles, row) for row in np.eye(length + 1)])
+    mean = between.reshape(length + 1, length, span).mean(axis=-1)
+    return between + np.repeat(np.eye(length + 1)[:, 1:] - mean, span, axis=-1)
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:

@@ -70,7 +70,7 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
     np.testing.assert_allclose(made.response, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("period", "span"), [(0.05, 1), (0.02, 1), (0.008, 2), (0.004, 5)])
+@pytest.mark.parametrize(("period", "span"), [(0.05, 1), (0.02, 1), (0.008, 1), (0.004, 1), (0.008, 2), (0.004, 5)])
 def test_the_flight_that_is_found_is_that_of_the_delayed_lag_at_every_rate(period, span):
     """The arm answers by the closed form of a delay of 0.05 s and a lag of 0.05 s."""
     rng, count = np.random.default_rng(1), round(0.6 / (span * period))
@@ -96,6 +96,14 @@ def filter_at(feature, noise=0.001):
     """Return a filter that starts at a feature."""
     level = NoiseLevel.guess(noise)
     return FeatureFilter(np.asarray(feature, dtype=float), level.variance, level)
+
+
+@pytest.mark.parametrize("span", [1, 2, 5])
+def test_what_is_left_of_the_commands_of_a_span_has_the_mean_that_the_fit_means(span):
+    response = np.random.default_rng(2).uniform(0.0, 0.3, 8)
+    made = with_response(JointResponse.immediate(8, np.zeros(3), 0.004, span), response)
+    left = made.left.reshape(8, span).mean(axis=1)
+    assert left == pytest.approx([response[i + 1 :].sum() for i in range(8)], abs=1e-12)
 
 
 def test_the_filter_is_a_kalman_filter_by_hand():
