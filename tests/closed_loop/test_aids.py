@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from servobench.controllers.methods import METHODS
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
@@ -10,6 +11,7 @@ from servobench.harness.run.request import RunRequest
 EQUIPPED = ("map_mfac", "rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")
 TURNED = "moderate+camera_rotation=120deg"
 PLUS, PAPER = "map_mfac", "rbfnn_mfac:published"
+IDENTIFYING = [name for name in METHODS if not name.endswith(":published") and name not in {"constant", "calibrated"}]
 
 
 def row(controller, task, mismatch, seed, *settings, latency=None):
@@ -48,6 +50,14 @@ def test_it_is_sooner_there_with_less_overshoot_and_tracks_better_than_the_metho
         assert plus["settling_time_s"] < paper["settling_time_s"]
         assert plus["overshoot"] < 0.5 * paper["overshoot"] + 0.005
     assert row(PLUS, "circle", "moderate", 1)["rms_error_evaluated"] < 0.004
+
+
+@pytest.mark.parametrize("name", IDENTIFYING)
+def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_that_answers_at_once(name):
+    """A law turns the noise of a frame into motion, which at a delay of 0 would explain that this noise is gone."""
+    for seed in range(2):
+        found = row(name, "circle", "moderate", seed, "kinematic.command_delay=0", latency=0.05)
+        assert found["rms_error_evaluated"] < 0.003
 
 
 def test_the_method_of_the_paper_tracks_a_circle_within_10_mm_and_worse_without_the_row_space():

@@ -48,7 +48,7 @@ _AIDS: Final[Space] = {
     "aids.feedforward": _SWITCH,
     "aids.limit": CategoricalDistribution(("scale", "clip", "redistribute")),
     "aids.map_walk": _log(0.03, 3.0),  # 1/√m
-    "aids.map_error": _log(0.01, 0.5),
+    "aids.map_error": _log(0.01, 0.1),  # with more the identified noise would be too small, and the delay biased
     "aids.posture_gain": FloatDistribution(0.1, 1.0),  # 1/s
 }
 _P: Final[Space] = {
