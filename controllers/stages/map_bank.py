@@ -6,14 +6,17 @@ for the joint motion d periods ago. A step Δy holds the noise of both its frame
 
     Δy = M x_d + e₊ − e + v,   v ~ N(0, c² ‖x_d‖² I)                   v the error of the model
     h = [x_d; −1],   ν = Δy − [M e] h,   s = σ² + c² ‖x_d‖² + hᵀ P h
-    [M e] ← [M e] + ν (P h)ᵀ / s,   P ← P − (P h)(P h)ᵀ / s
+    M ← M + ν (P h)_Mᵀ / s,   P_M ← P_M − (P h)_M (P h)_Mᵀ / s          if ‖x_d‖ ≥ σ
     e ← ν σ²/s,   P_ee ← σ² (1 − σ²/s),   P_Me ← −(P h)_M σ²/s          e₊ takes the place of e
 
 Without e the filter would be biased: a closed loop turns the noise of a frame into joint motion, which at a shorter
 delay than the true one seems to explain that this noise is gone from the next frame.
 
-This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. The
-candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
+This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. From
+steps shorter than the noise M is not learned, only considered (Schmidt–Kalman): at rest they would count by their sum,
+and what moves the feature there is no x, such as the posture's motion, of which the law undoes what is seen.
+
+The candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
 
     ℓ_d = Σ ‖ν‖² / s + m ln s
 
@@ -69,7 +72,9 @@ def map_update(
     s = frame + model + np.vecdot(h, Ph)
     known[..., :m] -= feature_step[..., None, :]  # −ν above P h: minus their products with the gain is the change
     nu, share = known[..., :m], frame / s
-    learned = bank - outer(known, Ph / s[..., None])
+    gain = Ph / s[..., None]
+    gain[..., :-1] *= (np.vecdot(x, x) >= frame)[..., None]
+    learned = bank - outer(known, gain)
     learned[..., -1] = -share[..., None] * known
     learned[..., -1, :-1] = learned[..., m:-1, -1]
     learned[..., -1, -1] = frame * (1.0 - share)

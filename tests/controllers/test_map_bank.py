@@ -15,8 +15,11 @@ FRAME = 0.49  # σ²
 
 
 def motions(count, m, seed=0):
+    """Return steps x of at least σ, what was seen, and the variances of the model."""
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(count, m)), rng.normal(size=(count, m)), rng.uniform(0.1, 2.0, count)
+    x = rng.normal(size=(count, m))
+    x *= (rng.uniform(1.01, 4.0, count) * np.sqrt(FRAME) / np.linalg.norm(x, axis=1))[:, None]
+    return x, rng.normal(size=(count, m)), rng.uniform(0.1, 2.0, count)
 
 
 def filtered(x, dy, model, P0, frame=FRAME):
@@ -69,6 +72,17 @@ def test_one_update_by_hand_and_every_candidate_on_its_own():
     np.testing.assert_allclose(bank[0], [[1.0 + 24.0 / 18.0, 3.0 / 18.0], [4.0 - 64.0 / 18.0, -8.0 / 18.0],
                                          [-8.0 / 18.0, 1.0 - 1.0 / 18.0]])  # fmt: skip
     np.testing.assert_allclose(bank[1], [[1.0, 2.5], [4.0, 0.0], [0.0, 0.5]])
+
+
+def test_steps_shorter_than_the_noise_are_considered_and_teach_nothing_of_the_map():
+    """A law that undoes a slow drift of the feature makes steady short steps in which nothing is seen to move."""
+    rng, x = np.random.default_rng(6), np.full((400, 1), 0.05)
+    dy = np.diff(np.sqrt(FRAME) * rng.normal(size=401))[:, None]
+    bank, _ = filtered(x, dy, np.full(400, 1e-4), 0.01 * np.eye(1))
+    assert (bank[0, 0], bank[1, 0]) == (1.0, 0.01)
+    longer = np.sqrt(FRAME) / 0.05 * 1.01
+    learned, _ = filtered(longer * x, longer * x + dy, np.full(400, 1e-4), 0.01 * np.eye(1))
+    assert learned[1, 0] < 1e-4
 
 
 def test_a_motion_that_answers_to_noise_does_not_pass_for_its_cause():
