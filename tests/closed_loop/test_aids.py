@@ -62,7 +62,7 @@ def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_tha
 
 @pytest.mark.parametrize("name", ["map_mfac", "ukf_mfac"])
 def test_the_posture_moves_the_arm_at_rest_without_spoiling_the_map(name):
-    """The motion of the posture moves the feature a little, and the law undoes what is seen of it: no map explains that."""
+    """The posture moves the feature a little, and the law undoes what is seen of it: no map explains that."""
     steps = run_experiment(RunRequest("kinematic", name, "random", "moderate", 40448), read_settings(None, [])).steps
     error = steps["jacobian_error"].to_numpy()
     assert error[-1] < 1.2 * error[20] < 0.2
