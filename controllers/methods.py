@@ -6,6 +6,7 @@ is a method too, called `law+estimator`. Method numbers and equations in the sum
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -196,3 +197,14 @@ def compose(law: str, estimator: str) -> ControllerEntry:
         raise ValueError(f"the law stands first: write {estimator}+{law}")
     summary = f"the law {law} with the Jacobian of the estimator {estimator}"
     return Method(f"{law}+{estimator}", law, estimator, summary).entry()
+
+
+def suggest_pair(name: str) -> str:
+    """Return what to say where the name of a law or an estimator is given as that of a controller; else nothing."""
+    if name not in {*LAWS, *ESTIMATORS}:
+        return ""
+    is_law = name in LAWS
+    pair = f"{name}+ukf" if is_law else f"mfac+{name}"
+    methods = [method for method in METHODS if name in re.split("[_:]", method)]
+    ready = f"; methods with it: {', '.join(methods)}" if methods else ""
+    return f"it is {'a law' if is_law else 'an estimator'} and makes a pair, such as {pair}{ready}"

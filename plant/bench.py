@@ -203,8 +203,7 @@ class Bench(Plant):
             feature, valid = self._held, self._none_valid
         if missing is not None:
             valid = np.logical_and(valid, np.logical_not(missing)[..., None])
-        unseen = self._unseen()
-        if unseen is not None:
+        if (unseen := self._unseen()) is not None:
             valid = np.logical_and(valid, np.logical_not(unseen))
         due: int | FloatArray = step + self._timing.latency
         if self._sensor.jitters:
@@ -254,8 +253,7 @@ class Bench(Plant):
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """See `Plant.with_delays`."""
-        latency, delay = self._sensing.latency, self._command_delay
-        return replace(model, latency=latency, command_delay=delay, lag=self.world.lag)
+        return replace(model, latency=self._sensing.latency, command_delay=self._command_delay, lag=self.world.lag)
 
     def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
         """See `Plant.nominal_jacobian`."""

@@ -77,3 +77,16 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def point_latest(folder: Path) -> None:
+    """Let the link `latest` beside `folder` point at it; where links cannot be made, nothing happens."""
+    link = folder.parent / "latest"
+    partial = folder.parent / f".latest-{os.getpid()}"
+    if link.exists() and not link.is_symlink():
+        return
+    try:
+        partial.symlink_to(folder.name, target_is_directory=True)
+        partial.replace(link)
+    except OSError:
+        partial.unlink(missing_ok=True)

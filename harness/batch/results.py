@@ -8,7 +8,6 @@ is not what was written is refused by name: `SHA256SUMS` vouches for all of them
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -264,19 +263,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         return decode(folder, MANIFEST, text)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{folder} is not a results folder: its {MANIFEST} cannot be read") from error
-
-
-def point_latest(folder: Path) -> None:
-    """Let the link `latest` beside `folder` point at it; where links cannot be made, nothing happens."""
-    link = folder.parent / "latest"
-    partial = folder.parent / f".latest-{os.getpid()}"
-    if link.exists() and not link.is_symlink():
-        return
-    try:
-        partial.symlink_to(folder.name, target_is_directory=True)
-        partial.replace(link)
-    except OSError:
-        partial.unlink(missing_ok=True)
 
 
 def _expected(folder: Path, name: str, sums: Sums | None) -> bool:

@@ -233,7 +233,8 @@ class ControllerChecks:
         n, m = OTHER_SIZES
         what = f"{n} joints and {m} features"
         try:
-            controller = self.entry.build(default_config(self.entry), self.rig(n, m).knowledge(truth=self._truth))
+            knowledge = self.rig(n, m).knowledge(truth=self.entry.needs_truth)
+            controller = self.entry.build(default_config(self.entry), knowledge)
         except ConfigurationError as error:
             if "ValueError" in str(error):
                 return f"it refuses {what}: {error}"
@@ -286,13 +287,9 @@ class ControllerChecks:
             return None
         return f"it prints {lines} lines in {self.steps} steps; numbers for the log are returned by diagnostics"
 
-    @property
-    def _truth(self) -> bool:
-        return self.entry.needs_truth
-
     def _build(self, preview: int | None = None) -> tuple[Controller, Rig]:
         rig = self.rig(JOINTS, FEATURES)
-        knowledge = rig.knowledge(truth=self._truth)
+        knowledge = rig.knowledge(truth=self.entry.needs_truth)
         if preview is not None:
             knowledge = replace(knowledge, preview=preview)
         return self.entry.build(default_config(self.entry), knowledge), rig

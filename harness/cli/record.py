@@ -64,7 +64,8 @@ def record(
     They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
-    from servobench.harness.config.registry import engine_of, rendered_plant
+    from servobench.harness.config.engines import engine_of
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch

@@ -215,12 +215,13 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
     from servobench.harness.config.extras import missing_extra
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.draw import draw_figures
+    from servobench.plant.files import point_latest
 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))
     print_faults(runs)
     if latest:
-        results.point_latest(folder)
+        point_latest(folder)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
     console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)

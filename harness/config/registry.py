@@ -8,7 +8,6 @@ that a user gives as files or objects are offered under a name for as long as a 
 from __future__ import annotations
 
 import contextlib
-import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.controllers.methods import METHODS, compose
+from servobench.controllers.methods import METHODS, compose, suggest_pair
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
 from servobench.harness.config.extras import check_installed, has_no_wheel
@@ -176,19 +175,6 @@ def installed_plant(name: str) -> PlantEntry:
     return entry
 
 
-def engine_of(name: str) -> str:
-    """Return which engine computes or renders a plant, in a line; empty where there is none, or no such plant here."""
-    try:
-        return _told(find_plant(name))
-    except (ConfigurationError, ImportError):
-        return ""
-
-
-@cache
-def _told(entry: PlantEntry) -> str:
-    return entry.engine() if entry.engine is not None else ""
-
-
 def default_plant() -> tuple[str, str]:
     """Return the plant of a run for which none is named, and why it is not a first choice; empty if it is.
 
@@ -296,17 +282,6 @@ def _points(group: str) -> dict[str, EntryPoint]:
     return points
 
 
-def _part(kind: str, name: str) -> str:
-    """Return what to say about a controller that is the name of a law or an estimator; nothing about another."""
-    if kind == "plant" or name not in {*LAWS, *ESTIMATORS}:
-        return ""
-    is_law = name in LAWS
-    pair = f"{name}+ukf" if is_law else f"mfac+{name}"
-    methods = [method for method in METHODS if name in re.split("[_:]", method)]
-    ready = f"; methods with it: {', '.join(methods)}" if methods else ""
-    return f"it is {'a law' if is_law else 'an estimator'} and makes a pair, such as {pair}{ready}"
-
-
 @cache
 def plugin_packages() -> frozenset[str]:
     """Return the names of the top-level packages that publish plants or controllers, this one left out."""
@@ -318,10 +293,10 @@ def plugin_packages() -> frozenset[str]:
 def _load(group: str, kind: str, name: str) -> object:
     points = _points(group)
     if name not in points:
-        known = plant_names() if group == PLANT_GROUP else controller_names()
+        known, hint = (plant_names(), "") if group == PLANT_GROUP else (controller_names(), suggest_pair(name))
         if Path(f"{name}.py").is_file():
             raise ConfigurationError(f"unknown {kind} {name!r}: did you mean your file './{name}.py'?")
-        raise ConfigurationError(f"unknown {kind} {name!r}: {_part(kind, name) or suggest(name, known)}")
+        raise ConfigurationError(f"unknown {kind} {name!r}: {hint or suggest(name, known)}")
     point = points[name]
     try:
         return point.load()

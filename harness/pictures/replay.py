@@ -155,7 +155,7 @@ class Replay:
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
         self._run, self._fineness, scale = run, fineness, run.robot.workspace.scale
-        open_scene = _scene_of(rendered_plant(str(run.track.row["plant"])))
+        open_scene = scene_of(rendered_plant(str(run.track.row["plant"])))
         self._scene = open_scene(run.model.arm, scenery=True, window=False, robot=run.robot)
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
@@ -214,7 +214,7 @@ class Replay:
                 cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
 
 
-def _scene_of(plant: str) -> OpenScene:
+def scene_of(plant: str) -> OpenScene:
     """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
     if plant == "mujoco":
         from servobench.plant.mujoco.scene import MujocoScene  # noqa: PLC0415

@@ -11,33 +11,28 @@ from servobench.controllers.controller import Controller, Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
-from servobench.controllers.sight import Sight
-from servobench.controllers.units import in_natural_units
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.ending import ends_batch
+from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.plausible import check_joints, check_reach, check_times
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.draws import CameraDraws
-from servobench.plant.eyes.model import EyeModel
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
-from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.seeds import named_seed
-from servobench.plant.signals import PlantSpec
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +159,8 @@ def assemble(
     nominal = find_sensing(request.sensing).nominal(robot)
     plant = _build_plant(resolved, entry, PlantSetup(true, start, run.period, robot))
     try:
-        knowledge = _nominal_knowledge(robot, nominal, plant.spec, run)
-        knowledge = replace(knowledge, train=_network_source(_in_view(knowledge, nominal, robot), keep, progress))
+        knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
+        knowledge = replace(knowledge, train=trained_on(in_view(knowledge, nominal, robot), keep, progress))
         controller = _build_controller(
             request.controller, resolved.controller, knowledge, lambda: plant.with_delays(_equations(true))
         )
@@ -208,8 +203,8 @@ def train_networks(
     robot = find_robot(robot_name)
     nominal, limits = robot.nominal, robot.limits
     spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
-    knowledge = _nominal_knowledge(robot, nominal, spec, run)
-    source = _network_source(knowledge, None, progress)
+    knowledge = nominal_knowledge(robot, nominal, spec, run)
+    source = trained_on(knowledge, None, progress)
 
     def obtain(config: TrainingConfig) -> TrainedNetworks:
         trained.append(source(config))
@@ -220,41 +215,6 @@ def train_networks(
     if not trained:
         raise ConfigurationError(f"controller {controller} has no networks to train")
     return trained[-1]
-
-
-def _nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
-    """Return what every controller may know."""
-    return RobotKnowledge(
-        spec=spec,
-        preview=run.preview_rows,
-        nominal_jacobian=nominal.jacobian,
-        nominal_sight=_sight(nominal),
-        region=(robot.workspace.lower, robot.workspace.upper),
-    )
-
-
-def _sight(nominal: SensedArm) -> Sight | None:
-    """Return how the cameras of a nominal model see points, where its features are those of single points."""
-    if not (isinstance(nominal, EyeModel) and nominal.eye.single and nominal.eye.locate):
-        return None
-    return Sight(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
-
-
-def _in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:
-    """Return what networks are trained on: a Jacobian that says nothing about what the cameras do not see."""
-    if nominal is robot.nominal:
-        return knowledge
-    return replace(knowledge, nominal_jacobian=lambda q: nominal.jacobian_in_view(q, robot.workspace.home))
-
-
-def _network_source(
-    knowledge: RobotKnowledge, keep: Path | None, progress: Progress | None
-) -> Callable[[TrainingConfig], TrainedNetworks]:
-    """Return where a controller that knows a nominal model gets networks that are trained on it, in natural units."""
-    natural = in_natural_units(knowledge)
-    if natural.nominal_jacobian is None:
-        raise ValueError("nominal_jacobian must be known for networks that are trained on it, got None")
-    return network_source(natural.nominal_jacobian, natural.spec, keep, progress)
 
 
 def _build_with_own_robot(
@@ -278,7 +238,7 @@ def _build_with_own_robot(
         nominal = plant.nominal_jacobian()
         knowledge = RobotKnowledge(spec, run.preview_rows, nominal)
         if nominal is not None:
-            knowledge = replace(knowledge, train=_network_source(knowledge, keep, progress))
+            knowledge = replace(knowledge, train=trained_on(knowledge, keep, progress))
         controller = _build_controller(request.controller, resolved.controller, knowledge, plant.true_model)
     except BaseException:
         plant.close()

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from servobench.harness.config.registry import FORMER_NAMES, engine_of
+from servobench.harness.config.engines import engine_of
+from servobench.harness.config.registry import FORMER_NAMES
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.eyes.registry import DEFAULT_SENSING, FIXED

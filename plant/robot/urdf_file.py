@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from math import isfinite, pi
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -67,12 +68,26 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
         import yourdfpy  # noqa: PLC0415 - only the extra urdf brings it
     except ImportError as error:
         raise ValueError(f"robot file {path}: a URDF needs yourdfpy: pip install 'servobench[urdf]'") from error
+    said: list[str] = []  # of a text that is no XML, of which yourdfpy goes on to read what it can
+
+    def collect(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            said.append(record.getMessage())
+        return record.levelno < logging.ERROR
+
+    log = logging.getLogger(yourdfpy.urdf.__name__)
+    log.addFilter(collect)
     try:
-        return yourdfpy.URDF.load(
+        read = yourdfpy.URDF.load(
             str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
         ).robot
-    except Exception as error:
-        raise ValueError(f"robot file {path} is no URDF that can be read: {' '.join(str(error).split())}") from error
+    except Exception as error:  # noqa: BLE001 - whatever it raises, the line says it
+        said.append(str(error))
+    finally:
+        log.removeFilter(collect)
+    if said:
+        raise ValueError(f"robot file {path} is no URDF that can be read: {' '.join(said[0].split())}")
+    return read
 
 
 def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa: ANN401

@@ -1,9 +1,10 @@
-"""The rendered plant as a whole: truth, bits, save and restore, what it opens and closes."""
+"""What only the rendered plant on PyBullet has: its physics, its files, its worlds."""
 
 # ruff: noqa: E402 - PyBullet is an extra
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,64 +12,18 @@ import pytest
 
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
-from kit.bullet import BARE, HOME, IDEAL, MODEL, geared_ur5, wiggle
+from kit.rendered import BARE, HOME, IDEAL, MODEL
 from servobench.plant.bullet.bullet_plant import build_bullet
+from servobench.plant.bullet.mechanics import Mechanics
+from servobench.plant.faults import PlantDiverged
 from servobench.plant.plant import PlantSetup
-from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.signals import Command
 
 
-def test_another_process_sees_the_same_bits(open_plant):
-    code = (
-        "import sys; sys.path[:0] = ['tests']\n"
-        "from kit.bullet import *\n"
-        "plant = build_bullet(BARE, PlantSetup(MODEL, HOME, 0.05))\n"
-        "print('bits', wiggle(plant, 3).tobytes().hex())"
-    )
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
-    bits = next(line for line in done.stdout.splitlines() if line.startswith("bits")).split()[1]
-    assert bits == wiggle(open_plant(), 3).tobytes().hex()
-
-
-def test_two_plants_do_not_disturb_each_other(open_plant):
-    alone = wiggle(open_plant(), 3)
-    one, two = open_plant(), open_plant(start=HOME + 0.1)
-    one.reset(3), two.reset(5)
-    rng = np.random.default_rng(7)
-    for row in alone[1:]:
-        command = Command(rng.uniform(-0.5, 0.5, 6))
-        two.step(command)
-        np.testing.assert_array_equal(one.step(command).joint_position, row[1:7])
-
-
-@pytest.mark.parametrize("model", [MODEL, geared_ur5()], ids=["nominal", "geared"])
-def test_the_simulators_truth_is_the_models_feature_and_jacobian(open_plant, model):
-    start = (HOME - model.arm.joint_offset) / model.arm.gear_ratio
-    plant = open_plant(IDEAL, start, model=model)
-    plant.reset(0)
-    for _ in range(5):
-        observation = plant.step(Command(np.linspace(-0.4, 0.4, 6)))
-    q = observation.joint_position
-    np.testing.assert_allclose(plant.truth().feature, model.feature(q), atol=1e-6)
-    np.testing.assert_array_equal(plant.truth().jacobian, model.jacobian(q))
-    np.testing.assert_allclose(observation.feature, plant.truth().feature, atol=1e-3)
-
-
-def test_a_run_that_is_restored_continues_with_the_same_bits(open_plant):
-    plant, rng = open_plant(), np.random.default_rng(3)
-    plant.reset(1)
-    for _ in range(4):
-        plant.step(Command(rng.uniform(-0.5, 0.5, 6)))
-    state, commands = plant.save(), rng.uniform(-0.5, 0.5, (4, 6))
-    seen = [plant.step(Command(u)) for u in commands]
-    other = open_plant()
-    other.reset(9)
-    other.restore(state)
-    for u, expected in zip(commands, seen, strict=True):
-        observation = other.step(Command(u))
-        np.testing.assert_array_equal(observation.joint_position, expected.joint_position)
-        np.testing.assert_array_equal(observation.feature, expected.feature)
+@pytest.fixture
+def engine():
+    return "bullet"
 
 
 def test_loading_leaves_no_files_behind_even_when_it_fails(open_plant, tmp_path, monkeypatch):
@@ -102,8 +57,48 @@ def test_naming_the_plant_does_not_load_pybullet():
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X11 names its display in the environment")
-def test_a_window_without_a_display_is_refused(monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(ValueError, match="view needs a display"):
-        build_bullet(RenderedConfig(view=True), PlantSetup(MODEL, HOME, 0.05))
+def test_motion_under_torques_is_that_of_pybullets_own_engine():
+    mechanics, h, q = Mechanics(MODEL.arm, payload=1.0, assumed_payload=0.0), PHYSICS_STEP, HOME
+    client, arm, joints, v = mechanics._client, mechanics._arm, list(range(6)), np.zeros(6)
+    torque, body = np.array([5.0, -8.0, 10.0, 2.0, 0.5, 0.0]), mechanics.body(HOME, v)
+    pybullet.setPhysicsEngineParameter(fixedTimeStep=h, physicsClientId=client)
+    pybullet.setJointMotorControlArray(arm, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=client)
+    for joint in range(-1, 8):
+        pybullet.changeDynamics(arm, joint, linearDamping=0.0, angularDamping=0.0, physicsClientId=client)
+        pybullet.setCollisionFilterGroupMask(arm, joint, 0, 0, physicsClientId=client)
+    for joint, angle in enumerate(HOME):
+        pybullet.changeDynamics(arm, joint, jointDamping=0.0, physicsClientId=client)
+        pybullet.resetJointState(arm, joint, angle, physicsClientId=client)
+    torque[5] = 0.0
+    for _ in range(100):
+        body = mechanics.body(q, v)
+        v = v + h * np.linalg.solve(body.inertia, torque - body.bias)
+        q = q + h * v
+        pybullet.setJointMotorControlArray(
+            arm, joints, pybullet.TORQUE_CONTROL, forces=torque.tolist(), physicsClientId=client
+        )
+        pybullet.stepSimulation(physicsClientId=client)
+    simulated = np.array([state[0] for state in pybullet.getJointStates(arm, joints, physicsClientId=client)])
+    mechanics.close()
+    assert np.abs(q - HOME).max() > 0.01
+    np.testing.assert_allclose(q, simulated, atol=1e-3 * np.abs(q - HOME).max())
+
+
+def test_joint_angles_that_are_not_finite_end_the_run(open_plant, monkeypatch):
+    plant = open_plant()
+    plant.reset(0)
+    monkeypatch.setattr(pybullet, "calculateInverseDynamics", lambda *_, **__: (np.nan,) * 6)
+    with pytest.raises(PlantDiverged, match="joint positions are not finite"):
+        plant.step(Command(np.zeros(6)))
+
+
+def test_a_pybullet_without_numpy_works_too(open_plant, monkeypatch):
+    plant = open_plant(replace(IDEAL, width=160, height=120))
+    expected, original = plant.reset(0), pybullet.getCameraImage
+
+    def tuples(*args, **options):
+        width, height, rgba, depth, labels = original(*args, **options)
+        return width, height, tuple(np.ravel(rgba).tolist()), tuple(np.ravel(depth).tolist()), labels
+
+    monkeypatch.setattr(pybullet, "getCameraImage", tuples)
+    np.testing.assert_allclose(plant.reset(0).feature, expected.feature, atol=1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
-from kit.bullet import IDEAL
+from kit.rendered import IDEAL
 from servobench.plant.bullet.bullet_plant import build_bullet
 from servobench.plant.bullet.scene import BulletScene
 from servobench.plant.eyes.eye import Eye

@@ -1,17 +1,20 @@
 """A long campaign of fuzzing over every parser: python tests/fuzz/campaign.py --inputs 1000000.
 
-It prints for each parser how many inputs it took and refused, and what broke the promise of tests/kit/fuzzing.py; the
-exit code is 1 if something did. Batches have seeds of their own: `--first` goes on where another campaign ended.
+It prints for each parser how many inputs it took and refused, how long the longest took, and what broke the promise of
+tests/kit/fuzzing.py; the exit code is 1 if something did. Batches have seeds of their own: `--first` goes on where
+another campaign ended.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import sys
 import tempfile
 import time
 from collections import Counter
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -39,29 +42,38 @@ def main() -> int:
         os.environ["XDG_CACHE_HOME"] = scratch
         for name in names:
             wanted = max(1, round(chosen.inputs * PARSERS[name].share / shares))
-            counts, breaks = fuzz(name, wanted, chosen.first, Path(scratch))
-            total += counts.total()
-            found += len(breaks)
-            say(f"{name}: {counts.total()} inputs, {counts[True]} taken, {counts[False]} refused, {len(breaks)} broken")
-            for text in breaks:
+            tried = fuzz(name, wanted, chosen.first, Path(scratch))
+            total += tried.counts.total()
+            found += len(tried.breaks)
+            taken, refused = tried.counts[True], tried.counts[False]
+            say(f"{name}: {taken} taken, {refused} refused, {len(tried.breaks)} broken, longest {tried.longest:.2f} s")
+            for text in tried.breaks.values():
                 say(f"    {text}")
-    say(f"{total} inputs, {found} broken, {time.monotonic() - begin:.0f} s")
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    say(f"{total} inputs, {found} broken, {time.monotonic() - begin:.0f} s, at most {largest:.0f} MB in memory")
     return min(found, 1)
 
 
-def fuzz(name: str, wanted: int, first: int, scratch: Path) -> tuple[Counter[bool], list[str]]:
-    """Return how many inputs a parser took (True) and refused (False), and what broke its promise, each kind once."""
-    counts, breaks, batch = Counter[bool](), dict[str, str](), first
-    while counts.total() < wanted:
+@dataclass
+class Tried:
+    """What came of the inputs of a parser."""
+
+    counts: Counter[bool] = field(default_factory=Counter)  # how many it took (True) and refused (False)
+    breaks: dict[str, str] = field(default_factory=dict)  # what broke its promise, each kind once
+    longest: float = 0.0  # [s] of the processor
+
+
+def fuzz(name: str, wanted: int, first: int, scratch: Path) -> Tried:
+    """Give a parser inputs, in batches."""
+    tried, batch = Tried(), first
+    while tried.counts.total() < wanted:
         with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            run_batch(PARSERS[name], min(BATCH, wanted - counts.total()), batch, Path(folder), counts, breaks)
+            run_batch(PARSERS[name], min(BATCH, wanted - tried.counts.total()), batch, Path(folder), tried)
         batch += 1
-    return counts, list(breaks.values())
+    return tried
 
 
-def run_batch(
-    parser: Parser, size: int, number: int, folder: Path, counts: Counter[bool], breaks: dict[str, str]
-) -> None:
+def run_batch(parser: Parser, size: int, number: int, folder: Path, tried: Tried) -> None:
     """Give a parser `size` inputs and note what it made of them."""
 
     @seed(number)
@@ -74,12 +86,14 @@ def run_batch(
     )
     @given(inputs(parser))
     def once(value: str | bytes) -> None:
+        begin = time.process_time()
         try:
-            counts[check(parser, value, folder)] += 1
+            tried.counts[check(parser, value, folder)] += 1
         except Broken as error:
-            counts[False] += 1
+            tried.counts[False] += 1
             kind = "".join(each for each in str(error)[:60] if not each.isdigit())
-            breaks.setdefault(kind, f"{error}  <-  {value!r}"[:2000])
+            tried.breaks.setdefault(kind, f"{error}  <-  {value!r}"[:2000])
+        tried.longest = max(tried.longest, time.process_time() - begin)
 
     once()
 

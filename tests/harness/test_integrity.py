@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import shutil
 
@@ -11,9 +12,9 @@ import pandas as pd
 import pytest
 
 from kit.command import judged
-from servobench.harness.batch import results
+from servobench.harness.batch import parquet, results
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
-from servobench.harness.batch.checksums import SUMS, DamagedFile
+from servobench.harness.batch.checksums import SUMS, DamagedFile, UnwritableFolder, fault, read_sums, writing
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.sweep import SweepPlan
@@ -261,3 +262,72 @@ def test_steps_that_are_damaged_or_missing_make_their_part_count_no_more(tmp_pat
         results.load_steps(folder)
     assert run(folder, resume=True, steps=True).repeated == RUNS
     assert results.load_steps(folder)["run_id"].nunique() > RUNS - 8
+
+
+@pytest.mark.parametrize("name", [results.RUNS, results.FAILURES, results.MANIFEST])
+def test_a_file_that_is_gone_is_named(whole, tmp_path, name):
+    folder = copy(whole, tmp_path)
+    (folder / name).unlink()
+    found = [(each.name, each.what) for each in examine(folder).findings]
+    assert found == [(name, "is missing")]
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(whole, tmp_path):
+    folder = copy(whole, tmp_path)
+    (folder / results.RUNS).unlink()
+    (folder / results.RUNS).mkdir()
+    assert fault(folder, results.RUNS, read_sums(folder)) == "cannot be read: Is a directory"
+    (folder / SUMS).unlink()
+    (folder / SUMS).mkdir()
+    with pytest.raises(ConfigurationError, match=f"{SUMS} cannot be read: Is a directory"):
+        read_sums(folder)
+
+
+def test_a_folder_that_takes_no_more_files_says_why_once(tmp_path):
+    full = pytest.raises(UnwritableFolder, match=f"results folder {tmp_path} cannot be written: No space left")
+    with full as caught, writing(tmp_path / "other"), writing(tmp_path):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.errno == errno.ENOSPC
+    with pytest.raises(UnwritableFolder, match="gone cannot be written: it was removed"), writing(tmp_path / "gone"):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "what"),
+    [(8, 12, "holds the rows of other runs"), (None, 12, "holds runs that the part before it has, too")],
+)
+def test_rows_that_are_not_those_of_their_part_are_named_where_nothing_vouches_for_them(
+    half, tmp_path, source, name, what
+):
+    folder = copy(half, tmp_path)
+    (folder / SUMS).unlink()
+    place = folder / results.part_name(name, results.RUNS)
+    if source is None:
+        (folder / results.part_name(8, results.RUNS)).unlink()
+        rows = [{"run_id": f"run{index}", "status": "completed"} for index in range(6)]
+        parquet.write_table(parquet.as_table(rows), folder / results.part_name(8, results.RUNS))
+        parquet.write_table(parquet.as_table(rows), place)
+    else:
+        shutil.copy(folder / results.part_name(source, results.RUNS), place)
+    named = {each.name: each.what for each in examine(folder).findings}
+    assert named[results.part_name(name, results.RUNS)] == what
+
+
+def test_a_changed_bit_is_found_by_the_pages_where_nothing_vouches_for_a_table(half, tmp_path):
+    folder = copy(half, tmp_path)
+    (folder / SUMS).unlink()
+    place = folder / results.part_name(8, results.RUNS)
+    content = bytearray(place.read_bytes())
+    content[60] ^= 1  # within the first page
+    place.write_bytes(content)
+    named = {each.name: each.what for each in examine(folder).findings}
+    assert named[results.part_name(8, results.RUNS)].startswith("cannot be read (")
+
+
+def test_a_manifest_of_another_schema_is_not_written_anew(half, tmp_path):
+    folder = copy(half, tmp_path)
+    manifest = json.loads((folder / results.MANIFEST).read_text()) | {"schema_version": "3"}
+    (folder / SUMS).unlink()
+    (folder / results.MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(ConfigurationError, match="has results of schema '3'; this servobench reads '4'; the column"):
+        run(folder, resume=True)

@@ -11,7 +11,7 @@ from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.lock import LOCK, locked
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import RunResult
-from servobench.plant.files import write_atomically
+from servobench.plant.files import point_latest, write_atomically
 
 
 def add_part(folder, index: int, **extra: float) -> None:
@@ -103,14 +103,14 @@ def test_a_folder_of_another_schema_or_none_at_all_is_refused(folder, tmp_path):
 
 
 def test_latest_points_at_the_newest_folder_and_never_replaces_a_real_one(folder):
-    results.point_latest(folder)
+    point_latest(folder)
     newer = folder.parent / "newer"
     results.create_folder(newer, {})
-    results.point_latest(newer)
+    point_latest(newer)
     assert (folder.parent / "latest").resolve() == newer.resolve()
     (folder.parent / "latest").unlink()
     (folder.parent / "latest").mkdir()
-    results.point_latest(newer)
+    point_latest(newer)
     assert not (folder.parent / "latest").is_symlink()
 
 

@@ -54,6 +54,11 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
     "statistics": (("harness/analysis/statistics.py",), ("harness/test_statistics.py",)),
     "results": (("harness/batch/results.py",), ("harness/test_results.py", "harness/test_ending.py")),
+    "folders": (
+        ("harness/batch/parquet.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
+         "harness/batch/manifest_text.py"),
+        ("harness/test_results.py", "harness/test_integrity.py"),
+    ),
 }  # fmt: skip
 BINARY: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult,

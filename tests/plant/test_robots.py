@@ -241,3 +241,12 @@ def test_a_urdf_with_odd_axes_moves_as_its_reader_says(tmp_path):
         find_robot(f"{path}#hnd")
     with pytest.raises(ValueError, match="no chain of at least three turning joints"):
         find_robot(f"{path}#link_1")
+
+
+@pytest.mark.parametrize("text", ["<", "<robot name='a'><link", odd_urdf() + "<"])
+def test_a_urdf_that_is_no_xml_is_one_line_in_which_its_reader_says_why(tmp_path, caplog, text):
+    pytest.importorskip("yourdfpy")
+    (tmp_path / "arm.urdf").write_text(text)
+    with pytest.raises(ValueError, match=r"arm\.urdf is no URDF that can be read: .*line \d+, column \d+"):
+        find_robot(str(tmp_path / "arm.urdf"))
+    assert caplog.records == []

@@ -1,19 +1,13 @@
 """How the arm of the rendered plant moves: drives, loads, encoders, stops, and what it meets."""
 
-# ruff: noqa: E402 - PyBullet is an extra
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
-
-from kit.bullet import BARE, HOME, IDEAL, MODEL, geared_ur5
-from servobench.plant.bullet.mechanics import Mechanics
-from servobench.plant.faults import Collision, FeatureLost, PlantDiverged
-from servobench.plant.rendered.contact import Contacts
+from kit.rendered import BARE, HOME, IDEAL, MODEL, geared_ur5
+from servobench.plant.faults import Collision, FeatureLost
 from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
-from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.signals import Command
 
 
@@ -68,33 +62,6 @@ def test_the_arm_moves_alike_under_every_control_period(open_plant, period):
     np.testing.assert_array_equal(*ends)
 
 
-def test_motion_under_torques_is_that_of_pybullets_own_engine():
-    mechanics, h, q = Mechanics(MODEL.arm, payload=1.0, assumed_payload=0.0), PHYSICS_STEP, HOME
-    client, arm, joints, v = mechanics._client, mechanics._arm, list(range(6)), np.zeros(6)
-    torque, body = np.array([5.0, -8.0, 10.0, 2.0, 0.5, 0.0]), mechanics.body(HOME, v)
-    pybullet.setPhysicsEngineParameter(fixedTimeStep=h, physicsClientId=client)
-    pybullet.setJointMotorControlArray(arm, joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=client)
-    for joint in range(-1, 8):
-        pybullet.changeDynamics(arm, joint, linearDamping=0.0, angularDamping=0.0, physicsClientId=client)
-        pybullet.setCollisionFilterGroupMask(arm, joint, 0, 0, physicsClientId=client)
-    for joint, angle in enumerate(HOME):
-        pybullet.changeDynamics(arm, joint, jointDamping=0.0, physicsClientId=client)
-        pybullet.resetJointState(arm, joint, angle, physicsClientId=client)
-    torque[5] = 0.0
-    for _ in range(100):
-        body = mechanics.body(q, v)
-        v = v + h * np.linalg.solve(body.inertia, torque - body.bias)
-        q = q + h * v
-        pybullet.setJointMotorControlArray(
-            arm, joints, pybullet.TORQUE_CONTROL, forces=torque.tolist(), physicsClientId=client
-        )
-        pybullet.stepSimulation(physicsClientId=client)
-    simulated = np.array([state[0] for state in pybullet.getJointStates(arm, joints, physicsClientId=client)])
-    mechanics.close()
-    assert np.abs(q - HOME).max() > 0.01
-    np.testing.assert_allclose(q, simulated, atol=1e-3 * np.abs(q - HOME).max())
-
-
 def test_a_load_that_the_drives_do_not_know_of_disturbs_the_joints(open_plant):
     def path(**load):
         plant = open_plant(replace(BARE, drives=DriveConfig(**load), encoder_resolution=0.0))
@@ -146,18 +113,6 @@ def test_meeting_itself_ends_the_run_where_that_is_wanted(open_plant):
     turn(free, fold, 20)
 
 
-def test_neighbouring_links_never_count_as_contact():
-    mechanics, rng = Mechanics(MODEL.arm, payload=1.0, assumed_payload=1.0), np.random.default_rng(0)
-    names = ["base", *MODEL.arm.joint_names]
-    contacts = Contacts(mechanics.overlaps, MODEL.arm, find_robot("ur5"))
-    met = [contacts.find(rng.uniform(-np.pi, np.pi, 6), room=False) for _ in range(200)]
-    assert contacts.find(HOME) is None
-    mechanics.close()
-    pairs = [pair for pair in met if pair is not None]
-    assert 5 < len(pairs) < 195
-    assert all(names.index(second) - names.index(first) > 1 for first, second in pairs)
-
-
 def test_an_obstacle_hides_the_ball_and_stands_in_the_way(open_plant):
     above, lost = (0.5, 0.0, 0.6, 0.3, 0.3, 0.02), pytest.raises(FeatureLost, match="not visible")
     with lost:
@@ -167,9 +122,11 @@ def test_an_obstacle_hides_the_ball_and_stands_in_the_way(open_plant):
         open_plant(replace(BARE, obstacles=(inside,))).reset(0)
 
 
-def test_joint_angles_that_are_not_finite_end_the_run(open_plant, monkeypatch):
-    plant = open_plant()
-    plant.reset(0)
-    monkeypatch.setattr(pybullet, "calculateInverseDynamics", lambda *_, **__: (np.nan,) * 6)
-    with pytest.raises(PlantDiverged, match="joint positions are not finite"):
-        plant.step(Command(np.zeros(6)))
+def test_neighbouring_links_never_count_as_contact(open_plant):
+    contacts, rng = open_plant().world._contacts, np.random.default_rng(0)
+    names = ["base", *MODEL.arm.joint_names]
+    met = [contacts.find(rng.uniform(-np.pi, np.pi, 6), room=False) for _ in range(200)]
+    assert contacts.find(HOME) is None
+    pairs = [pair for pair in met if pair is not None]
+    assert 5 < len(pairs) < 195
+    assert all(names.index(second) - names.index(first) > 1 for first, second in pairs)

@@ -1,15 +1,9 @@
 """What the camera of the rendered plant sees: the ball, noise, what hides it, table and floor."""
 
-# ruff: noqa: E402 - PyBullet is an extra
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
-
-from kit.bullet import BARE, HOME, IDEAL, MODEL, wiggle
-from servobench.plant.bullet.scene import BulletScene
+from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
 from servobench.plant.faults import FeatureLost
 from servobench.plant.rendered.detection import find_patch, locate_ball
 from servobench.plant.rendered.settings import RenderedConfig
@@ -20,10 +14,10 @@ from servobench.plant.signals import Command
 FLANGE_DOWN = np.array([np.pi, -1.6, 1.9, -1.87, -np.pi / 2, 0.0])
 
 
-def errors_over_poses(noise, count) -> tuple[np.ndarray, int]:
+def errors_over_poses(open_scene, noise, count) -> tuple[np.ndarray, int]:
     """Detected less simulated ball centres over random visible poses, and how many poses were tried."""
     camera, rng = PinholeCamera(), np.random.default_rng(11)
-    scene = BulletScene(MODEL.arm, scenery=False, window=False)
+    scene = open_scene(scenery=False)
     errors, tried = [], 0
     while len(errors) < count:
         scene.place(HOME + rng.uniform(-0.6, 0.6, 6))
@@ -35,13 +29,12 @@ def errors_over_poses(noise, count) -> tuple[np.ndarray, int]:
             found = locate_ball(patch, depth, camera, ur5.BALL_RADIUS)
             if found is not None:
                 errors.append(found.centre - MODEL.to_camera(scene.ball_position()))
-    scene.close()
     return np.array(errors), tried
 
 
-def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre():
+def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre(open_scene):
     # Table and floor change no bit of what is found, as a test below shows, and cost most of the time.
-    errors, tried = errors_over_poses(DepthNoise("none", depth_quantisation=0.0), 200)
+    errors, tried = errors_over_poses(open_scene, DepthNoise("none", depth_quantisation=0.0), 200)
     distance = np.linalg.norm(errors, axis=1)
     assert np.median(distance) <= 0.0002
     assert distance.max() <= 0.001
@@ -49,16 +42,16 @@ def test_without_noise_the_centre_is_found_to_a_fifth_of_a_millimetre():
 
 
 @pytest.mark.parametrize("model", ["stereo", "structured_light"])
-def test_with_noise_the_centre_has_no_bias_of_note(model):
-    errors, _ = errors_over_poses(DepthNoise(model), 100)
+def test_with_noise_the_centre_has_no_bias_of_note(open_scene, model):
+    errors, _ = errors_over_poses(open_scene, DepthNoise(model), 100)
     assert np.abs(errors.mean(axis=0)).max() < 0.0006
     assert np.linalg.norm(errors, axis=1).max() < 0.015
 
 
-def test_stereo_noise_moves_the_centre_by_more_than_the_noise_of_kinematic():
-    errors, _ = errors_over_poses(DepthNoise("stereo"), 100)
+def test_stereo_noise_moves_the_centre_by_more_than_the_noise_of_kinematic(open_scene):
+    errors, _ = errors_over_poses(open_scene, DepthNoise("stereo"), 100)
     assert ((errors.std(axis=0) > 0.001) & (errors.std(axis=0) < 0.0025)).all()
-    white, _ = errors_over_poses(DepthNoise("stereo", depth_patch=0.0), 100)
+    white, _ = errors_over_poses(open_scene, DepthNoise("stereo", depth_patch=0.0), 100)
     assert (white.std(axis=0) < 0.001).all()
 
 
@@ -86,22 +79,9 @@ def test_a_ball_that_is_hidden_at_the_start_is_reported_with_evidence(open_plant
         plant.reset(0)
 
 
-def test_table_and_floor_are_in_view():
-    scene, camera = BulletScene(MODEL.arm, scenery=True, window=False), PinholeCamera()
+def test_table_and_floor_are_in_view(open_scene):
+    scene, camera = open_scene(scenery=True), PinholeCamera()
     depth = camera.metric_depth(scene.render(camera, MODEL.X_BC)[1])
-    scene.close()
     distance = MODEL.X_BC[2, 3]
     assert np.isclose(depth, distance, atol=1e-3).mean() > 0.3
     assert np.isclose(depth, distance + 0.75, atol=1e-3).mean() > 0.3
-
-
-def test_a_pybullet_without_numpy_works_too(open_plant, monkeypatch):
-    plant = open_plant(replace(IDEAL, width=160, height=120))
-    expected, original = plant.reset(0), pybullet.getCameraImage
-
-    def tuples(*args, **options):
-        width, height, rgba, depth, labels = original(*args, **options)
-        return width, height, tuple(np.ravel(rgba).tolist()), tuple(np.ravel(depth).tolist()), labels
-
-    monkeypatch.setattr(pybullet, "getCameraImage", tuples)
-    np.testing.assert_allclose(plant.reset(0).feature, expected.feature, atol=1e-9)

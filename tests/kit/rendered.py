@@ -1,9 +1,9 @@
-"""The rendered plant for tests."""
+"""The rendered plants for tests."""
 
 import numpy as np
 
 from kit.plants import configure
-from servobench.plant.bullet.bullet_plant import build_bullet
+from servobench.harness.config.registry import find_plant
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.settings import RenderedConfig
@@ -29,9 +29,9 @@ IDEAL = configure(
 MODEL = ur5.nominal_ur5()
 
 
-def build(config=BARE, start=HOME, period=0.05, model=MODEL):
+def build(config=BARE, start=HOME, period=0.05, model=MODEL, *, engine):
     """Return a plant, which is to be closed."""
-    return build_bullet(config, PlantSetup(model, start, period))
+    return find_plant(engine).build(config, PlantSetup(model, start, period))
 
 
 def wiggle(plant, seed, periods=12) -> np.ndarray:
