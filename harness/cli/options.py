@@ -241,7 +241,7 @@ def split_sensings(text: str) -> tuple[str, ...]:
 def default_plant() -> str:
     """Return the plant of a run for which none is named; a line says if it is not the first choice, and why."""
     from servobench.harness.cli.terminal import say
-    from servobench.harness.config.registry import default_plant
+    from servobench.harness.config.engines import default_plant
 
     name, why = default_plant()
     if why:

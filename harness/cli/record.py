@@ -64,8 +64,7 @@ def record(
     They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
-    from servobench.harness.config.engines import engine_of
-    from servobench.harness.config.registry import rendered_plant
+    from servobench.harness.config.engines import engine_of, rendered_plant
     from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
@@ -98,7 +97,7 @@ def record(
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
-    from servobench.harness.config.registry import rendered_plant
+    from servobench.harness.config.engines import rendered_plant
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.replay import logged_run
     from servobench.plant.settings import suggest
@@ -117,7 +116,8 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.config.registry import choose_controller, choose_plant, rendered_plant
+    from servobench.harness.config.engines import rendered_plant
+    from servobench.harness.config.registry import choose_controller, choose_plant
     from servobench.harness.config.settings import ConfigurationError, flatten
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment

@@ -1,10 +1,11 @@
-"""Which engine computes or renders a plant, for tables and manifests."""
+"""Which engine computes or renders a plant, and which plant a run is on that names none."""
 
 from __future__ import annotations
 
 from functools import cache
 
-from servobench.harness.config.registry import find_plant
+from servobench.harness.config.extras import has_no_wheel
+from servobench.harness.config.registry import RENDERED, UNRENDERED, find_plant, installed_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.plant import PlantEntry
 
@@ -20,3 +21,31 @@ def engine_of(name: str) -> str:
 @cache
 def _told(entry: PlantEntry) -> str:
     return entry.engine() if entry.engine is not None else ""
+
+
+def default_plant() -> tuple[str, str]:
+    """Return the plant of a run for which none is named, and why it is not a first choice; empty if it is.
+
+    Where PyBullet has no wheel, `mujoco` is as good a choice as `bullet`, and the one to install.
+    """
+    missing = {}
+    for name in RENDERED:
+        try:
+            installed_plant(name)
+        except ConfigurationError as error:
+            missing[name] = str(error)
+        else:
+            return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
+    return UNRENDERED, missing[RENDERED[has_no_wheel()]]
+
+
+def rendered_plant(named: str | None = None) -> str:
+    """Return the plant whose engine shows runs of the plant `named`: itself if it renders, or else one that is there.
+
+    Raises:
+        ConfigurationError: the engine is missing, or all of them are; the message says what to install.
+    """
+    name, why = (named, "") if named is not None and named in RENDERED else default_plant()
+    if name == UNRENDERED:
+        raise ConfigurationError(why)
+    return installed_plant(name).name

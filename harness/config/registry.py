@@ -18,7 +18,7 @@ from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose, suggest_pair
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
-from servobench.harness.config.extras import check_installed, has_no_wheel
+from servobench.harness.config.extras import check_installed
 from servobench.harness.config.own import Own, describe_import, is_place, read_own
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.files import user_path
@@ -173,34 +173,6 @@ def installed_plant(name: str) -> PlantEntry:
     if lack:
         raise ConfigurationError(f"plant {name!r} cannot run here: {lack}")
     return entry
-
-
-def default_plant() -> tuple[str, str]:
-    """Return the plant of a run for which none is named, and why it is not a first choice; empty if it is.
-
-    Where PyBullet has no wheel, `mujoco` is as good a choice as `bullet`, and the one to install.
-    """
-    missing = {}
-    for name in RENDERED:
-        try:
-            installed_plant(name)
-        except ConfigurationError as error:
-            missing[name] = str(error)
-        else:
-            return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
-    return UNRENDERED, missing[RENDERED[has_no_wheel()]]
-
-
-def rendered_plant(named: str | None = None) -> str:
-    """Return the plant whose engine shows runs of the plant `named`: itself if it renders, or else one that is there.
-
-    Raises:
-        ConfigurationError: the engine is missing, or all of them are; the message says what to install.
-    """
-    name, why = (named, "") if named is not None and named in RENDERED else default_plant()
-    if name == UNRENDERED:
-        raise ConfigurationError(why)
-    return installed_plant(name).name
 
 
 def find_controller(name: str) -> ControllerEntry:

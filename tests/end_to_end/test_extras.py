@@ -11,7 +11,7 @@ import pytest
 
 from kit.folders import comparison
 from kit.plants import NEEDS_BULLET, NEEDS_MUJOCO
-from servobench.harness.config import extras, registry
+from servobench.harness.config import engines, extras, registry
 from servobench.harness.config.extras import EXTRAS
 from servobench.harness.config.settings import ConfigurationError
 
@@ -105,7 +105,7 @@ def test_without_an_engine_a_run_that_names_no_plant_takes_the_kinematic_one_and
 @NEEDS_MUJOCO
 def test_without_pybullet_mujoco_is_the_rendered_plant(monkeypatch):
     monkeypatch.setattr(registry, "check_installed", lambda needs, what: needs == ("pybullet",) and refuse(what))
-    assert registry.default_plant() == (
+    assert engines.default_plant() == (
         "mujoco",
         "" if extras.has_no_wheel() else "plant 'bullet' needs what is not here",
     )
