@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from servobench.fmus.compile import CODE, Platform, compile_library, library_files, this_platform
+from servobench.fmus.eye_variables import View
 from servobench.fmus.generate import kinematics_source, layout_header
 from servobench.fmus.model_description import (
     REFERENCES,
@@ -33,9 +34,11 @@ from servobench.fmus.model_description import (
 )
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
 from servobench.fmus.variables import Actuation, Layout, arm_groups, parameters_of
+from servobench.plant.eyes.model import EyeModel
+from servobench.plant.eyes.registry import Sensing
 from servobench.plant.robot.catalogue import UR5, find_robot
-from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.sensed import SensedArm
 
 MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
 MACHINERY = "fmi"  # folder of the FMI functions, which know no model
@@ -51,6 +54,7 @@ RELATED_FILES = (
     (INPUT_FILE, "testcase", "Commands of the reference run, each held over the step that begins at its time."),
     (OUTPUT_FILE, "result", "Outputs of the reference run, computed by an independent implementation."),
 )
+PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 
 
@@ -75,7 +79,7 @@ class ExportOptions:
     """
 
     fmi_version: int = 2
-    model: HandEyeModel = field(default_factory=lambda: find_robot(UR5).nominal)
+    model: SensedArm = field(default_factory=lambda: find_robot(UR5).nominal)
     actuation: Actuation = field(default_factory=default_actuation)
     platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))
     mismatch: str = "none"
@@ -89,29 +93,48 @@ class ExportOptions:
             raise ValueError("platforms must name at least one platform, got none")
 
     @property
+    def view(self) -> View | None:
+        """What cameras see; None for the ball in 3-D by a fixed one."""
+        return View.of(self.model) if isinstance(self.model, EyeModel) else None
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the variables."""
+        return arm_layout(self.model.arm.n, self.view)
+
+    @property
     def identifier(self) -> str:
-        """Name of the libraries: that of the robot as a word of C."""
-        word = re.sub(r"[^A-Za-z0-9_]", "_", self.robot.name)
+        """Name of the libraries: that of the robot, and of another sensing than `position`, as a word of C."""
+        view = self.view
+        word = re.sub(r"[^A-Za-z0-9_]", "_", self.robot.name if view is None else f"{self.robot.name}_{view.word}")
         return f"{word if word[:1].isalpha() else f'arm_{word}'}_mismatched"
 
     @property
     def title(self) -> str:
         """Name of the model."""
-        return f"{self.robot.title} with mismatched kinematics"
+        view = self.view
+        seen = "" if view is None else f", seen by {view.eye.name}{' on the hand' if view.mount == 'hand' else ''}"
+        return f"{self.robot.title} with mismatched kinematics{seen}"
 
     @property
     def summary(self) -> str:
         """What the model is."""
-        title = self.robot.title
+        title, view = self.robot.title, self.view
+        seen = "with a ball on its flange under a fixed camera" if view is None else f"and its cameras: {view.setting}"
         return (
-            f"{'An' if title[:1] in set('AEIO') else 'A'} {title} with a ball on its flange under a fixed camera; "
+            f"{'An' if title[:1] in set('AEIO') else 'A'} {title} {seen}; "
             "every length, angle and offset is a tunable parameter."
         )
 
 
-def nominal_options(fmi_version: int, robot: Robot) -> ExportOptions:
-    """Return the options of an export of a robot without mismatch."""
-    return ExportOptions(fmi_version, robot.nominal, default_actuation(robot), robot=robot)
+def nominal_options(fmi_version: int, robot: Robot, sensing: Sensing | None = None) -> ExportOptions:
+    """Return the options of an export of a robot without mismatch, by default with the sensing `position`.
+
+    Raises:
+        ValueError: the arm has too few joints for the sensing.
+    """
+    model = robot.nominal if sensing is None else sensing.nominal(robot)
+    return ExportOptions(fmi_version, model, default_actuation(robot), robot=robot)
 
 
 def export_fmu(path: Path, options: ExportOptions) -> Path:
@@ -154,7 +177,7 @@ def fingerprint(options: ExportOptions) -> str:
 
 def source_files(options: ExportOptions) -> dict[str, str]:
     """Return the C files of the FMU by their path in the archive, with a placeholder for the token."""
-    layout, start = arm_layout(options.model.arm.n), parameters_of(options.model, options.actuation)
+    layout, start = options.layout, parameters_of(options.model, options.actuation)
     texts = {name: _committed(folder, name) for folder, names in COMMITTED.items() for name in names}
     texts |= {name: _committed(MACHINERY, name) for name in FMI_SOURCES[options.fmi_version]}
     header = INSTANCE_HEADERS[options.fmi_version]
@@ -167,7 +190,7 @@ def source_files(options: ExportOptions) -> dict[str, str]:
 
 def _companion_files(options: ExportOptions) -> dict[str, str]:
     """Return documentation, licence and reference run by their path in the archive."""
-    layout = arm_layout(options.model.arm.n)
+    layout = options.layout
     run = reference_run(options.model, options.actuation)
     return {
         INPUT_FILE: input_csv(run, layout),
@@ -181,9 +204,9 @@ def _companion_files(options: ExportOptions) -> dict[str, str]:
 
 
 @cache
-def arm_layout(n: int) -> Layout:
-    """Return the layout of an arm with `n` joints."""
-    return Layout(arm_groups(n))
+def arm_layout(n: int, view: View | None = None) -> Layout:
+    """Return the layout of an arm with `n` joints, with the ball in 3-D by a fixed camera or with another view."""
+    return Layout(arm_groups(n, view), view)
 
 
 _PLACEHOLDER = "{token}"
@@ -218,7 +241,7 @@ def _description(options: ExportOptions) -> Description:
         model_name=options.title,
         model_identifier=options.identifier,
         summary=options.summary,
-        layout=arm_layout(options.model.arm.n),
+        layout=options.layout,
         start=parameters_of(options.model, options.actuation),
         sources=(*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES),
         tool=f"servobench {version('servobench')}",
@@ -235,7 +258,7 @@ def _token(contents: Mapping[str, bytes]) -> str:
 
 
 def _documentation(layout: Layout, options: ExportOptions) -> str:
-    template = _committed(MODEL, "documentation.html")
+    template, view = _committed(MODEL, "documentation.html"), options.view
     rows = [
         f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
         f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
@@ -245,6 +268,8 @@ def _documentation(layout: Layout, options: ExportOptions) -> str:
         title=html.escape(options.title),
         summary=html.escape(options.summary),
         joints=options.model.arm.n,
+        seen=f" and cameras: {html.escape(view.setting)}" if view else " carries a ball; a fixed camera sees it",
+        feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
         mismatch="the nominal model"
         if options.mismatch == "none"
         else f"the mismatch “{html.escape(options.mismatch)}”",

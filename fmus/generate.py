@@ -2,8 +2,8 @@
 
 The kinematic core has three functions in CasADi's calling convention. They need libm only:
 
-    arm_ball      q, p -> y                    ball in the camera frame
-    arm_jacobian  q, p -> J                    row-major, 3 × n
+    arm_feature   q, p -> y                    the ball in the camera frame, or features and which of them are seen
+    arm_jacobian  q, p -> J                    of the features, row-major, m × n
     arm_forward   q, p, q̇, ṗ -> ẏ, J̇          forward derivatives along (q̇, ṗ)
 """
 
@@ -16,10 +16,14 @@ from typing import Any
 
 import casadi
 import numpy as np
+import numpy.typing as npt
 
-from servobench.fmus.variables import FIXED, INPUT, KINEMATIC_PARAMETERS, PARAMETER, STATE, Layout
+from servobench.fmus.eye_variables import View
+from servobench.fmus.variables import FIXED, INPUT, PARAMETER, STATE, Layout
 from servobench.plant.checks import FloatArray
-from servobench.plant.robot.symbolic import SX, HandEyeGeometry, feature_and_jacobian
+from servobench.plant.eyes.optics import Optics
+from servobench.plant.eyes.symbolic import EyeGeometry, features, points_in_cameras, seen_features
+from servobench.plant.robot.symbolic import SX, ArmGeometry, HandEyeGeometry, feature_and_jacobian
 
 # Generated functions do not use all of their parameters; none of them is exported by the library.
 KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */
@@ -62,8 +66,10 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: s
     lines += [f"#define N_JOINTS {_size(layout, 'joint_position')}", f"#define N_GROUPS {len(layout.groups)}"]
     lines += [f"#define N_KINEMATIC {kinematic_size(layout)}", f"#define N_WORK {max(work, 1)}"]
     lines += [f"#define N_VALUES {layout.size}", f"#define N_SETTABLE {layout.offsets['der(joint_position)']}"]
+    first, *_ = layout.computed
     for group in layout.groups:
-        lines.append(f"#define OFFSET_{_macro(group.name)} {layout.offsets[group.name]}")
+        name = "FEATURE" if group is first else _macro(group.name)
+        lines.append(f"#define OFFSET_{name} {layout.offsets[group.name]}")
     sizes = ", ".join(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups)
     zero = np.zeros(1)
     values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
@@ -77,36 +83,67 @@ def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: s
 
 def kinematic_size(layout: Layout) -> int:
     """Return the number of kinematic parameters."""
-    return sum(group.size for group in layout.groups[:KINEMATIC_PARAMETERS])
+    return sum(group.size for group in layout.kinematic)
 
 
 def _core_functions(layout: Layout) -> list[Any]:
     n = _size(layout, "joint_position")
     q, p = casadi.SX.sym("q", n), casadi.SX.sym("p", kinematic_size(layout))
     dq, dp = casadi.SX.sym("dq", n), casadi.SX.sym("dp", kinematic_size(layout))
-    feature, jacobian = feature_and_jacobian(q, _geometry(layout, p))
+    feature, jacobian = _equations(layout, q, p)
     row_major = casadi.vec(jacobian.T)
     along = casadi.jtimes(casadi.vertcat(feature, row_major), casadi.vertcat(q, p), casadi.vertcat(dq, dp))
     return [
-        casadi.Function("arm_ball", [q, p], [feature], {"cse": True}),
+        casadi.Function("arm_feature", [q, p], [feature], {"cse": True}),
         casadi.Function("arm_jacobian", [q, p], [row_major], {"cse": True}),
         casadi.Function("arm_forward", [q, p, dq, dp], [along], {"cse": True}),
     ]
 
 
-def _geometry(layout: Layout, p: SX) -> HandEyeGeometry:
-    part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.groups[:KINEMATIC_PARAMETERS]}
+def _equations(layout: Layout, q: SX, p: SX) -> tuple[SX, SX]:
+    """Return the outputs before the Jacobian and the Jacobian, for joint positions and kinematic parameters."""
+    part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
+    arm, view = _arm(part), layout.view
+    if view is None:
+        ball = HandEyeGeometry(*arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
+        return feature_and_jacobian(q, ball)
+    geometry = _view(part, arm, view)
+    points = points_in_cameras(q, geometry, view.mount)
+    feature = features(points, geometry.optics, view.eye)
+    seen = seen_features(points, geometry.optics, view.eye)
+    return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
+
+
+def _arm(part: Mapping[str, SX]) -> ArmGeometry:
     columns = casadi.horzcat(part["a"], part["y"], part["d"])
     angles = casadi.horzcat(part["alpha"], part["pitch"], part["yaw"])
-    return HandEyeGeometry(
+    return ArmGeometry(
         translation=casadi.vertcat(part["base_position"].T, columns),
         rpy=casadi.vertcat(part["base_rpy"].T, angles),
         joint_offset=part["joint_offset"],
         gear_ratio=part["gear_ratio"],
-        tool=part["tool"],
-        R_BC=_rotation(part["camera_rpy"]),
-        p_BC=part["camera_position"],
     )
+
+
+def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> EyeGeometry:
+    c = view.eye.cameras
+    optics = Optics(
+        _objects(part["focal_length"], (c,)),
+        _objects(part["principal_point"], (c, 2)),
+        _objects(part["distortion"], (c,)),
+        view.size,
+    )
+    positions, angles = (casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy"))
+    poses = [(_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]
+    return EyeGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
+
+
+def _objects(values: SX, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    """Return expressions, (k, 1), as an array of them."""
+    array = np.empty(values.numel(), dtype=object)
+    for k in range(array.size):
+        array[k] = values[k]
+    return array.reshape(shape)
 
 
 def _rotation(rpy: SX) -> SX:

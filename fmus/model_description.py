@@ -16,7 +16,6 @@ from servobench.fmus.variables import (
     FIXED,
     INDICATOR,
     INPUT,
-    KINEMATIC_PARAMETERS,
     OUTPUT,
     PARAMETER,
     STATE,
@@ -97,7 +96,7 @@ def write_fmi2(description: Description, token: str) -> bytes:
         files = ET.SubElement(ET.SubElement(root, interface, {**capabilities, **more}), "SourceFiles")
         for name in description.sources:
             ET.SubElement(files, "File", name=name)
-    _units(root)
+    _units(root, {group.unit for group in description.layout.groups})
     _log_categories(root)
     ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
     _scalar_variables(ET.SubElement(root, "ModelVariables"), description)
@@ -125,7 +124,7 @@ def write_fmi3(description: Description, token: str) -> bytes:
     }
     ET.SubElement(root, "ModelExchange", capabilities)
     ET.SubElement(root, "CoSimulation", capabilities, canHandleVariableCommunicationStepSize="true")
-    _units(root)
+    _units(root, {group.unit for group in description.layout.groups})
     _log_categories(root)
     ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
     _array_variables(ET.SubElement(root, "ModelVariables"), description)
@@ -205,13 +204,14 @@ class _Structure:
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         self._group = {group.name: group for group in layout.groups}
-        self._geometry = tuple(group.name for group in layout.groups[:KINEMATIC_PARAMETERS])
+        self._geometry = tuple(group.name for group in layout.kinematic)
+        self._computed = tuple(group.name for group in layout.computed)
 
     def sections(self) -> tuple[_Section, ...]:
         state = ("joint_position", "joint_velocity")
         outputs: _Rows = [(name, (name,), True) for name in state]
         outputs += [("encoder_position", ("joint_position",), True)]
-        outputs += [(name, ("joint_position",), False) for name in ("ball_position", "jacobian")]
+        outputs += [(name, ("joint_position",), False) for name in self._computed]
         derivatives: _Rows = [
             ("der(joint_position)", state, True),
             ("der(joint_velocity)", (*state, "joint_velocity_command"), True),
@@ -222,9 +222,8 @@ class _Structure:
             ("der(joint_position)", (), True),
             ("der(joint_velocity)", ("lag", "max_speed", "joint_velocity_command"), True),
             ("encoder_position", ("encoder_resolution", "home"), True),
-            ("ball_position", (*self._geometry, "home"), False),
-            ("jacobian", (*self._geometry, "home"), False),
         ]
+        start += [(name, (*self._geometry, "home"), False) for name in self._computed]
         return (
             self._section("Outputs", "Output", outputs),
             self._section("Derivatives", "ContinuousStateDerivative", derivatives),
@@ -244,9 +243,11 @@ def _describe(root: ET.Element, description: Description) -> None:
     root.attrib["variableNamingConvention"] = "structured"
 
 
-def _units(root: ET.Element) -> None:
+def _units(root: ET.Element, used: set[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
-    for name, exponents in UNITS.items():
+    # A pixel, or whatever else a set-up measures in, is a number.
+    own = {name: {"rad": "-1"} if name.endswith("/rad") else {} for name in sorted(used - set(UNITS))}
+    for name, exponents in (UNITS | own).items():
         unit = ET.SubElement(definitions, "Unit", name=name)
         ET.SubElement(unit, "BaseUnit", exponents)
         if name in DISPLAY_UNITS:

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from servobench.fmus.eye_variables import FEATURE, SEEN
 from servobench.fmus.variables import Actuation, Layout
 from servobench.plant.checks import FloatArray
+from servobench.plant.eyes.model import EyeModel
 from servobench.plant.kinematic import discretise_lag
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.seeds import named_generator
 
 STEP = 0.05  # [s]
@@ -20,7 +22,6 @@ STEPS = 200
 INPUT_FILE = "extra/servobench/reference_input.csv"
 OUTPUT_FILE = "extra/servobench/reference_output.csv"
 COMMAND = "joint_velocity_command"
-OUTPUTS = ("joint_position", "joint_velocity", "ball_position", "encoder_position")
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class ReferenceRun:
     outputs: dict[str, FloatArray]
 
 
-def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
+def reference_run(model: SensedArm, actuation: Actuation) -> ReferenceRun:
     """Return the reference run of `model`; some of its commands exceed the speed limit."""
     n = model.arm.n
     stops = actuation.stops(n)
@@ -59,10 +60,18 @@ def reference_run(model: HandEyeModel, actuation: Actuation) -> ReferenceRun:
     outputs = {
         "joint_position": positions,
         "joint_velocity": velocities,
-        "ball_position": model.feature(positions),
+        **_features(model, positions),
         "encoder_position": np.where(resolution > 0.0, np.round(positions / steps) * steps, positions),
     }
     return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, wanted, outputs)
+
+
+def _features(model: SensedArm, positions: FloatArray) -> dict[str, FloatArray]:
+    """Return what is seen at joint positions (k, n), (k, size) by name."""
+    if not isinstance(model, EyeModel):
+        return {"ball_position": model.feature(positions)}
+    feature, _, seen = model.look(positions)
+    return {FEATURE: feature, SEEN: seen.astype(np.float64)}
 
 
 def input_csv(run: ReferenceRun, layout: Layout) -> str:

@@ -11,14 +11,16 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from servobench.fmus.export import export_fmu, fingerprint, nominal_options
+from servobench.fmus.eye_variables import FEATURE, SEEN, View
 from servobench.fmus.variables import Actuation, parameters_of
 from servobench.plant.bench import Bench
 from servobench.plant.cache import cached
+from servobench.plant.eyes.model import EyeModel
+from servobench.plant.eyes.registry import Sensing
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.catalogue import UR5, find_robot
-from servobench.plant.robot.hand_eye import FEATURE_NAMES
 from servobench.plant.robot.robot import Robot
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import NonNegative, Positive, nested, settings
@@ -50,17 +52,22 @@ class Ur5FmuConfig:
 
 
 @cache
-def cached_fmu(fmi_version: int, robot: Robot | None = None) -> Path:
+def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | None = None) -> Path:
     """Return a nominal robot, by default the UR5, as FMU, from the user's cache folder.
 
     It is built there if anything in it has changed.
+
+    Args:
+        fmi_version: 2 or 3.
+        robot: None for the UR5.
+        sensing: what its cameras see; None for the ball in 3-D by a fixed one.
 
     Raises:
         CompilerMissing: it has to be built and there is no compiler.
         CompilationFailed: it has to be built and the compiler refused it.
         ValueError: it has to be built and the cache folder cannot be written.
     """
-    options = nominal_options(fmi_version, robot or find_robot(UR5))
+    options = nominal_options(fmi_version, robot or find_robot(UR5), sensing)
     name = f"{options.identifier}.fmu"
     key = f"{options.identifier}-fmi{fmi_version}-{fingerprint(options).strip('{}')}"
     return cached("fmus", key, lambda folder: export_fmu(folder / name, options)) / name
@@ -68,7 +75,8 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None) -> Path:
 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported arm, with the true model of `setup` as its parameters, (..., size)."""
-    model, start = setup.ball_robot()
+    model, start = setup.robot()
+    view = View.of(model) if isinstance(model, EyeModel) else None
     lag, n = config.joint_lags or (config.lag,), model.arm.n
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
@@ -81,13 +89,14 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         file=path,
         inputs=("joint_velocity_command",),
         joints=("encoder_position" if resolution > 0.0 else "joint_position",),
-        features=("ball_position",),
+        features=("ball_position",) if view is None else (FEATURE,),
+        seen=() if view is None else (SEEN,),
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
-        camera=("camera_position", "camera_rpy"),
+        camera=("camera_position", "camera_rpy") if view is None or view.eye.cameras == 1 else None,
         parameters=parameters,
         limits=JointLimits(stops.speed, stops.lower, stops.upper),
-        names=LogNames(model.arm.joint_names, FEATURE_NAMES),
+        names=LogNames(model.arm.joint_names, model.channel.names, model.channel.unit),
     )
 
 
@@ -98,12 +107,14 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
         ValueError: a setting out of its bounds, a start of the wrong size, or an FMU that has to be built and cannot:
             no compiler, or no place in the cache folder.
     """
+    model, _ = setup.robot()
+    sensing = Sensing(model.eye, model.mount) if isinstance(model, EyeModel) else None
     try:
-        path = cached_fmu(config.fmi_version, setup.nominal)
+        path = cached_fmu(config.fmi_version, setup.nominal, sensing)
     except ValueError as error:
         raise ValueError(f"the FMU cannot be built: {error}") from error
     lag = float(np.mean(config.joint_lags or config.lag))
-    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag)
+    return build_fmu(ur5_mapping(path, config, setup), setup, config.command_delay, config.sensing, lag, model)
 
 
 ENTRY = PlantEntry(
@@ -112,4 +123,5 @@ ENTRY = PlantEntry(
     config=Ur5FmuConfig,
     build=build_ur5,
     side_by_side=True,
+    any_sensing=True,
 )

@@ -16,10 +16,13 @@ from math import prod
 
 import numpy as np
 
+from servobench.fmus.eye_variables import View, view_parameters
 from servobench.plant.checks import FloatArray, as_array
+from servobench.plant.eyes.model import EyeModel
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.limits import JointLimits, narrowed
+from servobench.plant.robot.sensed import SensedArm
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT = "derivative", "event indicator", "output"
@@ -60,10 +63,14 @@ class Group:
             yield f"der({scalar})" if self.role == DERIVATIVE else scalar
 
 
-def arm_groups(n: int) -> tuple[Group, ...]:
+def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
     """Return the groups of an arm with `n` joints, in the order of the flat vector.
 
     The kinematic parameters come first and in the order in which the generated core takes them.
+
+    Args:
+        n: number of joints.
+        view: of a sensing set-up; None for the ball in 3-D by a fixed camera.
     """
     table = "transform after joint i"
     return (
@@ -77,9 +84,7 @@ def arm_groups(n: int) -> tuple[Group, ...]:
         Group("yaw", (n,), PARAMETER, "rad", f"Calibration column, 0 in DH: yaw of the {table}."),
         Group("joint_offset", (n,), PARAMETER, "rad", "True joint angle at a reported position of zero."),
         Group("gear_ratio", (n,), PARAMETER, "1", "True joint motion over reported joint motion."),
-        Group("tool", (3,), PARAMETER, "m", "Ball centre in the flange frame."),
-        Group("camera_position", (3,), PARAMETER, "m", "Camera in the base frame."),
-        Group("camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."),
+        *_of_sensing(view),
         Group("lag", (n,), PARAMETER, "s", "Time constant of the joint's velocity loop; 0 for none.", 0.0),
         Group("max_speed", (n,), PARAMETER, "rad/s", "Commands beyond it, either way, are clipped.", 0.0),
         Group("joint_lower", (n,), PARAMETER, "rad", "The joint stops here."),
@@ -93,19 +98,54 @@ def arm_groups(n: int) -> tuple[Group, ...]:
         Group("der(joint_velocity)", (n,), DERIVATIVE, "rad/s2", "Derivative of the joint velocity."),
         Group("stop_indicator", (n, 2), INDICATOR, "1", "Distance to lower and upper stop; at a stop the command."),
         Group("encoder_position", (n,), OUTPUT, "rad", "Joint position in whole steps of the encoder."),
+        *_outputs(n, view),
+    )
+
+
+def _of_sensing(view: View | None) -> tuple[Group, ...]:
+    """Return the kinematic parameters of target and cameras."""
+    if view is not None:
+        return tuple(Group(name, shape, PARAMETER, unit, text) for name, shape, unit, text in view.parameters())
+    return (
+        Group("tool", (3,), PARAMETER, "m", "Ball centre in the flange frame."),
+        Group("camera_position", (3,), PARAMETER, "m", "Camera in the base frame."),
+        Group("camera_rpy", (3,), PARAMETER, "rad", "Roll, pitch and yaw of the camera in the base frame."),
+    )
+
+
+def _outputs(n: int, view: View | None) -> tuple[Group, ...]:
+    """Return the outputs that the generated core computes."""
+    if view is not None:
+        return tuple(Group(name, shape, OUTPUT, unit, text) for name, shape, unit, text in view.outputs(n))
+    return (
         Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
         Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),
     )
 
 
-KINEMATIC_PARAMETERS = 13  # of the groups above, from the first
-
-
 @dataclass(frozen=True)
 class Layout:
-    """The groups and their offsets in the flat vector of values."""
+    """The groups and their offsets in the flat vector of values.
+
+    Attributes:
+        groups: of the model.
+        view: of a sensing set-up; None for the ball in 3-D by a fixed camera.
+    """
 
     groups: tuple[Group, ...]
+    view: View | None = None
+
+    @property
+    def kinematic(self) -> tuple[Group, ...]:
+        """The parameters of the generated core, which come first."""
+        names = [group.name for group in self.groups]
+        return self.groups[: names.index("lag")]
+
+    @property
+    def computed(self) -> tuple[Group, ...]:
+        """The outputs of the generated core, which come last: the feature first, the Jacobian last."""
+        names = [group.name for group in self.groups]
+        return self.groups[names.index("encoder_position") + 1 :]
 
     @cached_property
     def offsets(self) -> dict[str, int]:
@@ -151,7 +191,7 @@ class Actuation:
         return narrowed(self.limits, n, self.max_speed, self.joint_range)
 
 
-def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatArray]:
+def parameters_of(model: SensedArm, actuation: Actuation) -> dict[str, FloatArray]:
     """Return the FMU's parameters for `model` and `actuation` by group, (..., size)."""
     arm, n = model.arm, model.arm.n
     stops = actuation.stops(n)
@@ -164,15 +204,24 @@ def parameters_of(model: HandEyeModel, actuation: Actuation) -> dict[str, FloatA
         **{name: arm.rpy[..., 1:, column] for name, column in angles.items()},
         "joint_offset": arm.joint_offset,
         "gear_ratio": arm.gear_ratio,
-        "tool": arm.tool,
-        "camera_position": model.X_BC[..., :3, 3],
-        "camera_rpy": rpy_from_rotation(model.X_BC[..., :3, :3]),
+        **_sensing_parameters(model),
         "lag": np.array(np.broadcast_to(actuation.lag, n)),
         "max_speed": stops.speed,
         "joint_lower": stops.lower,
         "joint_upper": stops.upper,
         "encoder_resolution": np.array(np.broadcast_to(actuation.encoder_resolution, n)),
         "home": as_array("home", actuation.home, (*model.lead, n)),
+    }
+
+
+def _sensing_parameters(model: SensedArm) -> dict[str, FloatArray]:
+    if isinstance(model, EyeModel):
+        return view_parameters(model)
+    pose = model.camera
+    return {
+        "tool": model.arm.tool,
+        "camera_position": pose[..., :3, 3],
+        "camera_rpy": rpy_from_rotation(pose[..., :3, :3]),
     }
 
 

@@ -2,11 +2,11 @@
 #ifndef KINEMATICS_H
 #define KINEMATICS_H
 
-/* q, p -> ball in the camera frame (3) */
-int arm_ball(const double **arg, double **res, int *iw, double *w, int mem);
-/* q, p -> Jacobian, row-major (3 x N_JOINTS) */
+/* q, p -> the ball in the camera frame (3), or m features and which of them are seen (2 m) */
+int arm_feature(const double **arg, double **res, int *iw, double *w, int mem);
+/* q, p -> Jacobian of the features, row-major (m x N_JOINTS) */
 int arm_jacobian(const double **arg, double **res, int *iw, double *w, int mem);
-/* q, p, dq, dp -> derivatives of ball (3) and Jacobian (3 x N_JOINTS) along (dq, dp) */
+/* q, p, dq, dp -> derivatives of both, the Jacobian last, along (dq, dp) */
 int arm_forward(const double **arg, double **res, int *iw, double *w, int mem);
 
 #endif

@@ -9,7 +9,7 @@
 /* How far behind its stop a joint meets it [rad]; a joint that leaves a stop does not meet it at once that way. */
 #define STOP_HYSTERESIS 1e-9
 
-enum { STALE_BALL = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
+enum { STALE_FEATURE = 1, STALE_JACOBIAN = 2, STALE_DERIVATIVES = 4, STALE_ALL = 7 };
 
 static const double start_values[N_VALUES] = START_VALUES;
 static const double minima[N_SETTABLE] = MINIMA;
@@ -138,9 +138,9 @@ static void refresh_kinematics(Model *model, int part)
 {
     double work[N_WORK];
     const double *arguments[2] = {model->values + OFFSET_JOINT_POSITION, model->values};
-    if (part == STALE_BALL) {
-        double *results[1] = {model->values + OFFSET_BALL_POSITION};
-        arm_ball(arguments, results, NULL, work, 0);
+    if (part == STALE_FEATURE) {
+        double *results[1] = {model->values + OFFSET_FEATURE};
+        arm_feature(arguments, results, NULL, work, 0);
     } else {
         double *results[1] = {model->values + OFFSET_JACOBIAN};
         arm_jacobian(arguments, results, NULL, work, 0);
@@ -167,15 +167,15 @@ static void refresh_derivatives(Model *model)
 ModelStatus model_get(Model *model, size_t index, double *value)
 {
     if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
-    if (index >= OFFSET_ENCODER_POSITION && index < OFFSET_BALL_POSITION) {
+    if (index >= OFFSET_ENCODER_POSITION && index < OFFSET_FEATURE) {
         *value = encoder_position(model, index - OFFSET_ENCODER_POSITION);
         return MODEL_OK;
     }
     if (model->stale != 0 && index >= OFFSET_DER_JOINT_POSITION) {
         if (index >= OFFSET_JACOBIAN) {
             if (model->stale & STALE_JACOBIAN) refresh_kinematics(model, STALE_JACOBIAN);
-        } else if (index >= OFFSET_BALL_POSITION) {
-            if (model->stale & STALE_BALL) refresh_kinematics(model, STALE_BALL);
+        } else if (index >= OFFSET_FEATURE) {
+            if (model->stale & STALE_FEATURE) refresh_kinematics(model, STALE_FEATURE);
         } else if (model->stale & STALE_DERIVATIVES) {
             refresh_derivatives(model);
         }
@@ -258,6 +258,6 @@ void model_derive(Model *model, double direction[N_VALUES], int starting)
     double work[N_WORK];
     const double *arguments[4] = {model->values + OFFSET_JOINT_POSITION, model->values,
                                   direction + OFFSET_JOINT_POSITION, direction};
-    double *results[1] = {direction + OFFSET_BALL_POSITION}; /* the Jacobian follows it */
+    double *results[1] = {direction + OFFSET_FEATURE}; /* the Jacobian follows it */
     arm_forward(arguments, results, NULL, work, 0);
 }

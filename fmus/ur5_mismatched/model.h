@@ -1,6 +1,6 @@
 /* The arm as a dynamic system, free of FMI: one flat vector of values, a step, derivatives and their sensitivities.
 
-   dq/dt = v,   dv/dt = (clip(u) - v) / lag;   y = ball in the camera frame at q
+   dq/dt = v,   dv/dt = (clip(u) - v) / lag;   y = features at q, such as the ball in the camera frame
 
    A joint that meets a stop rests there, v = 0, for as long as u drives it into the stop. */
 #ifndef MODEL_H

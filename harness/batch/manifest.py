@@ -12,6 +12,7 @@ from typing import Any
 from servobench.harness.batch.survey import Survey
 from servobench.harness.config.registry import Offer, find_plant
 from servobench.harness.config.robots import find_robot
+from servobench.harness.config.sensing import find_sensing, sensing_file
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
 
@@ -63,6 +64,7 @@ def describe_batch(
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "robots": [describe_robot(name) for name in runs.robots],
+        "sensings": [describe_sensing(word) for word in runs.sensings],
         "seeds": ",".join(f"{own.start}:{own.stop}" if len(own) > 1 else f"{own.start}" for own in runs.seeds),
         "configuration": configuration,
         "engines": {name: entry.engine() for name in runs.plants if (entry := find_plant(name)).engine},
@@ -74,6 +76,14 @@ def describe_batch(
         "run_count": runs.count,
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),
     }
+
+
+def describe_sensing(word: str) -> dict[str, Any]:
+    """Return what a manifest says about a sensing set-up: its features, and of a user's file the place and the hash."""
+    found, own = find_sensing(word), sensing_file(word)
+    eye = found.eye
+    source = {} if own is None else {"file": str(own.path), "sha256": own.digest}
+    return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras} | source
 
 
 def describe_robot(name: str) -> dict[str, Any]:

@@ -25,6 +25,7 @@ class Survey:
     tasks: dict[str, None] = field(default_factory=dict)
     mismatches: dict[str, None] = field(default_factory=dict)
     robots: dict[str, None] = field(default_factory=dict)
+    sensings: dict[str, None] = field(default_factory=dict)
     seeds: list[range] = field(default_factory=list)  # in order, without gaps within each
     examples: list[RunRequest] = field(default_factory=list)
     """With every plant in every condition (mismatch, noise, times) and with every controller, and every task."""
@@ -57,7 +58,7 @@ def survey(requests: Sequence[RunRequest]) -> Survey:
             found.examples.append(request)
     for example in found.examples:
         found.plants[example.plant] = found.controllers[example.controller] = found.tasks[example.task] = None
-        found.mismatches[str(example.mismatch)] = None
+        found.mismatches[str(example.mismatch)] = found.sensings[example.sensing] = None
         if not find_plant(example.plant).own_robot:
             found.robots[example.robot] = None
     found.digest, found.seeds = digest.hexdigest(), seeds.merged()

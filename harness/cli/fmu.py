@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servobench.harness.cli.options import RobotOption, known_robot
+from servobench.harness.cli.options import RobotOption, SensingOption, known_robot
 from servobench.harness.cli.terminal import console
 
 fmu_app = typer.Typer(help="Export an arm as an FMU; check and show FMUs.", no_args_is_help=True)
@@ -21,6 +21,7 @@ def export(
     fmi: Annotated[int, typer.Option(help="2 or 3; both offer co-simulation and model exchange.")] = 2,
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
     robot: RobotOption = "ur5",
+    sensing: SensingOption = "position",
     seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
     platforms: Annotated[
         str | None,
@@ -31,13 +32,16 @@ def export(
     from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
     from servobench.fmus.export import ExportOptions, default_actuation, export_fmu
     from servobench.harness.config.robots import find_robot
+    from servobench.harness.config.sensing import find_sensing
     from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
     from servobench.plant.seeds import named_seed
 
     described = find_robot(known_robot(robot))
     try:
-        model, _ = sample_mismatch(Mismatch.parse(mismatch), described, named_seed(seed, "mismatch"))
+        drawn, differs = named_seed(seed, "mismatch"), Mismatch.parse(mismatch)
+        arm, sample = sample_mismatch(differs, described, drawn)
+        model, _ = find_sensing(sensing).true(described, arm, sample, differs, drawn)
         words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
         options = ExportOptions(fmi, model, default_actuation(described), parse_platforms(platforms), words, described)
         export_fmu(output, options)

@@ -29,9 +29,19 @@ from servobench.harness.cli.verify import verify
 
 INPUT_ERROR = 2  # exit code
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
-ROBOTLESS = {  # why a command has no --robot
-    "claims": "the claims are those of the paper, which are about a UR5",
-    "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+WITHOUT: dict[tuple[object, object], str] = {  # why a command does not have an option that others have
+    ("claims", "--robot"): "the claims are those of the paper, which are about a UR5",
+    ("tune", "--robot"): "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how "
+    "they do",
+    ("claims", "--sensing"): "the claims are those of the paper, which are about the ball in 3-D",
+    ("tune", "--sensing"): "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural "
+    "units; compare shows how they do",
+    (
+        "analyse",
+        "--sensing",
+    ): "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
+    ("record", "--sensing"): "films show the ball's way through space; figures of run --sensing show pixels",
+    ("controllers", "--sensing"): "settings of a controller are the same under all sensing",
 }
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
@@ -123,8 +133,9 @@ def _refuse(line: str) -> NoReturn:
 def _usage_line(error: typer.TyperException) -> str:
     """Return what a command that cannot be understood is told with; nothing where its help was printed."""
     context = getattr(error, "ctx", None)
-    if context and getattr(error, "option_name", None) == "--robot" and context.info_name in ROBOTLESS:
-        return f"{context.info_name} has no --robot: {ROBOTLESS[context.info_name]}"
+    option = getattr(error, "option_name", None)
+    if context and (context.info_name, option) in WITHOUT:
+        return f"{context.info_name} has no {option}: {WITHOUT[context.info_name, option]}"
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())
     return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""

@@ -231,6 +231,14 @@ def split_mismatches(text: str) -> tuple[str, ...]:
     return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
 
 
+def one_sensing(word: str) -> str:
+    """Return the sensing set-up that a user named; it is looked up, so that a mistyped one is refused at once."""
+    from servobench.harness.config.sensing import find_sensing
+
+    find_sensing(word)
+    return word
+
+
 def split_sensings(text: str) -> tuple[str, ...]:
     """Return the sensing set-ups that a user named; each is looked up, so that a mistyped one is refused at once."""
     from servobench.harness.config.sensing import find_sensing, sensing_names

@@ -140,6 +140,7 @@ def compare(
 def train(
     controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
     """Train the networks of a controller.
@@ -158,7 +159,7 @@ def train(
     settings, controller = overrides.settings(), choose_controller(controller)
     check_settings(settings, [controller])
     with telling(console, "training") as tell:
-        trained = train_networks(controller, settings, tell, robot)
+        trained = train_networks(controller, settings, tell, robot, sensing)
     table = Table("network", "held-out error")
     table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
     table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")

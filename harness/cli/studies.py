@@ -32,6 +32,7 @@ def robustness(
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
+    sensing: options.SensingOption = "position",
     axes: Annotated[str, typer.Option(help="Comma-separated axes, such as outliers,jitter; default: seven.")] = "",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
@@ -50,8 +51,10 @@ def robustness(
     arm = options.known_robot(robot)
     names = options.split_controllers(controllers, arm)
     where = options.split_plants(plant, "plant", arm)[0]
+    seen = options.one_sensing(sensing)
     with watching(console, out) as observer:
-        files = make_map(out, where, names, parse_seeds(seeds), settings, running.execution(observer), arm, lines)
+        how = running.execution(observer)
+        files = make_map(out, where, names, parse_seeds(seeds), settings, how, arm, lines, seen)
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 from servobench.harness.config.own import PLACE
@@ -23,9 +24,7 @@ def find_sensing(word: str) -> Sensing:
     Raises:
         ConfigurationError: an unknown word, or a file that cannot be used.
     """
-    place, _, mount = word.rpartition(":")
-    place = place if mount in (FIXED, HAND) else word
-    found = PLACE.fullmatch(place)
+    place, found = _place(word)
     own = {}
     if found is not None and found["file"]:
         own = {place: _read_eye(found["file"], found["name"])}
@@ -33,6 +32,19 @@ def find_sensing(word: str) -> Sensing:
         return Sensing.parse(word, {**EYES, **own})
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
+
+
+def sensing_file(word: str) -> SourceFile | None:
+    """Return the file of a user's own set-up; None for one of this package."""
+    _, found = _place(word)
+    return SourceFile.read(found["file"]) if found is not None and found["file"] else None
+
+
+def _place(word: str) -> tuple[str, re.Match[str] | None]:
+    """Return a word without its mount, and the file and the name in it where it is those of a user."""
+    place, _, mount = word.rpartition(":")
+    place = place if mount in (FIXED, HAND) else word
+    return place, PLACE.fullmatch(place)
 
 
 def _read_eye(file: str, name: str | None) -> Eye:

@@ -190,7 +190,11 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
 
 
 def train_networks(
-    controller: str, settings: Settings, progress: Progress, robot_name: str = DEFAULT_ROBOT
+    controller: str,
+    settings: Settings,
+    progress: Progress,
+    robot_name: str = DEFAULT_ROBOT,
+    sensing: str = DEFAULT_SENSING,
 ) -> TrainedNetworks:
     """Return the networks that a controller of this name starts from, trained where the cache has none.
 
@@ -201,10 +205,13 @@ def train_networks(
     run = settings.resolve("run", RunSettings())
     plant = KinematicConfig()
     robot = find_robot(robot_name)
-    nominal, limits = robot.nominal, robot.limits
+    try:
+        nominal, limits = find_sensing(sensing).nominal(robot), robot.limits
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
     spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
     knowledge = nominal_knowledge(robot, nominal, spec, run)
-    source = trained_on(knowledge, None, progress)
+    source = trained_on(in_view(knowledge, nominal, robot), None, progress)
 
     def obtain(config: TrainingConfig) -> TrainedNetworks:
         trained.append(source(config))

@@ -39,6 +39,7 @@ from servobench.harness.pictures.style import TEXT, WIDTH, figure_style, method_
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import check_settings
 from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, NOISE, Line
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.kinematic import KinematicConfig
 
 BASE: Final = "moderate"
@@ -79,6 +80,7 @@ def make_map(
     how: Execution,
     robot: str = DEFAULT_ROBOT,
     lines: Sequence[Line] = LINES,
+    sensing: str = DEFAULT_SENSING,
 ) -> list[Path]:
     """Carry out the runs of a map, put its tables together and draw it.
 
@@ -91,6 +93,7 @@ def make_map(
         how: how the runs are carried out.
         robot: name, or the path of a file.
         lines: its axes.
+        sensing: set-up of its cameras.
 
     Returns:
         The files of the pictures.
@@ -102,7 +105,7 @@ def make_map(
         raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")
     check_settings(settings, [plant, TASK, *controllers])
     settings = Settings(settings.sections)  # each part reads some of them
-    static, moved = map_cells(plant, controllers, seeds, robot, lines)
+    static, moved = map_cells(plant, controllers, seeds, robot, lines, sensing)
     parts = {STATIC_CAMERA: (static, settings), MOVED_CAMERA: (moved, moved_settings(settings))}
     made = [name for name, (cells, _) in parts.items() if len(cells)]
     for name in made:
@@ -110,7 +113,7 @@ def make_map(
         carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
     results.write_summary(out, map_tables(out), results.read_manifest(out / made[0]))
     limits: dict[str, float] = {}
-    if any(line.axis == LATENCY for line in lines):
+    if any(line.axis == LATENCY for line in lines) and sensing == DEFAULT_SENSING:
         limits = predicted_limits(controllers, settings, robot)
     pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
     return draw_map(results.load_runs(out), out / FIGURES, limits)
@@ -139,9 +142,10 @@ def map_cells(
     seeds: Sequence[int],
     robot: str = DEFAULT_ROBOT,
     lines: Sequence[Line] = LINES,
+    sensing: str = DEFAULT_SENSING,
 ) -> tuple[Grid[Cell], Grid[Cell]]:
     """Return the runs of the map: those whose camera stays, and those whose camera is moved."""
-    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot).requests()
+    requests = Batch((plant,), tuple(controllers), (TASK,), (BASE,), seeds, robot, (sensing,)).requests()
     static, moved = (
         [Place(line.axis, magnitude) for line in lines if (line.axis == MOVE) == moves for magnitude in line.places]
         for moves in (False, True)

@@ -11,7 +11,7 @@ coefficient of radial distortion, as in OpenCV. All functions take leading axes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -121,6 +121,12 @@ def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArra
 
 
 def _depth(points: FloatArray) -> FloatArray:
-    """Return z, (..., 1) m, not below the least depth; expressions as they are."""
+    """Return z, (..., 1) m, not below the least depth."""
     depth = points[..., 2:]
-    return depth if depth.dtype == object else np.maximum(depth, NEAR)
+    if depth.dtype != object:
+        return np.maximum(depth, NEAR)
+    least = np.empty(depth.shape, dtype=object)  # of expressions, which have methods in place of numpy's functions
+    for index in np.ndindex(depth.shape):
+        z: Any = depth[index]
+        least[index] = z.fmax(NEAR)
+    return least

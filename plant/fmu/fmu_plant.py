@@ -11,6 +11,7 @@ from servobench.plant.faults import FmuError
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.sensing import SensingConfig
 from servobench.plant.settings import NonNegative, nested, settings
 from servobench.plant.timing import RENAMED_DELAY
@@ -31,7 +32,12 @@ class FmuConfig:
 
 
 def build_fmu(
-    mapping: FmuMapping, setup: PlantSetup, command_delay: float, sensing: SensingConfig, lag: float | None = None
+    mapping: FmuMapping,
+    setup: PlantSetup,
+    command_delay: float,
+    sensing: SensingConfig,
+    lag: float | None = None,
+    model: SensedArm | None = None,
 ) -> Bench:
     """Return the plant of an FMU, for a registry.
 
@@ -41,13 +47,14 @@ def build_fmu(
         command_delay: between a command and its first effect, s.
         sensing: noise, latency, frame period and lost frames.
         lag: time constant of the FMU's joints, s; None where it is unknown.
+        model: what the FMU is known to be, for names, unit and natural size of its features.
 
     Raises:
         ValueError: an FMU or mapping that cannot be used; also if the FMU itself says so.
     """
     try:
         start = mapping.start if setup.start is None else setup.start
-        return build_bench(lambda own: FmuWorld(mapping, start, own.period, lag), setup, command_delay, sensing)
+        return build_bench(lambda own: FmuWorld(mapping, start, own.period, lag, model), setup, command_delay, sensing)
     except FmuError as error:
         raise ValueError(str(error)) from error
 

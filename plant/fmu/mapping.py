@@ -92,6 +92,8 @@ class FmuMapping:
     """What the controller sees; they give m."""
     joints: Names = ()
     """Joint positions, rad; without them, commands are integrated."""
+    seen: Names = ()
+    """Which features are seen: above 0.5 for each of them that is; without it all are."""
     truth: TruthMapping = nested(TruthMapping)
     """For evaluation only."""
     home: str | None = None
@@ -151,6 +153,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
     truth = mapping.truth
     for name, names, size in (
         ("joints", mapping.joints, n),
+        ("seen", mapping.seen, m),
         ("truth.features", truth.features, m),
         ("truth.jacobian", truth.jacobian, n * m),
         ("truth.states", truth.states, n),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
@@ -26,10 +26,13 @@ from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.plant import TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
+from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.seeds import Seeds
 from servobench.plant.settings import Names
-from servobench.plant.signals import Truth
+from servobench.plant.signals import BoolArray, Truth
 from servobench.plant.world import World
+
+SEEN_ABOVE = 0.5  # a number that says whether a feature is seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +54,16 @@ class FmuState:
 class FmuWorld(World):
     """y, q ← fmi…GetReal after fmi…DoStep under the held command, with an instance for each run side by side."""
 
-    def __init__(self, mapping: FmuMapping, start: FloatArray | None, period: float, lag: float | None = None) -> None:
+    _seen: BoolArray | None = None
+
+    def __init__(
+        self,
+        mapping: FmuMapping,
+        start: FloatArray | None,
+        period: float,
+        lag: float | None = None,
+        model: SensedArm | None = None,
+    ) -> None:
         """Extract and load the FMU and look all names up.
 
         Args:
@@ -60,6 +72,7 @@ class FmuWorld(World):
                 own home, or 0. Its leading axis says how many runs there are.
             period: of `advance`, s.
             lag: time constant of the FMU's joints, s; None where it is unknown.
+            model: what the FMU is known to be, for names, unit and natural size of its features.
 
         Raises:
             ValueError: an FMU that cannot be used, or a name or size that does not fit.
@@ -74,6 +87,8 @@ class FmuWorld(World):
         if description.needs_tool:
             logger.warning("%s calls the tool that made it, which has to be installed here", mapping.file.name)
         self.spec = mapping_spec(mapping, self.description, period)
+        if model is not None:
+            self.spec, self.noise_unit = replace(self.spec, feature=model.channel), model.noise_unit
         self._has_start = start is not None
         start = np.zeros(self.spec.n) if start is None else start
         self.lead = np.shape(start)[:-1]
@@ -98,9 +113,9 @@ class FmuWorld(World):
         truth = mapping.truth
         self._has_joints = bool(mapping.joints)
         self._command = self._port("inputs", mapping.inputs)
-        self._result = self._port("joints and features", (*mapping.joints, *mapping.features))
+        self._result = self._port("joints, features and seen", (*mapping.joints, *mapping.features, *mapping.seen))
         self._truth = self._port("truth", (*(truth.features or mapping.features), *truth.jacobian))
-        self._split = self._result.values.shape[-1] - self.spec.m
+        self._split = self.spec.n if mapping.joints else 0
         self._now = ctypes.c_double()
         setters = {
             name: (variables[0], setter(variables, name, value, self.lead)) for name, variables, value in self._values()
@@ -186,11 +201,13 @@ class FmuWorld(World):
             for i in np.flatnonzero(~np.isfinite(values).all(axis=-1)).tolist():
                 self._instances.drop(i, self._not_finite(values.reshape(-1, values.shape[-1])[i]))
             failed = list(self.faults)
-            values[failed, self._split :] = self._feature[failed]
+            values[failed, self._split : self._split + self.spec.m] = self._feature[failed]
             if self._has_joints:
                 values[failed, : self._split] = self._joints[failed]
         self._joints = values[..., : self._split] if self._has_joints else self._integrated
-        self._feature = values[..., self._split :]
+        self._feature = values[..., self._split : self._split + self.spec.m]
+        if self._mapping.seen:
+            self._seen = values[..., self._split + self.spec.m :] > SEEN_ABOVE
 
     def _not_finite(self, values: FloatArray) -> FmuError:
         bad = [label for label, value in zip(self._result.labels, values, strict=True) if not np.isfinite(value)]
@@ -199,6 +216,10 @@ class FmuWorld(World):
     def see(self) -> FloatArray:
         """Return the FMU's feature as read after the last step."""
         return self._feature
+
+    def visible(self) -> BoolArray | None:
+        """Return which features the FMU says are seen; see `World.visible`."""
+        return self._seen
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """Set the parameters of the camera's pose; see `Plant.move_camera`.
@@ -252,6 +273,7 @@ class FmuWorld(World):
         self.lead, self._rows = (len(chosen),), self._rows[lanes]
         arrays = self._start, self._joints, self._feature, self._integrated
         self._start, self._joints, self._feature, self._integrated = (array[lanes] for array in arrays)
+        self._seen = None if self._seen is None else self._seen[lanes]
 
     def save(self) -> FmuState:
         """Return the present state of the FMU; see `Plant.save`.

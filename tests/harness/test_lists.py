@@ -121,3 +121,9 @@ def test_a_command_without_arms_says_why(monkeypatch, capsys, name):
     error = capsys.readouterr().err
     assert error.startswith(f"servobench: {name} has no --robot: ")
     assert "UR5" in error
+
+
+@pytest.mark.parametrize("name", ["tune", "claims", "record", "controllers"])
+def test_a_command_without_cameras_says_why(monkeypatch, capsys, name):
+    assert servobench(monkeypatch, name, "--sensing", "pixel") == 2
+    assert capsys.readouterr().err.startswith(f"servobench: {name} has no --sensing: ")

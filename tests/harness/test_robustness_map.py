@@ -130,6 +130,11 @@ def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, 
     assert "half of the runs or more never settle" in figures[1].get_suptitle()
 
 
+def test_a_map_of_pixels_has_them_at_every_place():
+    usual, moved = map_cells("kinematic", ["constant"], [0], sensing="stereo:hand")
+    assert {cell.request.sensing for cell in [*usual, *moved]} == {"stereo:hand"}
+
+
 def test_the_map_of_another_arm_has_its_runs_and_its_prediction():
     usual, moved = map_cells("kinematic", ["constant"], [0], "panda")
     assert {cell.request.robot for cell in [*usual, *moved]} == {"panda"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
 from servobench.controllers.units import in_natural_units
+from servobench.harness.batch.manifest import describe_sensing
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.sensing import find_sensing, sensing_names
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
-from servobench.harness.run.experiment import build, build_experiment
+from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.pose_error import pose_error
 from servobench.harness.run.pose_tasks import PoseTask, displaced, pose_start
 from servobench.harness.run.request import RunRequest
@@ -251,9 +254,11 @@ def test_a_start_out_of_view_is_a_run_without_a_feature():
     assert "not visible at the start" in row["reason"]
 
 
-def test_other_plants_have_the_position_only():
-    with pytest.raises(ConfigurationError, match="plant fmu has the sensing position only, got --sensing pixel"):
-        build(resolve(replace(request("pixel"), plant="fmu"), Settings({})))
+def test_a_plant_may_have_the_position_only(monkeypatch):
+    entry = replace(find_plant("kinematic"), any_sensing=False)
+    monkeypatch.setattr(experiment, "find_plant", lambda _: entry)
+    with pytest.raises(ConfigurationError, match="plant kinematic has the sensing position only, got --sensing pixel"):
+        build(resolve(request("pixel"), Settings({})))
 
 
 def test_a_plate_is_refused_for_an_arm_of_four_joints(tmp_path):
@@ -290,6 +295,16 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     row = run_experiment(request(f"{file}:hand"), Settings({})).row
     assert row["outcome"] == "settled"
     assert row["sensing"] == f"{file}:hand"
+    told = describe_sensing(f"{file}:hand")
+    assert told == {
+        "name": f"{file}:hand",
+        "features": ["r", "y", "z"],
+        "unit": "m",
+        "cameras": 1,
+        "file": str(file),
+        "sha256": hashlib.sha256(OWN.encode()).hexdigest(),
+    }
+    assert "sha256" not in describe_sensing("stereo:hand")
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")
     (tmp_path / "none.py").write_text("x = 1\n")
@@ -297,6 +312,18 @@ def test_a_file_can_bring_a_set_up(tmp_path):
         find_sensing(str(tmp_path / "none.py"))
     with pytest.raises(ConfigurationError, match="unknown sensing 'pixle': did you mean 'pixel'"):
         find_sensing("pixle")
+
+
+def test_networks_are_trained_on_the_features_of_a_set_up():
+    few = {"samples": 100, "width_scales": [1.0], "regularisations": [1e-6]}
+    training = {"jacobian": {**few, "centres": 5}, "controller": {**few, "hidden": 5}}
+    settings = Settings({"rbfnn_mfac": {"training": training}})
+    by_metres, by_pixels = (
+        train_networks("rbfnn_mfac", settings, lambda *_: None, "ur5", word) for word in ("position", "pixel")
+    )
+    assert (by_metres.jacobian.m, by_pixels.jacobian.m) == (3, 2)
+    with pytest.raises(ConfigurationError, match="has no networks to train"):
+        train_networks("ukf_mfac", Settings({}), lambda *_: None, "ur5", "pixel")
 
 
 def test_names_of_all_set_ups_are_found():
