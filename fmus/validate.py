@@ -13,8 +13,8 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description
-from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
+from servobench.plant.fmu.port import Port
 
 TOLERANCE = 1e-9
 

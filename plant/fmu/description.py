@@ -67,6 +67,9 @@ class FmuDescription:
         once_per_process: its library bears one instance only.
         variables: all of them, in order.
         needs_tool: it calls the tool that made it, which has to be installed.
+        exchange: it offers model exchange only and has to be integrated by a solver.
+        n_states: number of continuous states.
+        n_indicators: number of event indicators.
         internal_step: its own fixed step size, s, of which steps must be multiples; None for none.
     """
 
@@ -80,6 +83,9 @@ class FmuDescription:
     once_per_process: bool
     variables: tuple[Variable, ...]
     needs_tool: bool = False
+    exchange: bool = False
+    n_states: int = 0
+    n_indicators: int = 0
     internal_step: float | None = None
 
     @cached_property
@@ -145,14 +151,13 @@ def read_description(path: Path, root: Path) -> FmuDescription:
     """Read the model description of the FMU at `path`, extracted to `root`; once a process.
 
     Raises:
-        ValueError: broken, of FMI 1, or without co-simulation.
+        ValueError: broken, of FMI 1, or with scheduled execution only.
     """
     description = parse_description(path, root)
     version = str(description.fmiVersion)
-    interface = description.coSimulation
+    interface = description.coSimulation or description.modelExchange
     if interface is None:
-        offered = "model exchange" if description.modelExchange is not None else "scheduled execution"
-        raise ValueError(f"fmu file {path} offers {offered} only; wanted co-simulation")
+        raise ValueError(f"fmu file {path} offers scheduled execution only; wanted co-simulation or model exchange")
     return FmuDescription(
         path=path,
         version=int(version[0]),
@@ -164,6 +169,9 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         once_per_process=bool(interface.canBeInstantiatedOnlyOncePerProcess),
         variables=tuple(_variable(each, path) for each in description.modelVariables),
         needs_tool=bool(interface.needsExecutionTool),
+        exchange=description.coSimulation is None,
+        n_states=int(description.numberOfContinuousStates or 0),
+        n_indicators=int(description.numberOfEventIndicators or 0),
         internal_step=_internal_step(root),
     )
 

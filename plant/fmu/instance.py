@@ -1,4 +1,4 @@
-"""One interface to an instance of a co-simulation FMU for FMI 2 and FMI 3.
+"""One interface to an instance of an FMU for FMI 2 and FMI 3; one of model exchange only is integrated.
 
 The libraries are called by ctypes with argument objects that are made once: a call then costs a third of a microsecond,
 whereas converting lists at every call costs several.
@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import logging
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -21,80 +19,17 @@ import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.description import FmuDescription, Variable, total_size
+from servobench.plant.fmu.description import FmuDescription, Variable
+from servobench.plant.fmu.exchange import Integrator
 from servobench.plant.fmu.library import condemn, is_condemned, load_library, unload_library
-
-logger = logging.getLogger("servobench.fmu")
+from servobench.plant.fmu.messages import MessageLog
+from servobench.plant.fmu.port import Port
 
 Call: TypeAlias = Callable[[], None]
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # of numbers: the word in the names of functions, the type in memory
 RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
-STATUS_WORDS = ("ok", "warning", "discard", "error", "fatal", "pending")
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
-REMEMBERED_MESSAGES = 5
 MIN_PROGRESS = 1e-9  # share of a step that a partial step must cover
-STATUS_LEVELS = (logging.DEBUG, logging.WARNING, logging.WARNING, logging.ERROR, logging.ERROR, logging.DEBUG)
-
-
-class Port:
-    """Variables that are read or written together, with their buffer; instances side by side have a row each.
-
-    Attributes:
-        values: (..., size), the buffer.
-        members: the variables themselves.
-        variables: value references and their number, for C.
-    """
-
-    def __init__(self, variables: Sequence[Variable], lead: tuple[int, ...] = ()) -> None:
-        """Prepare the buffer, whose leading axis is `lead`."""
-        self.members = tuple(variables)
-        self.values: FloatArray = np.zeros((*lead, total_size(variables)))
-        self._address = self.values.ctypes.data
-        count = len(variables)
-        references = (ctypes.c_uint32 * count)(*(variable.reference for variable in variables))
-        self.variables = references, ctypes.c_size_t(count)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """A name for each number of a row, for messages."""
-        return tuple(label for variable in self.members for label in variable.labels())
-
-    @property
-    def summary(self) -> str:
-        """A few names, for messages."""
-        return ", ".join(self.labels[:3]) + (", …" if len(self.labels) > 3 else "")
-
-    def pointer(self, row: int = 0) -> ctypes.c_void_p:
-        """Return a row of the buffer, for C."""
-        return ctypes.c_void_p(self._address + row * self.values.shape[-1] * self.values.itemsize)
-
-
-class MessageLog:
-    """Forwards an FMU's messages to the log and keeps the last ones for errors."""
-
-    def __init__(self, name: str) -> None:
-        """Start empty."""
-        self._name = name
-        self._last: deque[str] = deque(maxlen=REMEMBERED_MESSAGES)
-
-    def add(self, status: int, message: str) -> None:
-        """Take a message with its status."""
-        text = " ".join(message.split())
-        self._last.append(text)
-        level = STATUS_LEVELS[status] if 0 <= status < len(STATUS_LEVELS) else logging.ERROR
-        logger.log(level, "%s: %s", self._name, text)
-
-    def failure(self, function: str, outcome: int | str) -> FmuError:
-        """Return the error of a call that returned a bad status, or what else the words say, with the last messages.
-
-        The messages are forgotten.
-        """
-        word = outcome
-        if isinstance(outcome, int):
-            word = STATUS_WORDS[outcome] if 0 <= outcome < len(STATUS_WORDS) else "nothing usable"
-        said = f"; the FMU said: {' | '.join(self._last)}" if self._last else ""
-        self._last.clear()
-        return FmuError(f"{self._name}: {function} returned {word}{said}")
 
 
 class Instance(ABC):
@@ -107,6 +42,7 @@ class Instance(ABC):
         state: what the functions for states call these.
         deserialise: the verb of the function that reads a state from bytes.
         early: word for a step that ended early.
+        derivatives: what the function that reads the states' derivatives is called.
     """
 
     prefix: ClassVar[str]
@@ -115,6 +51,7 @@ class Instance(ABC):
     state: ClassVar[str]
     deserialise: ClassVar[str]
     early: ClassVar[str]
+    derivatives: ClassVar[str]
 
     def __init__(self, description: FmuDescription, root: Path, library: Any = None) -> None:  # noqa: ANN401 - ctypes
         """Make an instance.
@@ -156,6 +93,7 @@ class Instance(ABC):
     def start(self, time: float) -> None:
         """Go through initialisation, to begin at `time`."""
         self._initialise(time)
+        self._integrator = Integrator(self, self.derivatives)
         self._begun = True
 
     @abstractmethod
@@ -168,6 +106,23 @@ class Instance(ABC):
 
         It returns 0 where the step was taken without anything to report; any other result is for `finish`.
         """
+
+    @abstractmethod
+    def update_discrete_states(self) -> tuple[bool, bool, float]:
+        """Update the discrete states, in event mode of model exchange.
+
+        Returns:
+            Whether it has to be repeated, whether the FMU wants to end, and the time of the next event, s.
+        """
+
+    def _integrated(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """Return the `step_call` of model exchange, which raises FmuError instead of returning a bad status."""
+
+        def advance() -> int:
+            self._integrator.advance(now.value, step.value)
+            return OK
+
+        return advance
 
     @abstractmethod
     def _reached(self, status: int, time: float) -> float | None:

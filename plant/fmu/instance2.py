@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import weakref
 from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
-from servobench.plant.fmu.instance import DISCARD, OK, Instance, Kinds, MessageLog, RawCall
+from servobench.plant.fmu.instance import DISCARD, OK, Instance, Kinds, RawCall
+from servobench.plant.fmu.messages import MessageLog
 
-CO_SIMULATION = 1
+MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 LAST_SUCCESSFUL_TIME = 2
 
 _Logger = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 _Allocate = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
 _Free = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+
+
+class _EventInfo(ctypes.Structure):
+    _fields_ = (
+        ("again", ctypes.c_int),
+        ("ends", ctypes.c_int),
+        ("nominals_changed", ctypes.c_int),
+        ("states_changed", ctypes.c_int),
+        ("has_next", ctypes.c_int),
+        ("next_time", ctypes.c_double),
+    )
 
 
 class _Callbacks(ctypes.Structure):
@@ -45,6 +58,7 @@ class Instance2(Instance):
     """One instance of an FMI 2.0 FMU."""
 
     prefix, real, state, deserialise, early = "fmi2", "Real", "FMUstate", "DeSerialize", "discard"
+    derivatives = "GetDerivatives"
     kinds: ClassVar[Kinds] = {
         "Real": ("Real", np.float64),
         "Integer": ("Integer", np.int32),
@@ -58,7 +72,7 @@ class Instance2(Instance):
         create.restype = ctypes.c_void_p
         address: int | None = create(
             self.description.model_name.encode(),
-            ctypes.c_int(CO_SIMULATION),
+            ctypes.c_int(MODEL_EXCHANGE if self.description.exchange else CO_SIMULATION),
             self.description.token.encode(),
             (self.root / "resources").as_uri().encode(),
             ctypes.byref(self._callbacks),
@@ -76,7 +90,15 @@ class Instance2(Instance):
 
     def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         """See `Instance.step_call`."""
+        if self.description.exchange:
+            return self._integrated(now, step)
         return partial(self.function("DoStep"), self._component, now, step, ctypes.c_int(1))
+
+    def update_discrete_states(self) -> tuple[bool, bool, float]:
+        """See `Instance.update_discrete_states`."""
+        info = _EventInfo()
+        self.call("NewDiscreteStates", ctypes.byref(info))
+        return bool(info.again), bool(info.ends), info.next_time if info.has_next else math.inf
 
     def _reached(self, status: int, time: float) -> float | None:
         if status != DISCARD:

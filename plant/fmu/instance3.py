@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from functools import partial
 from typing import Any, ClassVar
@@ -10,7 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from servobench.plant.faults import FmuError
-from servobench.plant.fmu.instance import OK, WARNING, Instance, Kinds, Port, RawCall
+from servobench.plant.fmu.instance import OK, WARNING, Instance, Kinds, RawCall
+from servobench.plant.fmu.port import Port
 
 LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
 
@@ -19,6 +21,7 @@ class Instance3(Instance):
     """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
 
     prefix, real, state, deserialise, early = "fmi3", "Float64", "FMUState", "Deserialize", "early"
+    derivatives = "GetContinuousStateDerivatives"
     kinds: ClassVar[Kinds] = {
         "Float64": ("Float64", np.float64),
         "Float32": ("Float32", np.float32),
@@ -39,23 +42,15 @@ class Instance3(Instance):
             log.add(status, (message or b"").decode("utf-8", errors="replace"))
 
         self._on_message = LogMessage(on_message)
-        create = self.function("InstantiateCoSimulation")
+        exchange = self.description.exchange
+        create = self.function("InstantiateModelExchange" if exchange else "InstantiateCoSimulation")
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
-        address: int | None = create(
-            self.description.model_name.encode(),
-            self.description.token.encode(),
-            (str(self.root / "resources") + os.sep).encode(),
-            no,
-            no,
-            no,
-            ctypes.c_bool(True),  # it may return early
-            null,
-            ctypes.c_size_t(0),
-            null,
-            self._on_message,
-            null,
-        )
+        names = self.description.model_name, self.description.token, str(self.root / "resources") + os.sep
+        common = [*(name.encode() for name in names), no, no]  # neither visible nor with a debug log
+        early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
+        end = [null, self._on_message]
+        address: int | None = create(*common, *end) if exchange else create(*common, *early_return, *end, null)
         return address
 
     def _initialise(self, time: float) -> None:
@@ -65,10 +60,20 @@ class Instance3(Instance):
 
     def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
         """See `Instance.step_call`."""
+        if self.description.exchange:
+            return self._integrated(now, step)
         end, early = self._end, self._early
         results = [ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)]
         call = partial(self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results)
         return lambda: call() or (WARNING if end.value or early.value else OK)
+
+    def update_discrete_states(self) -> tuple[bool, bool, float]:
+        """See `Instance.update_discrete_states`."""
+        again, ends, nominals, states, has_next = (ctypes.c_bool() for _ in range(5))
+        following = ctypes.c_double()
+        results = [ctypes.byref(each) for each in (again, ends, nominals, states, has_next, following)]
+        self.call("UpdateDiscreteStates", *results)
+        return again.value, ends.value, following.value if has_next.value else math.inf
 
     def _reached(self, status: int, time: float) -> float | None:
         self.check("fmi3DoStep", status)

@@ -14,10 +14,11 @@ from typing import Any
 
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.description import FmuDescription
-from servobench.plant.fmu.instance import OK, Instance, Port, RawCall
+from servobench.plant.fmu.instance import OK, Instance, RawCall
 from servobench.plant.fmu.instance2 import Instance2
 from servobench.plant.fmu.instance3 import Instance3
 from servobench.plant.fmu.library import load_library, unload_library
+from servobench.plant.fmu.port import Port
 
 
 @dataclass(frozen=True, eq=False)

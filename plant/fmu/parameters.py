@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, total_size
-from servobench.plant.fmu.instance import Instance, Port
+from servobench.plant.fmu.instance import Instance
+from servobench.plant.fmu.port import Port
 
 STRUCTURAL: Final = "structuralParameter"
 BITS: Final = {

@@ -19,11 +19,13 @@ from servobench.plant.checks import FloatArray, as_array, is_finite, whole_steps
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import Variable, read_description
-from servobench.plant.fmu.instance import Instance, Port, logger
+from servobench.plant.fmu.instance import Instance
 from servobench.plant.fmu.instances import Instances, Lane
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec
+from servobench.plant.fmu.messages import logger
 from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
+from servobench.plant.fmu.port import Port
 from servobench.plant.plant import TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.sensed import SensedArm

@@ -21,7 +21,7 @@ MAPPING = {
 }
 
 FMI1 = describe_with(2, 'fmiVersion="2.0"', 'fmiVersion="1.0" modelIdentifier="crane" numberOfContinuousStates="0"')
-EXCHANGE_ONLY = describe_with(2, "<CoSimulation", "<ModelExchange")
+SCHEDULED_ONLY = describe_with(3, "<CoSimulation", "<ScheduledExecution")
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
     ("version", "arguments", "more", "message"),
     [
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
-        (2, {"description": EXCHANGE_ONLY}, "", "offers model exchange only; wanted co-simulation"),
+        (3, {"description": SCHEDULED_ONLY}, "", "offers scheduled execution only; wanted co-simulation or model"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
         (2, {}, "[parameters]\nquirk = 5\n", "fmi2EnterInitializationMode returned error"),
         (

@@ -22,8 +22,8 @@ from servobench.fmus.variables import parameters_of
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description
-from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
+from servobench.plant.fmu.port import Port
 from servobench.plant.kinematic import ENTRY as KINEMATIC
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.signals import Command

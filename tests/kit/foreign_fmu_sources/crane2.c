@@ -156,8 +156,16 @@ int fmi2GetContinuousStates(void *c, double *states, size_t n)
 int fmi2GetDerivatives(void *c, double *rates, size_t n)
 {
     for (size_t i = 0; i < n; i++) rates[i] = ((Crane *)c)->push[i];
+    return ((Crane *)c)->push[0] > 50.0 ? 3 : 0;
+}
+
+int fmi2GetNominalsOfContinuousStates(void *c, double *nominals, size_t n)
+{
+    for (size_t i = 0; i < n; i++) nominals[i] = 1.0;
     return 0;
 }
+
+int fmi2GetEventIndicators(void *c, double *indicators, size_t n) { return 0; }
 
 int fmi2GetDirectionalDerivative(void *component, const unsigned *unknowns, size_t n_unknowns, const unsigned *knowns,
                                  size_t n_knowns, const double *seed, double *sensitivity)
