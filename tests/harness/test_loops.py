@@ -168,6 +168,14 @@ def test_the_delay_margin_shrinks_with_the_gain_and_is_zero_for_an_unstable_loop
     assert unstable == 0.0
 
 
+def test_a_law_that_was_trained_on_the_nominal_model_has_a_delay_margin():
+    small = {"jacobian": {"centres": 8, "samples": 60}, "controller": {"hidden": 4, "samples": 60}}
+    warm = warm_up(resolved("rbfnn_mfac", training=small))
+    linear = linear_controller(warm, "true")
+    assert np.isfinite(linear.D).all()
+    assert np.abs(linear.D).max() > 0.0
+
+
 def test_only_a_composed_controller_has_a_fast_delay_margin():
     with pytest.raises(TypeError, match="controller must be a ServoController"):
         delay_margin(resolved("nmpc_calibrated").controller, "nmpc_calibrated")

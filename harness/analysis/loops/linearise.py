@@ -20,8 +20,7 @@ import numpy as np
 
 from servobench.controllers.controller import JacobianFunction
 from servobench.controllers.servo import Servo, ServoState
-from servobench.controllers.stages.estimation import EstimationState
-from servobench.controllers.stages.pairing import Pairing
+from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.harness.analysis.loops.matrices import StateSpace
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import map_arrays
@@ -41,9 +40,10 @@ class FrozenEstimation:
         pairing: the pair stage; None without one.
     """
 
-    def __init__(self, pairing: Pairing | None, jacobian: JacobianFunction) -> None:
-        """Take the pair stage, which goes on to remember joint positions, and the Jacobian."""
-        self.pairing, self._jacobian = pairing, jacobian
+    def __init__(self, estimation: Estimation, jacobian: JacobianFunction) -> None:
+        """Take the stages, of which the pair stage goes on to remember joint positions, and the Jacobian."""
+        self.pairing, self._jacobian = estimation.pairing, jacobian
+        self.into_model_frame = estimation.into_model_frame  # of what was learned before
 
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
         """Return the state at an observation; see `Estimation.update`."""
@@ -62,7 +62,7 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     """
     other, pairing, estimation = copy.copy(servo), servo.estimation.pairing, state.estimation
     estimation = estimation._replace(learned=estimation.learned._replace(estimator=None))  # it may be large
-    other.estimation = FrozenEstimation(pairing, jacobian)  # type: ignore[assignment]
+    other.estimation = FrozenEstimation(servo.estimation, jacobian)  # type: ignore[assignment]
     other.predictor = None if servo.predictor is None else servo.predictor.frozen()
     if pairing is not None:
         pair = estimation.learned.pair
