@@ -28,7 +28,9 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 BEFORE = "d7032c3"  # the last commit in which every run was carried out by itself
-LIBRARIES = ("numpy", "scipy", "casadi", "daqp", "fmpy", "pybullet", "pandas", "distributed", "filterpy", "do-mpc")
+LIBRARIES = (
+    "numpy", "scipy", "casadi", "daqp", "fmpy", "pybullet", "mujoco", "pandas", "distributed", "filterpy", "do-mpc",
+)  # fmt: skip
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -53,9 +55,13 @@ the same in numpy, for which every run has the same arm."""),
 Processor time of a period by part, on `kinematic`. Functions are wrapped from outside, which adds some µs to a period
 of a single run; building and judging are spread over the periods of the run. Estimator and law together are the step of
 a controller."""),
-    Section("Beside other tools", ("fmu_step", "ukf_update", "mpc_step", "bullet_period"), """\
+    Section(
+        "Beside other tools",
+        ("fmu_step", "ukf_update", "mpc_step", "bullet_period", "mujoco_period", "engines"),
+        """\
 Each table compares within one process, in turns: calls into an FMU with fmpy, the unscented filter with filterpy, the
-predictive law with do-mpc and IPOPT, and the rendered plant with a loop over PyBullet in the manner of Gymnasium."""),
+predictive law with do-mpc and IPOPT, and the rendered plant with a loop over PyBullet in the manner of Gymnasium. The
+last two are how far `mujoco` is from `bullet` under the same commands and in the same images."""),
     Section("Cost against size", ("scaling",), """\
 The exponent p is that of the fit cost = a sizeᵖ; −1 for runs side by side would mean that further runs cost nothing.
 Dotted lines are single runs, the others blocks of 128. Joints and horizon are measured on a linear robot y = J q."""),

@@ -73,7 +73,7 @@ def claims(
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
     from servobench.harness.studies.claims.studies import find_divisions
-    from servobench.harness.studies.claims.table import ANSWERS, differences, read_answers
+    from servobench.harness.studies.claims.table import ANSWERS, differences, elsewhere, read_answers
 
     names = options.split_plants(plants)
     divisions = find_divisions(division)
@@ -82,7 +82,8 @@ def claims(
         answers = reproduce(out, names, seeds, running.execution(observer), divisions)
     for answer in answers:
         title = f"{answer.title} on {answer.plant}, {answer.division}"
-        console.print(f"[bold]{title}: {answer.verdict}[/bold]", soft_wrap=True, highlight=False)
+        verdict = answer.verdict + elsewhere(answer, answers)
+        console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
     console.print(f"answers in {out / ANSWERS}, figures in {out / FIGURES}", soft_wrap=True)
     if wanted is not None:

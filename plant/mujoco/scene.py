@@ -7,8 +7,6 @@ and smoothing, which would cost many times as much on a processor. OpenGL sample
 
 from __future__ import annotations
 
-import os
-import sys
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -55,11 +53,10 @@ class MujocoScene(Scene):
         """Load the arm; see `OpenScene`.
 
         Raises:
-            ValueError: a robot with another number of joints, nothing to render with, or a window is wanted where
-                there is no display.
+            ValueError: a robot with another number of joints, nothing to render with, or a window is wanted.
         """
-        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
+        if window:
+            raise ValueError("view needs the plant bullet: mujoco opens no window")
         self._model = _compile(arm, boxes, robot or find_robot(UR5), rig, scenery=scenery)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)  # places the light
@@ -68,29 +65,16 @@ class MujocoScene(Scene):
         for name in COSTLY:
             self._drawn.flags[getattr(mujoco.mjtRndFlag, name)] = 0
         self._options, self._view = mujoco.MjvOption(), mujoco.MjvCamera()
-        self._window: Any = None
         self._gl = open_context(self._model.vis.global_.offwidth, self._model.vis.global_.offheight)
         with self._gl.as_current():
             self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
             self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        if window:
-            self._open_window()
-
-    def _open_window(self) -> None:
-        """Show the arm from the front right, without MuJoCo's side panels."""
-        from mujoco import viewer  # noqa: PLC0415 - only where there is a window
-
-        self._window = viewer.launch_passive(self._model, self._data, show_left_ui=False, show_right_ui=False)
-        camera = self._window.cam
-        camera.distance, camera.azimuth, camera.elevation, camera.lookat[:] = 1.9, 140.0, -30.0, (0.3, 0.0, 0.15)
 
     def place(self, theta: FloatArray) -> None:
         """See `Scene.place`."""
         self._data.qpos[:] = theta
         mujoco.mj_kinematics(self._model, self._data)
-        if self._window is not None:
-            self._window.sync()
 
     def ball_position(self) -> FloatArray:
         """See `Scene.ball_position`."""
@@ -126,9 +110,6 @@ class MujocoScene(Scene):
 
     def close(self) -> None:
         """See `Scene.close`."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
         if self._gl is not None:
             with self._gl.as_current():
                 self._context.free()

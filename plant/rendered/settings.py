@@ -68,7 +68,7 @@ class RenderedConfig:
     scenery: bool = True
     """Draw the table and the floor; without them a frame costs a fifth."""
     view: bool = False
-    """Open the engine's window and run in real time."""
+    """Open a window and run in real time; with PyBullet only."""
 
     RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 

@@ -102,3 +102,10 @@ def test_a_pybullet_without_numpy_works_too(open_plant, monkeypatch):
 
     monkeypatch.setattr(pybullet, "getCameraImage", tuples)
     np.testing.assert_allclose(plant.reset(0).feature, expected.feature, atol=1e-9)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X11 names its display in the environment")
+def test_a_window_without_a_display_is_refused(open_plant, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(ValueError, match="view needs a display"):
+        open_plant(replace(BARE, view=True))

@@ -26,7 +26,7 @@ from servobench.harness.studies.claims.studies import (
     TIMED,
     studies,
 )
-from servobench.harness.studies.claims.table import differences, markdown_table, read_answers, write_tables
+from servobench.harness.studies.claims.table import differences, elsewhere, markdown_table, read_answers, write_tables
 
 METHODS = (PROPOSED, "rbf_pid", "ukf_mfac", "ukf_mpc")
 SEEDS = range(20)
@@ -168,6 +168,17 @@ def test_a_committed_table_is_compared_line_by_line(tmp_path):
     ]
     with pytest.raises(ConfigurationError, match="is not a table of answers"):
         read_answers(tmp_path / "nothing.csv")
+
+
+def test_an_answer_that_is_another_on_a_second_engine_is_marked():
+    first = replace(answer_all(tables(), "kinematic")[0], plant="bullet", verdict=REPRODUCED)
+    second = replace(first, plant="mujoco", verdict="depends: holds in 2 of 4")
+    answers = [first, second, replace(second, division="as published")]
+    assert [elsewhere(a, answers) for a in answers] == [" (otherwise on mujoco)", " (otherwise on bullet)", ""]
+    assert "**reproduced** (otherwise on mujoco)" in markdown_table(answers)
+    as_often = replace(first, verdict="depends: holds in 3 of 4")
+    assert elsewhere(as_often, [as_often, second]) == ""
+    assert elsewhere(first, [first, replace(second, verdict=UNDECIDED)]) == ""
 
 
 def test_the_methods_as_published_are_answered_for_under_their_plain_names():

@@ -136,3 +136,8 @@ def test_naming_the_plant_does_not_load_mujoco():
 
 def test_the_engine_is_named_with_what_renders():
     assert describe_renderer().startswith(f"MuJoCo {mujoco.__version__}, rendered by ")
+
+
+def test_a_window_is_refused(open_plant):
+    with pytest.raises(ValueError, match="view needs the plant bullet: mujoco opens no window"):
+        open_plant(replace(BARE, view=True))

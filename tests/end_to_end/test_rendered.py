@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from kit.rendered import HOME, IDEAL, MODEL, geared_ur5, wiggle
-from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.signals import Command
 
 
@@ -63,10 +62,3 @@ def test_a_run_that_is_restored_continues_with_the_same_bits(open_plant):
         observation = other.step(Command(u))
         np.testing.assert_array_equal(observation.joint_position, expected.joint_position)
         np.testing.assert_array_equal(observation.feature, expected.feature)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X11 names its display in the environment")
-def test_a_window_without_a_display_is_refused(open_plant, monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(ValueError, match="view needs a display"):
-        open_plant(RenderedConfig(view=True))

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.studies.claims.measurements import Answer
+from servobench.harness.studies.claims.measurements import UNDECIDED, Answer
 
 ANSWERS: Final = "answers.csv"
 MEASUREMENTS: Final = "measurements.csv"
@@ -77,5 +77,26 @@ def _agree(found: str, wanted: str) -> bool:
 def markdown_table(answers: Sequence[Answer]) -> str:
     """Return the answers as a table in Markdown."""
     lines = ["| claim | plant | division | verdict | evidence |", "|---|---|---|---|---|"]
-    lines += [f"| {a.title} | {a.plant} | {a.division} | **{a.verdict}** | {a.evidence} |" for a in answers]
+    for a in answers:
+        verdict = f"**{a.verdict}**{elsewhere(a, answers)}"
+        lines.append(f"| {a.title} | {a.plant} | {a.division} | {verdict} | {a.evidence} |")
     return "\n".join(lines) + "\n"
+
+
+def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
+    """Return a remark about the plants on which the same claim came out otherwise; empty if there is none.
+
+    In how many comparisons a claim holds is not compared, nor a verdict for which robots were too few.
+    """
+    others = [
+        other.plant
+        for other in answers
+        if (other.claim, other.division) == (answer.claim, answer.division)
+        and _outcome(other) != _outcome(answer)
+        and UNDECIDED not in (other.verdict, answer.verdict)
+    ]
+    return f" (otherwise on {', '.join(others)})" if others else ""
+
+
+def _outcome(answer: Answer) -> str:
+    return answer.verdict.partition(":")[0]
