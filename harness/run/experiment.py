@@ -160,7 +160,8 @@ def assemble(
     plant = _build_plant(resolved, entry, PlantSetup(true, start, run.period, robot))
     try:
         knowledge = nominal_knowledge(robot, nominal, plant.spec, run)
-        knowledge = replace(knowledge, train=trained_on(in_view(knowledge, nominal, robot), keep, progress))
+        if robot.known:
+            knowledge = replace(knowledge, train=trained_on(in_view(knowledge, nominal, robot), keep, progress))
         controller = _build_controller(
             request.controller, resolved.controller, knowledge, lambda: plant.with_delays(_equations(true))
         )
@@ -211,6 +212,8 @@ def train_networks(
         raise ConfigurationError(str(error)) from error
     spec = hand_eye_spec(nominal, run.period, plant.max_joint_speed, plant.joint_range, limits)
     knowledge = nominal_knowledge(robot, nominal, spec, run)
+    if knowledge.nominal_jacobian is None:
+        raise ConfigurationError(f"networks are trained on a nominal model, and controllers know none of {robot.title}")
     source = trained_on(in_view(knowledge, nominal, robot), None, progress)
 
     def obtain(config: TrainingConfig) -> TrainedNetworks:

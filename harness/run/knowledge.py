@@ -22,6 +22,8 @@ from servobench.plant.signals import PlantSpec
 
 def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     """Return what every controller may know."""
+    if not robot.known:
+        return RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
     return RobotKnowledge(
         spec=spec,
         preview=run.preview_rows,

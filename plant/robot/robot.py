@@ -65,6 +65,7 @@ class Robot:
         workspace: where it works, and where the camera hangs.
         measured: the arm as its factory measured it; None where only the nominal one is known.
         note: a line for the user about what was assumed; empty for none.
+        known: whether controllers may know it; of another one they know joints and features alone.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Robot:
     workspace: Workspace
     measured: SerialArm | None = None
     note: str = ""
+    known: bool = True
 
     @property
     def n(self) -> int:

@@ -11,7 +11,7 @@ from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import carry_out_together, run_experiment
-from servobench.harness.run.experiment import build_experiment
+from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS
@@ -92,3 +92,15 @@ def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
     monkeypatch.setattr(resolved, "installed_plant", lambda name: replace(ENTRY, own_robot=True))
     with pytest.raises(ConfigurationError, match="brings a robot of its own, so --robot panda does not apply"):
         resolve(PANDA, Settings())
+
+
+def test_of_an_arm_that_nobody_knows_a_method_has_to_probe():
+    request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
+    with pytest.raises(ConfigurationError, match="source 'nominal' needs a nominal model"):
+        build_experiment(request, Settings())
+    knowledge = build_experiment(
+        request, Settings({"ukf_mfac": {"initial": {"source": "probe"}}})
+    ).controller.servo.knowledge
+    assert (knowledge.nominal_jacobian, knowledge.nominal_sight, knowledge.train) == (None, None, None)
+    with pytest.raises(ConfigurationError, match="controllers know none of random_arm_3"):
+        train_networks("rbfnn_mfac", Settings(), lambda share, what: None, "random_arm:3")

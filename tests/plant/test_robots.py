@@ -19,6 +19,7 @@ from servobench.plant.robot.limits import JointLimits, narrowed
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
 from servobench.plant.robot.measured import nearest_title, read_calibration
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
+from servobench.plant.robot.random_arm import random_robot
 from servobench.plant.robot.teaching import find_workspace
 from servobench.plant.robot.ur5 import nominal_ur5
 
@@ -250,3 +251,25 @@ def test_a_urdf_that_is_no_xml_is_one_line_in_which_its_reader_says_why(tmp_path
     with pytest.raises(ValueError, match=r"arm\.urdf is no URDF that can be read: .*line \d+, column \d+"):
         find_robot(str(tmp_path / "arm.urdf"))
     assert caplog.records == []
+
+
+def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
+    seven, again, eight = random_robot(7), random_robot(7), random_robot(8)
+    q = np.full(seven.n, 0.3)
+    np.testing.assert_array_equal(seven.arm.ball_position(q), again.arm.ball_position(q))
+    assert not seven.known
+    assert 3 <= seven.n <= 7
+    assert seven.n != eight.n or not np.allclose(seven.arm.translation, eight.arm.translation)
+    assert set(seven.arm.gear_ratio) <= {-1.0, 1.0}
+    assert find_robot("random_arm:7") is find_robot("random_arm:7")
+
+
+@pytest.mark.parametrize("text", ["random_arm:", "random_arm:-1", "random_arm:two", "random_arm:99999999"])
+def test_a_drawn_arm_needs_a_number(text):
+    with pytest.raises(ValueError, match="random_arm needs a colon and a number, such as random_arm:7"):
+        find_robot(text)
+
+
+def test_the_number_of_a_drawn_arm_has_bounds():
+    with pytest.raises(ValueError, match="the number of a random_arm must be from 0 to 1,000,000, got 1000001"):
+        random_robot(1_000_001)
