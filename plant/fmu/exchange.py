@@ -9,16 +9,26 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from servobench.plant.faults import FmuError
-
-if TYPE_CHECKING:
-    from servobench.plant.fmu.instance import Instance
+from servobench.plant.fmu.description import FmuDescription
 
 RELATIVE_TOLERANCE: Final = 1e-8
 MAX_SOLVER_STEPS: Final = 100_000  # of CVode in one step
 MAX_EVENT_ITERATIONS: Final = 1000  # at one instant
+
+
+class Exchanging(Protocol):
+    """The part of an instance of model exchange that is used here."""
+
+    description: FmuDescription
+
+    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
+        """Call a function of the library and check its status; raises FmuError."""
+
+    def update_discrete_states(self) -> tuple[bool, bool, float]:
+        """Return whether to repeat it, whether the FMU wants to end, and the time of the next event, s."""
 
 
 class _Held:
@@ -31,7 +41,7 @@ class _Held:
 class Integrator:
     """dx/dt = f(x, u) with events, from one step to the next under held inputs u."""
 
-    def __init__(self, instance: Instance, derivatives: str) -> None:
+    def __init__(self, instance: Exchanging, derivatives: str) -> None:
         """Take an instance in event mode.
 
         Args:
