@@ -10,7 +10,8 @@ camera and a candidate delay holds θ = [vec M, e], (9 + K,), by rows of M, and 
     θ ← θ + P Hᵀ S⁻¹ ν,   P ← P − P Hᵀ S⁻¹ H P,   then e₊ takes the place of e:
     e ← σ² S⁻¹ ν,   P_ee ← σ² I − σ⁴ S⁻¹,   P_Me ← −σ² (P Hᵀ)_M S⁻¹
 
-Features that were not seen are left out of ν, H and S. All functions are pure; axes: (..., D candidates, c cameras).
+M and P_M stay where ℓ² of no feature reaches σ² (see `map_bank`), and features that were not seen are left out of
+ν, H and S. All functions are pure; axes: (..., D candidates, c cameras).
 """
 
 from __future__ import annotations
@@ -50,7 +51,13 @@ class SightBank(NamedTuple):
 
 
 def sight_update(
-    bank: SightBank, H: FloatArray, feature_step: FloatArray, valid: BoolArray, frame: FloatArray, model: FloatArray
+    bank: SightBank,
+    H: FloatArray,
+    feature_step: FloatArray,
+    valid: BoolArray,
+    frame: FloatArray,
+    model: FloatArray,
+    learns: BoolArray | bool = True,
 ) -> tuple[SightBank, Innovation]:
     """Learn from one motion.
 
@@ -61,6 +68,7 @@ def sight_update(
         valid: which of them were seen, (..., K).
         frame: σ², (..., 1).
         model: c² ℓ², (..., K).
+        learns: (...), whether M is learned; otherwise it is considered only.
     """
     theta, P = bank
     K = H.shape[-2]
@@ -76,8 +84,9 @@ def sight_update(
         raise FilterDiverged(f"covariance of the map is not positive definite: {P.tolist()}") from error
     weight = np.where(valid[..., None] & valid[..., None, :], weight, 0.0)
     gain = PH @ weight
-    theta = theta + np.matvec(gain, nu)
-    P = P - gain @ transposed(PH)
+    used = np.where(np.asarray(learns)[..., None, None], gain, 0.0)
+    theta = theta + np.matvec(used, nu)
+    P = P - used @ transposed(PH)
     P = 0.5 * (P + transposed(P))
     weighted = np.matvec(weight, nu)
     theta[..., ENTRIES:] = frame * weighted
@@ -202,13 +211,16 @@ class SightMap(CameraMap[SightBank]):
         rates, points = step.rates, self._points(step.x)
         k, shape = rates.shape[-2], (*step.x.shape[:-1], self._c, self._K)
         H = (rates[..., None] * points[..., None, None, :]).reshape(*shape, ENTRIES)
-        model = self._aids.map_error**2 * np.repeat(self._squares(step) / k, k, axis=-1)
+        squares = np.repeat(self._squares(step) / k, k, axis=-1).reshape(shape)
+        model = self._aids.map_error**2 * squares
         moved, valid = self._by_camera(step.feature_step), self._by_camera(step.valid)
-        new, said = sight_update(bank, H, moved, valid, frame[..., None, None, None], model.reshape(shape))
+        frames = frame[..., None, None, None]
+        learns = np.logical_or.reduce(valid & (squares >= frames), axis=-1)
+        new, said = sight_update(bank, H, moved, valid, frames, model, learns)
         count = np.maximum(np.add.reduce(step.valid, axis=-1), 1)[..., None]
         nis, spread, variance, before = (np.add.reduce(each, axis=-1) for each in said)
-        frames = 1.0 + np.minimum(before / (count * frame[..., None]), 1.0)
-        return new, Innovation(nis, spread, variance / count, frames)
+        shared = 1.0 + np.minimum(before / (count * frame[..., None]), 1.0)
+        return new, Innovation(nis, spread, variance / count, shared)
 
     def completed(self, bank: SightBank, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `near_turn`."""

@@ -68,6 +68,18 @@ def test_the_filter_is_generalised_least_squares_and_its_score_the_likelihood():
     np.testing.assert_allclose(sum(each.spread for each in said), np.linalg.slogdet(S)[1], rtol=1e-10)
 
 
+def test_motions_shorter_than_the_noise_leave_map_and_covariance_and_follow_the_noise():
+    H, dy, model = motions(6)
+    bank, _ = filtered(H, dy, model)
+    new, said = sight_update(bank, H[0], dy[0], np.full(K, True), np.array([FRAME]), model[0], learns=False)
+    usual, same = sight_update(bank, H[0], dy[0], np.full(K, True), np.array([FRAME]), model[0])
+    np.testing.assert_array_equal(new.theta[:ENTRIES], bank.theta[:ENTRIES])
+    np.testing.assert_allclose(new.P[:ENTRIES, :ENTRIES], bank.P[:ENTRIES, :ENTRIES], atol=1e-12)
+    assert not np.allclose(usual.theta[:ENTRIES], bank.theta[:ENTRIES])
+    np.testing.assert_array_equal(new.theta[ENTRIES:], usual.theta[ENTRIES:])
+    assert said.nis == same.nis
+
+
 def test_a_feature_that_is_not_seen_is_as_if_it_were_none():
     H, dy, model = motions(12)
     three, said = filtered(H[:, :3], dy[:, :3], model[:, :3])
