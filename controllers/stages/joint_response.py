@@ -25,7 +25,7 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, transposed
 
-SPAN = 0.004  # [s] of an entry of g, and no shorter than a period
+SPAN = 0.01  # [s] of an entry of g, and no shorter than a period; steps of encoders spoil shorter ones
 PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of spans of a second; one step of some milliradians outweighs it
 PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
 MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
