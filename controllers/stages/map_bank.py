@@ -12,9 +12,10 @@ for the joint motion d periods ago. A step Δy holds the noise of both its frame
 Without e the filter would be biased: a closed loop turns the noise of a frame into joint motion, which at a shorter
 delay than the true one seems to explain that this noise is gone from the next frame.
 
-This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. From
-steps shorter than the noise M is not learned, only considered (Schmidt–Kalman): at rest they would count by their sum,
-and what moves the feature there is no x, such as the posture's motion, of which the law undoes what is seen.
+This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. Steps
+shorter than the noise do not change M and P_M, but P_M counts in s (a Schmidt–Kalman filter). An arm at rest makes many
+such steps: the posture stage moves the joints, x is how a wrong model thinks that this moves the feature, and the law
+removes the motion that is seen. Learned from, they would teach M that x moves nothing.
 
 The candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
 

@@ -214,13 +214,13 @@ class SightMap(CameraMap[SightBank]):
         squares = np.repeat(self._squares(step) / k, k, axis=-1).reshape(shape)
         model = self._aids.map_error**2 * squares
         moved, valid = self._by_camera(step.feature_step), self._by_camera(step.valid)
-        frames = frame[..., None, None, None]
-        learns = np.logical_or.reduce(valid & (squares >= frames), axis=-1)
-        new, said = sight_update(bank, H, moved, valid, frames, model, learns)
+        variance = frame[..., None, None, None]
+        learns = np.logical_or.reduce(valid & (squares >= variance), axis=-1)
+        new, said = sight_update(bank, H, moved, valid, variance, model, learns)
         count = np.maximum(np.add.reduce(step.valid, axis=-1), 1)[..., None]
-        nis, spread, variance, before = (np.add.reduce(each, axis=-1) for each in said)
-        shared = 1.0 + np.minimum(before / (count * frame[..., None]), 1.0)
-        return new, Innovation(nis, spread, variance / count, shared)
+        nis, spread, total, before = (np.add.reduce(each, axis=-1) for each in said)
+        frames = 1.0 + np.minimum(before / (count * frame[..., None]), 1.0)
+        return new, Innovation(nis, spread, total / count, frames)
 
     def completed(self, bank: SightBank, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `near_turn`."""
