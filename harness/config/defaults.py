@@ -2,7 +2,8 @@
 
 Tuned values are files `controllers/tuned/NAME.toml` that `servobench tune` wrote, with a dot for a colon in the name;
 their table `[settings]` holds nested fields of the configuration. A controller without a file keeps the defaults of its
-class.
+class. Values are tuned for arms of which a nominal model is known, where an estimator learns what the model leaves. On
+an arm without one the estimator has the whole Jacobian to learn, and to find the first one by probing moves.
 """
 
 from __future__ import annotations
@@ -29,13 +30,26 @@ def tuned_file(name: str) -> Traversable:
 
 
 @cache
-def default_config(entry: ControllerEntry) -> Any:  # noqa: ANN401 - any configuration dataclass
+def default_config(entry: ControllerEntry, *, model_known: bool = True) -> Any:  # noqa: ANN401 - any configuration dataclass
     """Return the configuration of a controller for which nothing is set.
+
+    Args:
+        entry: of the controller.
+        model_known: whether a nominal model of the arm is known.
 
     Raises:
         ConfigurationError: a file of tuned values that is malformed or does not fit the configuration.
     """
-    return apply_settings(entry, tuned_settings(entry.name))
+    tuned = tuned_settings(entry.name)
+    return apply_settings(entry, tuned if model_known else _without_model(entry, tuned))
+
+
+def _without_model(entry: ControllerEntry, tuned: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the tuned values that hold where no model is known; those of a published method never counted on one."""
+    if entry.needs_truth or not hasattr(entry.config(), "initial"):
+        return tuned
+    kept = {key: value for key, value in tuned.items() if key != "estimator" or ":" in entry.name}
+    return kept | {"initial": {"source": "probe"}}
 
 
 def apply_settings(entry: ControllerEntry, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - as default_config

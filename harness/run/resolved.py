@@ -63,7 +63,8 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict
     robot = _common_robot(requests)
     defaults |= {name: _plant_default(name, robot) for name in dict.fromkeys(each.plant for each in requests)}
     defaults |= {
-        name: default_config(find_controller(name)) for name in dict.fromkeys(each.controller for each in requests)
+        name: default_config(find_controller(name), model_known=robot.known)
+        for name in dict.fromkeys(each.controller for each in requests)
     }
     defaults |= {name: taught(find_task(name), robot) for name in dict.fromkeys(each.task for each in requests)}
     return {name: settings.resolve(name, default) for name, default in defaults.items()}

@@ -9,6 +9,8 @@ import pytest
 
 from kit.robots import FOUR_JOINTS
 from servobench.harness.batch.manifest import describe_robot
+from servobench.harness.config.defaults import default_config
+from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
@@ -94,13 +96,23 @@ def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
         resolve(PANDA, Settings())
 
 
-def test_of_an_arm_that_nobody_knows_a_method_has_to_probe():
+def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
-    with pytest.raises(ConfigurationError, match="source 'nominal' needs a nominal model"):
-        build_experiment(request, Settings())
-    knowledge = build_experiment(
-        request, Settings({"ukf_mfac": {"initial": {"source": "probe"}}})
-    ).controller.servo.knowledge
+    experiment = build_experiment(request, Settings())
+    knowledge = experiment.controller.servo.knowledge
     assert (knowledge.nominal_jacobian, knowledge.nominal_sight, knowledge.train) == (None, None, None)
+    config, known = (default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True))
+    assert (config.initial.source, known.initial.source) == ("probe", "nominal")
+    assert config.estimator == type(config.estimator)() != known.estimator
+    assert (config.law, config.aids) == (known.law, known.aids)
+    with pytest.raises(ConfigurationError, match="source 'nominal' needs a nominal model"):
+        build_experiment(request, Settings({"ukf_mfac": {"initial": {"source": "nominal"}}}))
+    assert run_experiment(request, Settings(), steps=False).row["outcome"] == "settled"
     with pytest.raises(ConfigurationError, match="controllers know none of random_arm_3"):
         train_networks("rbfnn_mfac", Settings(), lambda share, what: None, "random_arm:3")
+
+
+def test_what_counts_on_no_model_keeps_its_values_on_an_arm_that_nobody_knows():
+    published, bound = find_controller("ukf_mfac:published"), find_controller("calibrated")
+    assert default_config(published, model_known=False).estimator == default_config(published).estimator
+    assert default_config(bound, model_known=False) == default_config(bound)
