@@ -22,6 +22,7 @@ from servobench.plant.bullet.scene import BulletScene
 from servobench.plant.checks import FloatArray, whole_steps
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
@@ -78,7 +79,7 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
     model = nominal_ur5()
     plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
-    scenes = [BulletScene(model.arm, scenery=config.scenery, window=False) for _ in range(2)]
+    scenes = [BulletScene(Room(model.arm, config.scenery)) for _ in range(2)]
     mechanics = Mechanics(model.arm, payload=config.drives.payload, assumed_payload=config.drives.assumed_payload)
     camera, environment = config.camera(), PlainEnvironment(scenes[1], config, model.X_BC)
     plant.reset(0)

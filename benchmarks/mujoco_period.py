@@ -23,6 +23,7 @@ from servobench.plant.mujoco.simulation import MujocoSimulation
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
@@ -43,7 +44,7 @@ class BareCalls:
         arm, stops = self._model.arm, np.full(6, config.joint_range)
         machine = Machine(arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
         self._simulation = MujocoSimulation(machine)
-        self._scene = MujocoScene(arm, scenery=config.scenery, window=False)
+        self._scene = MujocoScene(Room(arm, config.scenery))
         self._simulation.start(HOME)
         self._scene.place(HOME)
 
