@@ -8,20 +8,19 @@ red points as the feature.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import pybullet
 
-from measuring import asked_to_be_quick, table
+from measuring import milliseconds, print_periods
 from servobench.plant.bullet.bullet_plant import build_bullet
 from servobench.plant.bullet.mechanics import Mechanics
 from servobench.plant.bullet.scene import BulletScene
 from servobench.plant.checks import FloatArray, whole_steps
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
@@ -67,18 +66,11 @@ class PlainEnvironment:
         return {"joints": joints, "feature": feature}, -float(np.linalg.norm(feature)), False, False, {}
 
 
-def milliseconds(call: Callable[[], object]) -> float:
-    """Return how long a call takes, ms."""
-    start = time.perf_counter()
-    call()
-    return 1e3 * (time.perf_counter() - start)
-
-
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
     model = nominal_ur5()
     plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
-    scenes = [BulletScene(model.arm, scenery=config.scenery, window=False) for _ in range(2)]
+    scenes = [BulletScene(Room(model.arm, config.scenery)) for _ in range(2)]
     mechanics = Mechanics(model.arm, payload=config.drives.payload, assumed_payload=config.drives.assumed_payload)
     camera, environment = config.camera(), PlainEnvironment(scenes[1], config, model.X_BC)
     plant.reset(0)
@@ -109,16 +101,5 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     return times
 
 
-def main() -> None:
-    """Print medians and ratios, with and without table and floor."""
-    repeats = 3 if asked_to_be_quick(__doc__) else 200
-    rows = []
-    for name, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
-        medians = np.median(measure(config, repeats), axis=1)
-        for kind, value in zip(("bare calls", "`Bench.step`", "Gymnasium-style loop"), medians, strict=True):
-            rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
-    print(table(["period of `bullet`", "a period", "× bare calls"], rows))
-
-
 if __name__ == "__main__":
-    main()
+    print_periods(__doc__, "bullet", ("bare calls", "`Bench.step`", "Gymnasium-style loop"), measure)

@@ -23,6 +23,7 @@ from servobench.plant.mujoco.simulation import MujocoSimulation
 from servobench.plant.rendered.detection import find_ball
 from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -63,7 +64,7 @@ def swings(drives: DriveConfig, robots: int) -> tuple[FloatArray, FloatArray]:
 def detections(poses: int) -> FloatArray:
     """Return how far detected balls are from the true ones on both engines, and from each other, (k, 3) m."""
     model, camera, rng = nominal_ur5(), RenderedConfig().camera(), np.random.default_rng(FIRST_SEED)
-    scenes = [kind(model.arm, scenery=False, window=False) for kind in (BulletScene, MujocoScene)]
+    scenes = [kind(Room(model.arm, scenery=False)) for kind in (BulletScene, MujocoScene)]
     rows = []
     for _ in range(poses):
         theta = np.array(HOME) + rng.uniform(-0.6, 0.6, 6)

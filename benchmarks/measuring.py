@@ -7,10 +7,16 @@ import math
 import time
 from collections.abc import Callable, Container, Iterable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from servobench.plant.checks import FloatArray
+    from servobench.plant.rendered.settings import RenderedConfig
+
+    MeasurePeriods: TypeAlias = Callable[[RenderedConfig, int], FloatArray]
 
 METHODS = ("ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac")
 EARLIER = {"map_mfac": "rbfnn_mfac_plus"}  # in checkouts before the aids, where the others had no divisions
@@ -55,6 +61,32 @@ def processor_time(call: Callable[[], object], calls: int, rounds: int = 3) -> f
             call()
         times.append((time.process_time() - began) / calls)
     return min(times)
+
+
+def milliseconds(call: Callable[[], object]) -> float:
+    """Return how long a call takes by the wall clock [ms]."""
+    start = time.perf_counter()
+    call()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def print_periods(description: str | None, plant: str, kinds: Sequence[str], measure: MeasurePeriods) -> None:
+    """Print medians of a rendered plant's periods with and without table and floor, and ratios to the first kind.
+
+    Args:
+        description: of the benchmark.
+        plant: its name.
+        kinds: of what is measured, the bare calls of the engine first.
+        measure: returns the times of up to as many kinds, (kinds, repeats) ms.
+    """
+    from servobench.plant.rendered.settings import RenderedConfig
+
+    repeats, rows = 3 if asked_to_be_quick(description) else 200, []
+    for name, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
+        medians = np.median(measure(config, repeats), axis=1)
+        for kind, value in zip(kinds, medians, strict=False):  # of an engine that is not installed there are none
+            rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
+    print(table([f"period of `{plant}`", "a period", "× bare calls"], rows))
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

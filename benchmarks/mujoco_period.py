@@ -7,14 +7,12 @@ physics steps, contact, and one image with its depths from the same camera; and,
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
 
-from measuring import asked_to_be_quick, table
+from measuring import milliseconds, print_periods
 from servobench.plant.checks import FloatArray, whole_steps
 from servobench.plant.mujoco.engine import mujoco
 from servobench.plant.mujoco.mujoco_plant import build_mujoco
@@ -23,6 +21,7 @@ from servobench.plant.mujoco.simulation import MujocoSimulation
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
@@ -43,7 +42,7 @@ class BareCalls:
         arm, stops = self._model.arm, np.full(6, config.joint_range)
         machine = Machine(arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
         self._simulation = MujocoSimulation(machine)
-        self._scene = MujocoScene(arm, scenery=config.scenery, window=False)
+        self._scene = MujocoScene(Room(arm, config.scenery))
         self._simulation.start(HOME)
         self._scene.place(HOME)
 
@@ -68,13 +67,6 @@ class BareCalls:
         self._simulation.close()
 
 
-def milliseconds(call: Callable[[], object]) -> float:
-    """Return how long a call takes, ms."""
-    start = time.perf_counter()
-    call()
-    return 1e3 * (time.perf_counter() - start)
-
-
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and, if it is there, those of `bullet`, (2 or 3, repeats) ms."""
     setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
@@ -96,17 +88,5 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     return times
 
 
-def main() -> None:
-    """Print medians and ratios, with and without table and floor."""
-    repeats = 3 if asked_to_be_quick(__doc__) else 200
-    rows = []
-    for name, config in (("with scenery", RenderedConfig()), ("without scenery", RenderedConfig(scenery=False))):
-        medians = np.median(measure(config, repeats), axis=1)
-        kinds = ("bare calls", "`Bench.step`", "`Bench.step` of `bullet`")
-        for kind, value in zip(kinds, medians, strict=False):
-            rows.append([f"{kind}, {name}", f"{value:.2f} ms", f"{value / medians[0]:.2f}"])
-    print(table(["period of `mujoco`", "a period", "× bare calls"], rows))
-
-
 if __name__ == "__main__":
-    main()
+    print_periods(__doc__, "mujoco", ("bare calls", "`Bench.step`", "`Bench.step` of `bullet`"), measure)

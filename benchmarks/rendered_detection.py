@@ -21,6 +21,7 @@ from servobench.plant.eyes.model import EyeModel
 from servobench.plant.eyes.registry import Sensing
 from servobench.plant.rendered.mark_sight import open_sight
 from servobench.plant.rendered.rig import Rig
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -46,7 +47,7 @@ def true_model(word: str, seed: int) -> EyeModel:
 def measure(word: str, seed: int, poses: int) -> tuple[FloatArray, FloatArray, float]:
     """Return true and found pixels (poses, c, p, 2), NaN where a mark is not found, and the time of a look [ms]."""
     model, rng = true_model(word, seed), np.random.default_rng(seed)
-    scene = BulletScene(model.arm, scenery=NOISELESS.scenery, window=False, robot=ROBOT, rig=Rig.of(model, ROBOT))
+    scene = BulletScene(Room(model.arm, NOISELESS.scenery, robot=ROBOT, rig=Rig.of(model, ROBOT)))
     sight, work, took = open_sight(model, scene, NOISELESS, ROBOT), ROBOT.workspace, 0.0
     sight.reset(seed)
     true, found = [], []

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import options
+from servobench.harness.cli import named, options
 from servobench.harness.cli.terminal import console, print_tables
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def analyse(
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.faults import RunFault
 
-    source, arm = _source(jacobian), options.known_robot(robot)
+    source, arm = _source(jacobian), named.known_robot(robot)
     runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
     loops: list[LoopAnalysis] = []
     for run in runs:
@@ -94,7 +94,7 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, sett
 
     if seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {seed}")
-    names = options.split_controllers(",".join(controllers), robot)
+    names = named.split_controllers(",".join(controllers), robot)
     check_settings(settings, [PLANT, TASK, *names])
     drawn = read_mismatch(mismatch)
     return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]

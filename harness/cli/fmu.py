@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from servobench.harness.cli.options import RobotOption, SensingOption, known_robot
+from servobench.harness.cli.named import known_robot
+from servobench.harness.cli.options import RobotOption, SensingOption
 from servobench.harness.cli.terminal import console
 
 fmu_app = typer.Typer(help="Export an arm as an FMU; check and show FMUs.", no_args_is_help=True)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from servobench.harness.cli import options
+from servobench.harness.cli import named, options
 from servobench.harness.cli.terminal import say
 
 PRINTED = Path("-")
@@ -35,8 +35,8 @@ def init(
     from servobench.harness.run.resolved import known_sections, resolve_sections
     from servobench.harness.run.tasks import find_task
 
-    names = options.split_plants(plants), options.split_controllers(controllers), options.split_tasks(tasks)
-    arm, nominal = options.known_robot(robot), read_mismatch("none")
+    names = named.split_plants(plants), named.split_controllers(controllers), named.split_tasks(tasks)
+    arm, nominal = named.known_robot(robot), read_mismatch("none")
     requests = [RunRequest(*each, nominal, 0, robot=arm) for each in product(*names)]
     settings = overrides.settings()
     settings.check_sections([*known_sections(), *names[0], *names[1]])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import completion, options
+from servobench.harness.cli import completion, named, options
 from servobench.harness.cli.show import make_report
 from servobench.harness.cli.terminal import console, print_tables, say
 from servobench.harness.cli.verdict import judge, print_faults
@@ -80,20 +80,20 @@ def run(
     if method and controller and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     controller = method or controller or DEFAULT_CONTROLLER
-    plant = options.default_plant() if plant is None else choose_plant(plant)
+    plant = named.default_plant() if plant is None else choose_plant(plant)
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
     name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
-    options.tell_unused(ControllerEntry, [name])
-    options.tell_unused(PlantEntry, [plant])
+    named.tell_unused(ControllerEntry, [name])
+    named.tell_unused(PlantEntry, [plant])
     batch = Batch(
         (plant,),
         (name,),
         (task,),
         (mismatch,),
         parse_seeds(f"{seed},"),
-        options.known_robot(robot),
-        options.split_sensings(sensing),
+        named.known_robot(robot),
+        named.split_sensings(sensing),
     )
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     folder = _carry_out(
@@ -122,13 +122,13 @@ def compare(
     from servobench.harness.config.settings import ConfigurationError
 
     batch = Batch(
-        options.split_plants(plants, robot=robot),
-        options.split_controllers(controllers, robot),
-        options.split_tasks(tasks),
-        options.split_mismatches(mismatch),
+        named.split_plants(plants, robot=robot),
+        named.split_controllers(controllers, robot),
+        named.split_tasks(tasks),
+        named.split_mismatches(mismatch),
         parse_seeds(seeds),
-        options.known_robot(robot),
-        options.split_sensings(sensing),
+        named.known_robot(robot),
+        named.split_sensings(sensing),
     )
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import options
+from servobench.harness.cli import named, options
 from servobench.harness.cli.terminal import console
 
 if TYPE_CHECKING:
@@ -48,10 +48,10 @@ def robustness(
 
     settings = overrides.settings()
     lines = find_lines([axis.strip() for axis in axes.split(",") if axis.strip()])
-    arm = options.known_robot(robot)
-    names = options.split_controllers(controllers, arm)
-    where = options.split_plants(plant, "plant", arm)[0]
-    seen = options.one_sensing(sensing)
+    arm = named.known_robot(robot)
+    names = named.split_controllers(controllers, arm)
+    where = named.split_plants(plant, "plant", arm)[0]
+    seen = named.one_sensing(sensing)
     with watching(console, out) as observer:
         how = running.execution(observer)
         files = make_map(out, where, names, parse_seeds(seeds), settings, how, arm, lines, seen)
@@ -75,7 +75,7 @@ def claims(
     from servobench.harness.studies.claims.studies import find_divisions
     from servobench.harness.studies.claims.table import ANSWERS, differences, elsewhere, read_answers
 
-    names = options.split_plants(plants)
+    names = named.split_plants(plants)
     divisions = find_divisions(division)
     wanted = None if check is None else read_answers(check)
     with watching(console, out) as observer:
@@ -119,9 +119,9 @@ def tune(
     from servobench.harness.studies.tuning.objective import TuningSet
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
 
-    names = options.split_names("controllers", controllers, tuple(SPACES), find_tunable)
+    names = named.split_names("controllers", controllers, tuple(SPACES), find_tunable)
     try:
-        runs = TuningSet(options.split_plants(plants), robots, offset)
+        runs = TuningSet(named.split_plants(plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servobench.harness.cli import options
+from servobench.harness.cli import named, options
 from servobench.harness.cli.terminal import console, print_tables
 from servobench.harness.cli.verdict import judge
 
@@ -45,13 +45,13 @@ def sweep(
 
     plan = SweepPlan(
         Batch(
-            options.split_plants(plants, robot=robot),
-            options.split_controllers(controllers, robot),
-            options.split_tasks(tasks),
-            options.split_mismatches(mismatch),
+            named.split_plants(plants, robot=robot),
+            named.split_controllers(controllers, robot),
+            named.split_tasks(tasks),
+            named.split_mismatches(mismatch),
             parse_seeds(seeds),
-            options.known_robot(robot),
-            options.split_sensings(sensing),
+            named.known_robot(robot),
+            named.split_sensings(sensing),
         ),
         tuple(parse_variation(text) for text in vary or []),
         tuple(_numbers("noise", noise)),
@@ -87,5 +87,5 @@ def _numbers(option: str, text: str) -> list[float]:
         raise ConfigurationError(f"--{option} must be comma-separated numbers, got {text!r}") from error
     if not numbers or min(numbers) < 0:
         raise ConfigurationError(f"--{option} must be numbers from 0 on, got {text!r}")
-    options.refuse_repetition(option, [f"{number:g}" for number in numbers])
+    named.refuse_repetition(option, [f"{number:g}" for number in numbers])
     return numbers

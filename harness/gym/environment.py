@@ -60,6 +60,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
     Attributes:
         observation: of the plant, as controllers get it; None before the first `reset`.
         natural_size: of a feature, in its unit.
+        resolved: what all runs have in common.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - declared so by Gymnasium
@@ -79,9 +80,9 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             ConfigurationError: a name, setting or mismatch that cannot be used.
         """
         self.observation: Observation | None = None
-        self._resolved = resolve_environment(plant, task, mismatch, robot, sensing, settings)
-        self._experiment: Experiment | None = build(self._resolved)
-        self._view = View(self._experiment.plant.spec, self._resolved.run.preview_rows)
+        self.resolved: Final = resolve_environment(plant, task, mismatch, robot, sensing, settings)
+        self._experiment: Experiment | None = build(self.resolved)
+        self._view = View(self._experiment.plant.spec, self.resolved.run.preview_rows)
         self.natural_size = self._view.spec.feature.scale
         self.observation_space, self.action_space = self._view.observations, self._view.actions
 
@@ -100,7 +101,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         super().reset(seed=seed)
         run_seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
         self.close()
-        self._experiment = experiment = build(with_seed(self._resolved, run_seed))
+        self._experiment = experiment = build(with_seed(self.resolved, run_seed))
         rows = experiment.periods + 1 + experiment.run.preview_rows  # also those after the last period
         self._desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
         self._k = self._lost = 0
@@ -145,7 +146,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
     def _see(self) -> Floats32:
         if self.observation is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        rows = self._resolved.run.preview_rows + 1
+        rows = self.resolved.run.preview_rows + 1
         return self._view.see(self.observation, self._desired[self._k : self._k + rows], self._action)
 
     def close(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, final
 
 import gymnasium
@@ -11,13 +10,11 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.gym.environment import SEEDS, ServoEnv, resolve_environment, with_seed
+from servobench.harness.gym.environment import SEEDS, ServoEnv, with_seed
 from servobench.harness.gym.view import Floats32, View
 from servobench.harness.run.together import Together, build_together, side_by_side_key
 from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import BoolArray, Command, Observation
 
@@ -39,27 +36,27 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
     def __init__(
         self,
         num_envs: int = 1,
-        plant: str = "kinematic",
-        task: str = "random",
-        mismatch: str = "moderate",
-        robot: str = DEFAULT_ROBOT,
-        sensing: str = DEFAULT_SENSING,
-        settings: Mapping[str, Mapping[str, Any]] | None = None,
+        **choice: Any,  # noqa: ANN401 - typed by `ServoEnv`
     ) -> None:
-        """Look everything up; arguments as in `ServoEnv`.
+        """Look everything up.
+
+        Args:
+            num_envs: number of lanes.
+            choice: what the runs have in common, by the arguments of `ServoEnv`.
 
         Raises:
             ConfigurationError: a name, setting or mismatch that cannot be used, or a plant that carries out one run
                 at a time.
         """
-        self._resolved = resolve_environment(plant, task, mismatch, robot, sensing, settings)
+        single = ServoEnv(**choice)
+        single.close()
+        self._resolved = single.resolved
         if side_by_side_key(self._resolved) is None:
             raise ConfigurationError(
-                f"plant {plant} carries out one run at a time: gymnasium.make_vec(..., vectorization_mode='async')"
+                f"plant {self._resolved.request.plant} carries out one run at a time: "
+                "gymnasium.make_vec(..., vectorization_mode='async')"
             )
         self.num_envs = num_envs
-        single = ServoEnv(plant, task, mismatch, robot, sensing, settings)
-        single.close()
         self.single_observation_space, self.single_action_space = single.observation_space, single.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

@@ -24,6 +24,7 @@ from servobench.harness.pictures.tracks import Track
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
@@ -156,7 +157,7 @@ class Replay:
         """
         self._run, self._fineness, scale = run, fineness, run.robot.workspace.scale
         open_scene = scene_of(rendered_plant(str(run.track.row["plant"])))
-        self._scene = open_scene(run.model.arm, scenery=True, window=False, robot=run.robot)
+        self._scene = open_scene(Room(run.model.arm, scenery=True, robot=run.robot))
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]

@@ -15,8 +15,9 @@ import pandas as pd
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
+from servobench.harness.run.drawn import Drawn, draw
 from servobench.harness.run.ending import COMPLETED, Ending, ends_batch, is_defect
-from servobench.harness.run.experiment import Drawn, Experiment, build, draw
+from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import run_loop
 from servobench.harness.run.metrics import judge_run

@@ -16,44 +16,23 @@ from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.drawn import Drawn, build_scenario, draw
 from servobench.harness.run.ending import ends_batch
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.plausible import check_joints, check_reach, check_times
+from servobench.harness.run.plausible import check_joints, check_reach
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
-from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
+from servobench.harness.run.tasks import Scenario, TaskSetting
 from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.draws import CameraDraws
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
-from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
+from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.seeds import named_seed
-
-
-@dataclass(frozen=True, eq=False)
-class Drawn:
-    """What is drawn for one run."""
-
-    scenario: Scenario
-    true: SensedArm | None = None  # the true robot and its cameras; None for a plant that brings its own
-    sample: MismatchSample | None = None  # how it differs from the nominal one
-    moved: SensedArm | None = None  # the true robot after its camera was moved; None if it is not
-    cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
-
-    @property
-    def final(self) -> SensedArm | None:
-        """The true robot with the camera as it is at the end of the run."""
-        return self.moved or self.true
-
-    def as_record(self) -> dict[str, object]:
-        """Return all values drawn for robot and cameras, for JSON."""
-        parts = (self.sample, self.cameras)
-        return {name: value for part in parts if part is not None for name, value in part.as_record().items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,25 +91,6 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
         return _build_with_own_robot(resolved, entry, keep, progress)
     drawn = draw(resolved)
     return Experiment(*assemble(resolved, drawn.true, drawn.scenario.start, keep, progress), drawn, resolved.run)
-
-
-def draw(resolved: ResolvedRun) -> Drawn:
-    """Draw the true robot and the task of a run.
-
-    Raises:
-        ConfigurationError: a mismatch or a task that cannot be used.
-    """
-    request, robot = resolved.request, find_robot(resolved.request.robot)
-    sensing, seed = find_sensing(request.sensing), named_seed(request.seed, "mismatch")
-    try:
-        arm, sample = sample_mismatch(request.mismatch, robot, seed)
-        true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
-    except ValueError as error:
-        raise ConfigurationError(str(error)) from error
-    moved = sample.moved(true, robot)
-    task_seed = named_seed(request.seed, "task")
-    setting = TaskSetting(true, true.arm.n, true.channel, task_seed, moved, robot, sensing.nominal(robot))
-    return Drawn(_build_scenario(resolved, setting), true, sample, moved, cameras)
 
 
 def assemble(
@@ -244,7 +204,7 @@ def _build_with_own_robot(
     try:
         spec = plant.spec
         setting = TaskSetting(None, spec.n, spec.feature, named_seed(request.seed, "task"))
-        scenario = _build_scenario(resolved, setting)
+        scenario = build_scenario(resolved, setting)
         nominal = plant.nominal_jacobian()
         knowledge = RobotKnowledge(spec, run.preview_rows, nominal)
         if nominal is not None:
@@ -266,16 +226,6 @@ def _equations(model: SensedArm | None) -> TrueModel:
         return symbolic_feature(model)(joint_position)
 
     return TrueModel(TrueJacobian(model), symbolic)
-
-
-def _build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
-    name = resolved.request.task
-    try:
-        scenario = find_task(name).build(resolved.task, setting)
-    except ValueError as error:
-        raise ConfigurationError(f"task {name}: {error}") from error
-    check_times(resolved, scenario.duration)
-    return scenario
 
 
 def _build_plant(resolved: ResolvedRun, entry: PlantEntry, setup: PlantSetup) -> Plant:

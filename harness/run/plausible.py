@@ -15,7 +15,8 @@ import numpy as np
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.harness.run.tasks import TASKS, PointTask, Scenario, find_task
+from servobench.harness.run.task_settings import PointTask
+from servobench.harness.run.tasks import TASKS, Scenario, find_task
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.robot.hand_eye import HandEyeModel

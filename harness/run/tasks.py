@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,17 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.pose_tasks import PoseTask, pose_start
 from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskKind, line, read_waypoints
 from servobench.harness.run.sampling import Box, draw_in_view, drawn_together
+from servobench.harness.run.task_settings import (
+    CircleTask,
+    EnduranceTask,
+    LemniscateTask,
+    LineTask,
+    PointTask,
+    RandomTask,
+    TargetTask,
+    Vector,
+    WaypointTask,
+)
 from servobench.harness.run.views import TaughtView, in_space
 from servobench.plant.checks import FloatArray, as_vector, check_number
 from servobench.plant.eyes.model import EyeModel
@@ -28,12 +39,10 @@ from servobench.plant.lanes import norm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
+from servobench.plant.robot.ur5 import MOVES, STRETCHED
 from servobench.plant.seeds import named_generator
-from servobench.plant.settings import Count, NonNegative, Number, Positive, settings, suggest
+from servobench.plant.settings import suggest
 from servobench.plant.signals import Channel
-
-Vector: TypeAlias = tuple[float, ...]
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
 
@@ -48,117 +57,6 @@ class Scenario:
     evaluate_from: float  # where the evaluated part begins [s]
     kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
     lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
-
-
-@settings
-class PointTask:
-    """A move from rest to a fixed target that was taught at given joint positions."""
-
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    target: Vector = HOME
-    """[rad] joint positions at which the target was taught"""
-    duration: Positive = 10.0
-    """[s] length of the run"""
-    into_view: bool = True
-    """where cameras see pixels, draw start and target together towards the arm's home until both are in view"""
-
-
-@settings
-class RandomTask:
-    """A move whose start and target are drawn by the run's seed from a box of joint positions.
-
-    Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
-    """
-
-    lower: Vector = TRAINING_LOWER
-    """[rad] lower corner of the box"""
-    upper: Vector = TRAINING_UPPER
-    """[rad] upper corner of the box"""
-    shortest: Number = 0.1
-    """[m] least distance between start and target on the nominal model"""
-    lowest: Number = 0.08
-    """[m] least height of the ball above the table on the nominal model"""
-    duration: Positive = 10.0
-    """[s] length of the run"""
-
-
-@settings
-class CircleTask:
-    """A horizontal circle in the camera frame, entered from its centre: a large initial error."""
-
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    centre: Vector = (0.0, 0.0, 1.25)
-    """[m] camera frame; (0.5, 0, 0.3) m in the base frame of the nominal robot"""
-    radius: Positive = 0.3
-    """[m] of the circle"""
-    lap_time: Positive = 10.0
-    """[s] 200 points a lap at the default period"""
-    laps: Count = 2
-    """laps in the run; the last one is judged"""
-
-
-@settings
-class LemniscateTask(CircleTask):
-    """A figure of eight in the plane of the camera's image."""
-
-    radius: Positive = 0.25
-    """[m] half of its length"""
-
-
-@settings
-class EnduranceTask:
-    """Many laps on the curve of the task `circle` or `lemniscate`: whether a method stays as good as it was."""
-
-    curve: Literal["circle", "lemniscate"] = "circle"
-    """the task whose centre and radius the curve has"""
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    lap_time: Positive = 10.0
-    """[s] 200 points a lap at the default period"""
-    laps: Count = 180
-    """laps in the run, half an hour; the first one is the entry, the last one is judged"""
-
-
-@settings
-class LineTask:
-    """A straight line at constant speed, then rest at its end."""
-
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    begin: Vector = (-0.2, 0.0, 1.25)
-    """[m] camera frame"""
-    end: Vector = (0.2, 0.1, 1.2)
-    """[m] camera frame"""
-    moving: Positive = 8.0
-    """[s] from the beginning to the end of the line"""
-    duration: Positive = 10.0
-    """[s] length of the run"""
-
-
-@settings
-class WaypointTask:
-    """Waypoints from a CSV file, in the camera frame; its columns are time_s, x_m, y_m, z_m on a UR5."""
-
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    file: str = ""
-    """path of the CSV file"""
-    settle: NonNegative = 2.0
-    """[s] rest after the last waypoint"""
-
-
-@settings
-class TargetTask:
-    """A move from rest to a fixed target that is given as a feature."""
-
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    target: Vector = (0.1, -0.1, 1.2)
-    """[m] camera frame"""
-    duration: Positive = 10.0
-    """[s] length of the run"""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import numpy as np
 
 from servobench.controllers.servo import Servo, ServoController
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.run.experiment import Drawn, assemble, draw, loop_settings
+from servobench.harness.run.drawn import Drawn, draw
+from servobench.harness.run.experiment import assemble, loop_settings
 from servobench.harness.run.loop import LoopSettings
 from servobench.harness.run.resolved import ResolvedRun
 from servobench.plant.bench import Bench

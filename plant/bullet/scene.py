@@ -16,20 +16,12 @@ import numpy as np
 
 from servobench.plant.bullet.engine import pybullet
 from servobench.plant.rendered.engine import Scene
-from servobench.plant.rendered.meshes import sphere_obj
-from servobench.plant.rendered.rig import Rig, arm_files
-from servobench.plant.rendered.urdf import Box, bench_files, boxes_urdf
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
-from servobench.plant.robot.catalogue import UR5, find_robot
 
 if TYPE_CHECKING:
     from servobench.plant.checks import FloatArray
     from servobench.plant.rendered.detection import ByteArray
-    from servobench.plant.robot.arm import SerialArm
-    from servobench.plant.robot.robot import Robot
-
-BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
-BALL_MESH = "ball.obj"
+    from servobench.plant.rendered.room import Room
 
 
 def describe_renderer() -> str:
@@ -41,17 +33,8 @@ def describe_renderer() -> str:
 class BulletScene(Scene):
     """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
 
-    def __init__(
-        self,
-        arm: SerialArm,
-        *,
-        scenery: bool,
-        window: bool,
-        boxes: tuple[Box, ...] = (),
-        robot: Robot | None = None,
-        rig: Rig | None = None,
-    ) -> None:
-        """Open a world and load the arm; see `OpenScene`.
+    def __init__(self, room: Room, *, window: bool = False) -> None:
+        """Open a world and load the room; see `OpenScene`.
 
         Raises:
             ValueError: a robot with another number of joints, or a window is wanted where there is no display.
@@ -63,25 +46,21 @@ class BulletScene(Scene):
         if self._client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
-            self._load(arm, boxes, robot or find_robot(UR5), rig, scenery=scenery)
+            self._load(room)
             if window:
                 self._aim_window()
         except BaseException:
             self.close()
             raise
-        n = arm.n
+        n = room.arm.n
         self._joints = list(range(n))
         self._ball_link = n + 1
 
-    def _load(self, arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, rig: Rig | None, *, scenery: bool) -> None:
+    def _load(self, room: Room) -> None:
         client = self._client
         # With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
-        files = {**arm_files(arm, BALL_MESH, robot, rig), BALL_MESH: sphere_obj(BALL_SUBDIVISIONS)}
-        if scenery:
-            files |= bench_files(robot.workspace.scale)
-        if boxes:
-            files["boxes.urdf"] = boxes_urdf(boxes)
+        files = room.files()
         with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
             for name, text in files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")

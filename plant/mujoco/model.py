@@ -16,7 +16,7 @@ def read_urdf(text: str, meshes: Mapping[str, str] | None = None, *, fuse: bool 
 
     Args:
         text: the URDF.
-        meshes: Wavefront OBJ text by the file names in the URDF.
+        meshes: Wavefront OBJ text by the file names in the URDF; other files are left alone.
         fuse: join links that a fixed joint connects: a step takes less time, and they lose their names.
 
     Raises:

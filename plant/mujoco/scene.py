@@ -16,20 +16,14 @@ import numpy.typing as npt
 from servobench.plant.mujoco.engine import mujoco, open_context
 from servobench.plant.mujoco.model import read_urdf
 from servobench.plant.rendered.engine import Scene
-from servobench.plant.rendered.meshes import sphere_obj
-from servobench.plant.rendered.rig import arm_files
-from servobench.plant.rendered.urdf import BALL_LINK, Box, bench_files, boxes_urdf
+from servobench.plant.rendered.urdf import BALL_LINK
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
-from servobench.plant.robot.catalogue import UR5, find_robot
 
 if TYPE_CHECKING:
     from servobench.plant.checks import FloatArray
     from servobench.plant.rendered.detection import ByteArray
-    from servobench.plant.rendered.rig import Rig
-    from servobench.plant.robot.arm import SerialArm
-    from servobench.plant.robot.robot import Robot
+    from servobench.plant.rendered.room import Room
 
-BALL_MESH = "ball.obj"
 SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
@@ -40,24 +34,15 @@ COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRN
 class MujocoScene(Scene):
     """An arm with a ball on its flange in a MuJoCo model of its own; joint angles here are the true ones, θ."""
 
-    def __init__(
-        self,
-        arm: SerialArm,
-        *,
-        scenery: bool,
-        window: bool,
-        boxes: tuple[Box, ...] = (),
-        robot: Robot | None = None,
-        rig: Rig | None = None,
-    ) -> None:
-        """Load the arm; see `OpenScene`.
+    def __init__(self, room: Room, *, window: bool = False) -> None:
+        """Load the room; see `OpenScene`.
 
         Raises:
             ValueError: a robot with another number of joints, nothing to render with, or a window is wanted.
         """
         if window:
             raise ValueError("view needs the plant bullet: mujoco opens no window")
-        self._model = _compile(arm, boxes, robot or find_robot(UR5), rig, scenery=scenery)
+        self._model = _compile(room)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_forward(self._model, self._data)  # places the light
         self._ball = self._model.body(BALL_LINK).id
@@ -117,19 +102,12 @@ class MujocoScene(Scene):
             self._gl = None
 
 
-def _compile(arm: SerialArm, boxes: tuple[Box, ...], robot: Robot, rig: Rig | None, *, scenery: bool) -> Any:  # noqa: ANN401
+def _compile(room: Room) -> Any:  # noqa: ANN401
     """Return the model of all that is drawn, an `MjModel`."""
-    ball = {BALL_MESH: sphere_obj()}
-    texts = arm_files(arm, BALL_MESH, robot, rig)
-    spec = read_urdf(texts["arm.urdf"], ball)
-    rooms = [("target", texts["target.urdf"], ball)] if "target.urdf" in texts else []
-    if scenery:
-        files = bench_files(robot.workspace.scale)
-        rooms.append(("bench", files.pop("bench.urdf"), files))
-    if boxes:
-        rooms.append(("boxes", boxes_urdf(boxes), {}))
-    for name, text, meshes in rooms:
-        spec.attach(read_urdf(text, meshes), prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    files = room.files()
+    (_, spec), *around = [(name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")]
+    for name, body in around:
+        spec.attach(body, prefix=f"{name}/", frame=spec.worldbody.add_frame())
     spec.worldbody.add_light(
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         dir=LIGHT,

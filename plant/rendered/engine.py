@@ -19,7 +19,7 @@ from servobench.plant.robot.robot import Robot
 if TYPE_CHECKING:
     from servobench.plant.rendered.detection import ByteArray
     from servobench.plant.rendered.drives import DriveConfig
-    from servobench.plant.rendered.rig import Rig
+    from servobench.plant.rendered.room import Room
 
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
@@ -47,25 +47,12 @@ class Scene(ABC):
 class OpenScene(Protocol):
     """The constructor of an engine's scene."""
 
-    def __call__(
-        self,
-        arm: SerialArm,
-        *,
-        scenery: bool,
-        window: bool,
-        boxes: tuple[Box, ...] = (),
-        robot: Robot | None = None,
-        rig: Rig | None = None,
-    ) -> Scene:
-        """Open a world and load the arm.
+    def __call__(self, room: Room, *, window: bool = False) -> Scene:
+        """Open a world and load the room.
 
         Args:
-            arm: the true kinematics.
-            scenery: whether to load the table and the floor.
+            room: what there is to see.
             window: whether to open the engine's window.
-            boxes: what else is in the room.
-            robot: by its maker's description, for the looks; None for the UR5.
-            rig: in place of the ball on the flange; None for the ball.
 
         Raises:
             ValueError: a robot with another number of joints, or a window is wanted where there is no display.

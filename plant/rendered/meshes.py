@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+BALL_MESH = "ball.obj"  # file in which URDFs look for the unit sphere
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.model import EyeModel
 from servobench.plant.rendered.marks import MARK_COLOURS
+from servobench.plant.rendered.meshes import BALL_MESH
 from servobench.plant.rendered.urdf import BALL_LINK, BASE_PART, DARK_GREY, RED, arm_tree, arm_urdf
 from servobench.plant.rendered.urdf_elements import add_joint, add_link, draw_cylinder, draw_mesh, text
 from servobench.plant.robot.arm import SerialArm
@@ -63,23 +64,22 @@ class Rig:
         return cls(model.target, model.cameras if on_hand else None, robot.workspace.scale, robot.workspace.ball_radius)
 
 
-def arm_files(arm: SerialArm, ball_mesh: str, robot: Robot, rig: Rig | None) -> dict[str, str]:
+def arm_files(arm: SerialArm, robot: Robot, rig: Rig | None) -> dict[str, str]:
     """Return the files, text by name, of an arm with what is on it, `arm.urdf`, and of a target in the world, if any.
 
     Args:
         arm: the kinematics, mismatch included.
-        ball_mesh: name of a file beside them that holds a mesh of the unit sphere.
         robot: by its maker's description.
         rig: of the set-up; None for the ball on the flange.
     """
     if rig is None:
-        return {"arm.urdf": arm_urdf(arm, ball_mesh, robot)}
-    tree = arm_tree(arm, ball_mesh, robot)
+        return {"arm.urdf": arm_urdf(arm, robot)}
+    tree = arm_tree(arm, robot)
     (carried,) = (link for link in tree.iter("link") if link.get("name") == BALL_LINK)
     for visual in carried.findall("visual"):
         carried.remove(visual)
     if rig.hand is None:
-        _draw_target(carried, rig, rig.target - arm.tool, ball_mesh)
+        _draw_target(carried, rig, rig.target - arm.tool)
         return {"arm.urdf": text(tree)}
     radius, length = rig.scale * np.array(HOUSING)
     for pose in rig.hand:
@@ -88,15 +88,15 @@ def arm_files(arm: SerialArm, ball_mesh: str, robot: Robot, rig: Rig | None) -> 
     body = ET.Element("robot", name="target")
     middle = rig.target.mean(axis=0)
     add_link(body, "world", *BASE_PART)
-    _draw_target(add_link(body, "target", *BASE_PART), rig, rig.target - middle, ball_mesh)
+    _draw_target(add_link(body, "target", *BASE_PART), rig, rig.target - middle)
     add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
     return {"arm.urdf": text(tree), "target.urdf": text(body)}
 
 
-def _draw_target(link: ET.Element, rig: Rig, points: FloatArray, ball_mesh: str) -> None:
+def _draw_target(link: ET.Element, rig: Rig, points: FloatArray) -> None:
     """Draw ball or plate at points (p, 3) [m] of a link's frame."""
     if len(points) == 1:
-        draw_mesh(link, RED, ball_mesh, rig.ball_radius)
+        draw_mesh(link, RED, BALL_MESH, rig.ball_radius)
         return
     scale = rig.scale
     back, middle = LAYER * scale * _normal(points), points.mean(axis=0)

@@ -15,7 +15,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from servobench.plant.checks import FloatArray
-from servobench.plant.rendered.meshes import rectangles_obj
+from servobench.plant.rendered.meshes import BALL_MESH, rectangles_obj
 from servobench.plant.rendered.urdf_elements import (
     add_joint,
     add_link,
@@ -59,21 +59,21 @@ class Box(NamedTuple):
     size: tuple[float, float, float]
 
 
-def arm_urdf(arm: SerialArm, ball_mesh: str, robot: Robot | None = None) -> str:
+def arm_urdf(arm: SerialArm, robot: Robot | None = None) -> str:
     """Return the URDF of an arm with masses and looks of a robot; its joint angles are the true ones, θ.
 
     Args:
         arm: the kinematics, mismatch included.
-        ball_mesh: name of a file beside the URDF that holds a mesh of the unit sphere.
         robot: by its maker's description; None for the UR5.
 
     Returns:
-        The URDF as text: the base, a link a joint in the arm's order, the flange and the ball.
+        The URDF as text: the base, a link a joint in the arm's order, the flange and the ball, which is drawn by a
+        mesh in `BALL_MESH`.
 
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    return text(arm_tree(arm, ball_mesh, robot or find_robot(UR5)))
+    return text(arm_tree(arm, robot or find_robot(UR5)))
 
 
 def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot | None = None) -> str:
@@ -89,7 +89,7 @@ def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot 
         ValueError: the arm has another number of joints than the robot.
     """
     described = robot or find_robot(UR5)
-    tree = arm_tree(arm, "", described)
+    tree = arm_tree(arm, described)
     for link in tree.iter("link"):
         for visual in link.findall("visual"):
             if not shapes:
@@ -135,7 +135,7 @@ def boxes_urdf(boxes: tuple[Box, ...]) -> str:
     return text(robot)
 
 
-def arm_tree(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
+def arm_tree(arm: SerialArm, described: Robot) -> ET.Element:
     """Return the tree of `arm_urdf`; arguments and errors are its own."""
     own, ball_radius = described.links, described.workspace.ball_radius
     if arm.n != described.n:
@@ -158,7 +158,7 @@ def arm_tree(arm: SerialArm, ball_mesh: str, described: Robot) -> ET.Element:
     add_joint(robot, FLANGE_LINK, (links[-1], FLANGE_LINK), origins[-1], turns=False)
     _draw_tool(add_link(robot, FLANGE_LINK, *LIGHT_PART), arm.tool, radius[-1], ball_radius)
     add_joint(robot, BALL_LINK, (FLANGE_LINK, BALL_LINK), np.stack([arm.tool, np.zeros(3)]), turns=False)
-    draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, ball_mesh, ball_radius)
+    draw_mesh(add_link(robot, BALL_LINK, *LIGHT_PART), RED, BALL_MESH, ball_radius)
     return robot
 
 

@@ -28,6 +28,7 @@ from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Engine, Joints, Machine
 from servobench.plant.rendered.mark_sight import open_sight
 from servobench.plant.rendered.rig import Rig
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
@@ -75,7 +76,7 @@ class RenderedWorld(World):
         self._camera = model.camera
         boxes, robot = config.boxes(), setup.nominal or find_robot(UR5)
         rig = Rig.of(model, robot) if isinstance(model, EyeModel) else None
-        self._scene = engine.scene(arm, scenery=config.scenery, window=config.view, boxes=boxes, robot=robot, rig=rig)
+        self._scene = engine.scene(Room(arm, config.scenery, boxes, robot, rig), window=config.view)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
         ordered = np.minimum(*stops), np.maximum(*stops)
         angle = arm.joint_angle(self._start)

@@ -6,6 +6,7 @@ from kit import rendered
 from kit.plants import plant_parameters
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.pictures.replay import scene_of
+from servobench.plant.rendered.room import Room
 
 
 @pytest.fixture(params=plant_parameters(RENDERED))
@@ -34,7 +35,7 @@ def open_scene(engine):
     scenes = []
 
     def build(**options):
-        scenes.append(scene_of(engine)(rendered.MODEL.arm, window=False, **options))
+        scenes.append(scene_of(engine)(Room(rendered.MODEL.arm, **options)))
         return scenes[-1]
 
     yield build

@@ -16,6 +16,7 @@ from servobench.plant.faults import FeatureLost
 from servobench.plant.plant import PlantSetup
 from servobench.plant.rendered.mark_sight import open_sight
 from servobench.plant.rendered.rig import Rig
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import rendered_config
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
@@ -49,7 +50,7 @@ def open_eye():
 @pytest.mark.parametrize("word", IN_PIXELS)
 def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word):
     model, rng = true_model(word), np.random.default_rng(5)
-    scene = BulletScene(model.arm, scenery=False, window=False, robot=UR5, rig=Rig.of(model, UR5))
+    scene = BulletScene(Room(model.arm, scenery=False, rig=Rig.of(model, UR5)))
     sight, errors, poses = open_sight(model, scene, IDEAL, UR5), [], 0
     sight.reset(0)
     while poses < 25:

@@ -25,7 +25,8 @@ from servobench.harness.run.tasks import TASKS
 from servobench.plant.faults import RunFault
 from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import FmuMapping
-from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
+from servobench.plant.robot.mismatch import Mismatch
+from servobench.plant.robot.mismatch_axes import AXES, PROFILES
 
 PACKAGE = "servobench"
 

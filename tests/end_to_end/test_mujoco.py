@@ -17,6 +17,7 @@ from servobench.plant.faults import PlantDiverged
 from servobench.plant.mujoco.engine import describe_renderer
 from servobench.plant.mujoco.scene import MujocoScene
 from servobench.plant.rendered.drives import DriveConfig
+from servobench.plant.rendered.room import Room
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.signals import Command
 
@@ -94,7 +95,7 @@ def test_depths_are_those_of_bullet_but_at_edges():
 
     camera, depths = PinholeCamera(), []
     for kind in (BulletScene, MujocoScene):
-        scene = kind(MODEL.arm, scenery=True, window=False)
+        scene = kind(Room(MODEL.arm, scenery=True))
         scene.place(HOME)
         depths.append(camera.metric_depth(scene.render(camera, MODEL.X_BC)[1]))
         scene.close()

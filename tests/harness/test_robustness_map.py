@@ -22,7 +22,7 @@ from servobench.harness.studies.robustness import (
     settling_median,
 )
 from servobench.plant.noise.axes import SENSOR_AXES
-from servobench.plant.robot.mismatch import Magnitude
+from servobench.plant.robot.mismatch_axes import Magnitude
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():

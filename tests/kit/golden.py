@@ -22,13 +22,14 @@ import numpy as np
 import pandas as pd
 
 import servobench
-from servobench.harness.config.registry import CONTROLLERS
+from servobench.harness.config.registry import CONTROLLERS, RENDERED
 from servobench.harness.run.tasks import find_task
 
 PERIODS = 20  # that are compared
 PERIOD = 0.05  # [s]
 TASK = "exp2"
-DURATIONS = {"kinematic": 4.0, "fmu": 4.0, "bullet": PERIODS * PERIOD}  # [s]; a rendered run takes long
+DURATIONS = {"kinematic": 4.0, "fmu": 4.0, **dict.fromkeys(RENDERED, PERIODS * PERIOD)}  # [s], short where rendered
+RENDERER = "llvmpipe"  # that drew the images of `mujoco`; those of another one differ by more than rounding
 MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow command
 TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
 SUMS = [f"u{k:02d}" for k in range(PERIODS)]
@@ -44,7 +45,7 @@ VARIANTS: tuple[Mapping[str, str], ...] = (
 def golden_runs(plant: str, controllers: tuple[str, ...] = CONTROLLERS) -> pd.DataFrame:
     """Make the runs on a plant and return the rows of the table, without the spread."""
     settings: dict[str, dict[str, Any]] = {TASK: {"duration": DURATIONS[plant]}, "run": {"period": PERIOD}}
-    if plant == "bullet":
+    if plant in RENDERED:
         settings[plant] = {"scenery": False}  # which changes no bit of an observation
     if os.environ.get("GOLDEN_START") == "next":
         settings[TASK]["start"] = np.nextafter(find_task(TASK).default.start, np.inf).tolist()

@@ -135,7 +135,7 @@ def test_drives_in_proportion_to_a_ur5_are_those_of_the_ur5():
 
 def test_inertia_in_a_urdf_has_the_moments_of_its_tensor():
     robot = find_robot("panda")
-    link = ET.fromstring(arm_urdf(robot.arm, "ball.obj", robot)).findall("link")[3]
+    link = ET.fromstring(arm_urdf(robot.arm, robot)).findall("link")[3]
     written = [float(link.find("inertial/inertia").get(axis)) for axis in ("ixx", "iyy", "izz")]
     np.testing.assert_allclose(written, np.linalg.eigvalsh(robot.links.inertia[2]), rtol=1e-9)
 
@@ -218,7 +218,7 @@ def test_a_urdf_that_was_written_here_is_read_as_the_same_arm(tmp_path):
     pytest.importorskip("yourdfpy")
     own = find_robot("ur3e")
     path = tmp_path / "written.urdf"
-    path.write_text(arm_urdf(own.arm, "ball.obj", own).replace('type="continuous">', 'type="continuous">\n'))
+    path.write_text(arm_urdf(own.arm, own).replace('type="continuous">', 'type="continuous">\n'))
     read = find_robot(str(path))
     postures = RNG.uniform(-3.0, 3.0, (5, 6))
     np.testing.assert_allclose(flange(read.arm, postures), flange(own.arm, postures), atol=1e-9)
