@@ -35,7 +35,7 @@ ONLY_READ = {
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
-OWN = ("my_ur10e.yaml", "my_arm.urdf", "mine.toml", "crane.toml", "planar", "nominal_rate", "learned.py", "learned_policy.py")  # yours
+OWN = ("my_ur10e.yaml", "my_arm.urdf", "mine.toml", "crane.toml", "planar", "nominal_rate", "learned")  # yours
 
 
 def shown_lines():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kit.rendered import IDEAL
+from servobench.harness.config.engines import scene_of
 from servobench.harness.config.registry import find_plant
-from servobench.harness.pictures.replay import scene_of
 from servobench.plant.eyes.eye import Eye
 from servobench.plant.eyes.registry import Sensing
 from servobench.plant.faults import FeatureLost
