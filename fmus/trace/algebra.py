@@ -121,14 +121,30 @@ def svd(a: Any, full_matrices: bool = True, compute_uv: bool = True) -> Svd | Tr
 @cache
 def _svd(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
     """Return the function that gives U (rows, columns), singular values and V of a tall matrix."""
-    A = casadi.SX.sym("A", rows, columns)
-    own, turned = casadi.horzsplit(A), casadi.horzsplit(casadi.SX(casadi.DM.eye(columns)))
+    sweep, sort = _sweep(rows, columns), _sorted(rows, columns)
+    A = casadi.MX.sym("A", rows, columns)
+    own, turned = A, casadi.MX(casadi.DM.eye(columns))
     for _ in range(SWEEPS):
-        for p in range(columns):
-            for q in range(p + 1, columns):
-                c, s = _rotation(own[p], own[q])
-                for part in (own, turned):
-                    part[p], part[q] = c * part[p] - s * part[q], s * part[p] + c * part[q]
+        own, turned = sweep(own, casadi.densify(turned))
+    return casadi.Function(f"svd_{rows}_{columns}", [A], list(sort(own, turned)))
+
+
+def _sweep(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
+    """Return the function that rotates each pair of columns once, and those of V alike."""
+    A, V = casadi.SX.sym("A", rows, columns), casadi.SX.sym("V", columns, columns)
+    own, turned = casadi.horzsplit(A), casadi.horzsplit(V)
+    for p in range(columns):
+        for q in range(p + 1, columns):
+            c, s = _rotation(own[p], own[q])
+            for part in (own, turned):
+                part[p], part[q] = c * part[p] - s * part[q], s * part[p] + c * part[q]
+    return casadi.Function(f"sweep_{rows}_{columns}", [A, V], [casadi.horzcat(*own), casadi.horzcat(*turned)])
+
+
+def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
+    """Return the function that makes U, singular values and V of columns that are orthogonal."""
+    A, V = casadi.SX.sym("A", rows, columns), casadi.SX.sym("V", columns, columns)
+    own, turned = casadi.horzsplit(A), casadi.horzsplit(V)
     sizes = [casadi.sqrt(casadi.sumsqr(column)) for column in own]
     for p in range(columns):
         for q in range(p + 1, columns):
@@ -141,7 +157,7 @@ def _svd(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of CasADi
         across = casadi.cross(left[0], left[1])
         left[2] = casadi.if_else(casadi.dot(across, left[2]) < 0.0, -across, across)
     outputs = [casadi.horzcat(*left), casadi.vertcat(*sizes), casadi.horzcat(*turned)]
-    return casadi.Function(f"svd_{rows}_{columns}", [A], [casadi.densify(each) for each in outputs], {"cse": True})
+    return casadi.Function(f"sorted_{rows}_{columns}", [A, V], [casadi.densify(each) for each in outputs])
 
 
 def _rotation(one: Expression, other: Expression) -> tuple[Expression, Expression]:
