@@ -14,7 +14,7 @@ from servobench.fmus.compile import Platform, this_platform
 from servobench.fmus.eye_variables import View
 from servobench.fmus.generate import arm_constants, kinematics_source
 from servobench.fmus.model_description import Description
-from servobench.fmus.product import FMI_SOURCES, Product, c_files, committed, tool, word
+from servobench.fmus.product import Product, c_files, check_version, committed, tool, word
 from servobench.fmus.reference import input_csv, output_csv, reference_run
 from servobench.fmus.structure import arm_sections
 from servobench.fmus.variables import Actuation, ArmLayout, arm_groups, parameters_of
@@ -58,8 +58,7 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
-        if self.fmi_version not in FMI_SOURCES:
-            raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
+        check_version(self.fmi_version)
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
 

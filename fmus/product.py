@@ -151,6 +151,16 @@ class Product:
         return library_files(libraries, identifier, self.fmi_version)
 
 
+def check_version(fmi_version: int) -> None:
+    """Refuse a version of FMI that is not exported.
+
+    Raises:
+        ValueError: neither 2 nor 3.
+    """
+    if fmi_version not in FMI_SOURCES:
+        raise ValueError(f"fmi_version must be 2 or 3, got {fmi_version}")
+
+
 def c_files(fmi_version: int, core: str) -> tuple[str, ...]:
     """Return the C files to compile, in order."""
     return (*FMI_SOURCES[fmi_version], *SHARED_SOURCES, f"{core}.c")

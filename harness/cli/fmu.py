@@ -24,7 +24,7 @@ FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 @fmu_app.command()
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The .fmu file to write.")],
-    fmi: Annotated[int, typer.Option(min=2, max=3, help="Version of FMI, 2 or 3.")] = 2,
+    fmi: Annotated[int, typer.Option(help="2 or 3; an arm has co-simulation and model exchange.")] = 2,
     controller: Annotated[
         str | None,
         typer.Option(help="Export this controller in place of the arm.", autocompletion=completion.controllers),
@@ -73,10 +73,12 @@ def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Produc
 
 
 def _controller(fmi: int, name: str, robot: str, sensing: str, mismatch: str, seed: int, settings: Settings) -> Product:
+    from servobench.fmus.product import check_version
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.controller_fmu import controller_model
     from servobench.harness.run.request import RunRequest, read_mismatch
 
+    check_version(fmi)
     run = RunRequest(
         "kinematic", choose_controller(name), "target", read_mismatch(mismatch), seed, robot=robot, sensing=sensing
     )
