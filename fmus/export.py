@@ -1,39 +1,23 @@
-"""Exports an arm with mismatched kinematics as an FMU: sources, libraries, description, documentation, reference run.
-
-Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
-"""
+"""Exports an arm with mismatched kinematics as an FMU."""
 
 from __future__ import annotations
 
-import hashlib
 import html
-import os
-import re
 import string
-import tempfile
-import zipfile
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
-from servobench.fmus.compile import CODE, Platform, compile_library, library_files, this_platform
+from servobench.fmus.compile import Platform, this_platform
 from servobench.fmus.eye_variables import View
-from servobench.fmus.generate import kinematics_source, layout_header
-from servobench.fmus.model_description import (
-    REFERENCES,
-    Description,
-    write_build_description,
-    write_fmi2,
-    write_fmi3,
-    write_references,
-)
-from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, input_csv, output_csv, reference_run
-from servobench.fmus.variables import Actuation, Layout, arm_groups, parameters_of
+from servobench.fmus.generate import arm_constants, kinematics_source
+from servobench.fmus.model_description import Description
+from servobench.fmus.product import Product, c_files, check_version, committed, tool, word
+from servobench.fmus.reference import input_csv, output_csv, reference_run
+from servobench.fmus.structure import arm_sections
+from servobench.fmus.variables import Actuation, ArmLayout, arm_groups, parameters_of
 from servobench.plant.eyes.model import EyeModel
 from servobench.plant.eyes.registry import Sensing
 from servobench.plant.robot.catalogue import UR5, find_robot
@@ -41,21 +25,8 @@ from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm
 
 MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
-MACHINERY = "fmi"  # folder of the FMI functions, which know no model
-HEADERS = {
-    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
-}
-FMI_SOURCES = {2: ("fmi2.c", "fmi2_exchange.c"), 3: ("fmi3.c", "fmi3_exchange.c", "fmi3_absent.c")}
-INSTANCE_HEADERS = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
-SHARED_SOURCES = ("model.c", "instance.c", "kinematics.c")
-COMMITTED = {MACHINERY: ("instance.h", "instance.c"), MODEL: ("kinematics.h", "model.h", "model.c")}
-RELATED_FILES = (
-    (INPUT_FILE, "testcase", "Commands of the reference run, each held over the step that begins at its time."),
-    (OUTPUT_FILE, "result", "Outputs of the reference run, computed by an independent implementation."),
-)
+CORE = "kinematics"
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
-ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
 
 
 def default_actuation(robot: Robot | None = None) -> Actuation:
@@ -87,8 +58,7 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Check version and platforms."""
-        if self.fmi_version not in FMI_SOURCES:
-            raise ValueError(f"fmi_version must be 2 or 3, got {self.fmi_version}")
+        check_version(self.fmi_version)
         if not self.platforms:
             raise ValueError("platforms must name at least one platform, got none")
 
@@ -98,7 +68,7 @@ class ExportOptions:
         return View.of(self.model) if isinstance(self.model, EyeModel) else None
 
     @property
-    def layout(self) -> Layout:
+    def layout(self) -> ArmLayout:
         """Layout of the variables."""
         return arm_layout(self.model.arm.n, self.view)
 
@@ -106,8 +76,8 @@ class ExportOptions:
     def identifier(self) -> str:
         """Name of the libraries: that of the robot, and of another sensing than `position`, as a word of C."""
         view = self.view
-        word = re.sub(r"[^A-Za-z0-9_]", "_", self.robot.name if view is None else f"{self.robot.name}_{view.word}")
-        return f"{word if word[:1].isalpha() else f'arm_{word}'}_mismatched"
+        name = self.robot.name if view is None else f"{self.robot.name}_{view.word}"
+        return f"{word(name, 'arm')}_mismatched"
 
     @property
     def title(self) -> str:
@@ -138,127 +108,57 @@ def nominal_options(fmi_version: int, robot: Robot, sensing: Sensing | None = No
 
 
 def export_fmu(path: Path, options: ExportOptions) -> Path:
-    """Write the FMU to `path` atomically.
-
-    Args:
-        path: the .fmu file; its folder must exist.
-        options: version, model, platforms.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: the folder does not exist.
-        CompilerMissing: no compiler for one of the platforms.
-        CompilationFailed: a compiler rejected the sources.
-    """
-    if not path.parent.is_dir():
-        raise ValueError(f"the folder {path.parent} for the FMU does not exist")
-    texts = source_files(options) | _companion_files(options)
-    contents = {name: text.encode() for name, text in texts.items()}
-    token = _token(contents)
-    layout_name = "sources/layout.h"
-    contents[layout_name] = contents[layout_name].replace(_PLACEHOLDER.encode(), token.encode())
-    contents |= _descriptions(options, token)
-    with tempfile.TemporaryDirectory(prefix="servobench-export-") as folder:
-        _compile(Path(folder), contents, options)
-        _write_archive(path, contents)
-    return path
+    """Write the FMU to `path` atomically; see `Product.write`."""
+    return product(options).write(path, options.platforms)
 
 
 def fingerprint(options: ExportOptions) -> str:
-    """Return a hash of all that determines the behaviour of the FMU: sources, descriptions, compilation."""
-    contents = {name: text.encode() for name, text in source_files(options).items()}
-    contents |= _descriptions(options, _PLACEHOLDER)
-    for platform in options.platforms:
-        contents[f"binaries/{platform.name}"] = repr((CODE, platform)).encode()
-    return _token(contents)
+    """Return a hash of all that determines the behaviour of the FMU; see `Product.fingerprint`."""
+    return product(options, documented=False).fingerprint(options.platforms)
 
 
-def source_files(options: ExportOptions) -> dict[str, str]:
-    """Return the C files of the FMU by their path in the archive, with a placeholder for the token."""
+def product(options: ExportOptions, *, documented: bool = True) -> Product:
+    """Return what goes into the FMU; documentation and reference run only where it is to be `documented`."""
     layout, start = options.layout, parameters_of(options.model, options.actuation)
-    texts = {name: _committed(folder, name) for folder, names in COMMITTED.items() for name in names}
-    texts |= {name: _committed(MACHINERY, name) for name in FMI_SOURCES[options.fmi_version]}
-    header = INSTANCE_HEADERS[options.fmi_version]
-    texts[header] = _committed(MACHINERY, header)
-    texts |= {name: _fmi_header(name) for name in HEADERS[options.fmi_version]}
-    texts["kinematics.c"] = _kinematics(layout)
-    texts["layout.h"] = layout_header(layout, start, options.identifier, _PLACEHOLDER)
-    return {f"sources/{name}": text for name, text in texts.items()}
-
-
-def _companion_files(options: ExportOptions) -> dict[str, str]:
-    """Return documentation, licence and reference run by their path in the archive."""
-    layout = options.layout
-    run = reference_run(options.model, options.actuation)
-    return {
-        INPUT_FILE: input_csv(run, layout),
-        OUTPUT_FILE: output_csv(run, layout),
-        f"extra/{REFERENCES}/fmi-ls-manifest.xml": write_references(
-            (f"../{file.removeprefix('extra/')}", role, text) for file, role, text in RELATED_FILES
-        ).decode(),
-        "documentation/index.html": _documentation(layout, options),
-        "documentation/licenses/license.txt": _committed(MODEL, "license.txt"),
-    }
-
-
-@cache
-def arm_layout(n: int, view: View | None = None) -> Layout:
-    """Return the layout of an arm with `n` joints, with the ball in 3-D by a fixed camera or with another view."""
-    return Layout(arm_groups(n, view), view)
-
-
-_PLACEHOLDER = "{token}"
-
-
-@cache
-def _kinematics(layout: Layout) -> str:
-    return kinematics_source(layout)
-
-
-def _committed(folder: str, name: str) -> str:
-    return (files("servobench.fmus") / folder / name).read_text(encoding="utf-8")
-
-
-def _fmi_header(name: str) -> str:
-    return (files("fmpy") / "c-code" / name).read_text(encoding="utf-8")
-
-
-def _descriptions(options: ExportOptions, token: str) -> dict[str, bytes]:
-    """Return the XML files by their path in the archive."""
-    description = _description(options)
-    if options.fmi_version == 2:
-        return {"modelDescription.xml": write_fmi2(description, token)}
-    return {
-        "modelDescription.xml": write_fmi3(description, token),
-        "sources/buildDescription.xml": write_build_description(description),
-    }
-
-
-def _description(options: ExportOptions) -> Description:
-    return Description(
+    description = Description(
         model_name=options.title,
         model_identifier=options.identifier,
         summary=options.summary,
-        layout=options.layout,
-        start=parameters_of(options.model, options.actuation),
-        sources=(*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES),
-        tool=f"servobench {version('servobench')}",
+        layout=layout,
+        sections=arm_sections(layout),
+        start=start,
+        sources=c_files(options.fmi_version, CORE),
+        tool=tool(),
+    )
+    reference = ("", "")
+    if documented:
+        run = reference_run(options.model, options.actuation)
+        reference = input_csv(run, layout), output_csv(run, layout)
+    return Product(
+        fmi_version=options.fmi_version,
+        folder=MODEL,
+        core=CORE,
+        source=_kinematics(layout),
+        constants=arm_constants(layout),
+        description=description,
+        documentation=_documentation(layout, options) if documented else "",
+        reference=reference,
     )
 
 
-def _token(contents: Mapping[str, bytes]) -> str:
-    """Return a GUID that is a hash of everything in the FMU except its libraries."""
-    digest = hashlib.sha256()
-    for name in sorted(contents):
-        digest.update(name.encode() + b"\0" + contents[name] + b"\0")
-    text = digest.hexdigest()
-    return "{" + "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:32])) + "}"
+@cache
+def arm_layout(n: int, view: View | None = None) -> ArmLayout:
+    """Return the layout of an arm with `n` joints, with the ball in 3-D by a fixed camera or with another view."""
+    return ArmLayout(arm_groups(n, view), view)
 
 
-def _documentation(layout: Layout, options: ExportOptions) -> str:
-    template, view = _committed(MODEL, "documentation.html"), options.view
+@cache
+def _kinematics(layout: ArmLayout) -> str:
+    return kinematics_source(layout)
+
+
+def _documentation(layout: ArmLayout, options: ExportOptions) -> str:
+    template, view = committed(MODEL, "documentation.html"), options.view
     rows = [
         f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
         f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
@@ -275,32 +175,3 @@ def _documentation(layout: Layout, options: ExportOptions) -> str:
         else f"the mismatch “{html.escape(options.mismatch)}”",
         rows="\n".join(rows),
     )
-
-
-def _compile(folder: Path, contents: dict[str, bytes], options: ExportOptions) -> None:
-    for name, content in contents.items():
-        if name.startswith("sources/"):
-            file = folder / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(content)
-    libraries = {}
-    for target in options.platforms:
-        library = folder / "library" / target.name / f"{options.identifier}{target.suffix}"
-        compile_library(folder / "sources", (*FMI_SOURCES[options.fmi_version], *SHARED_SOURCES), target, library)
-        libraries[target] = library.read_bytes()
-    contents |= library_files(libraries, options.identifier, options.fmi_version)
-
-
-def _write_archive(path: Path, contents: Mapping[str, bytes]) -> None:
-    handle, name = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
-            for inside in sorted(contents, key=lambda name: (name != "modelDescription.xml", name)):
-                entry = zipfile.ZipInfo(inside, ZIP_EPOCH)
-                entry.compress_type, entry.create_system = zipfile.ZIP_DEFLATED, 3
-                entry.external_attr = 0o644 << 16
-                archive.writestr(entry, contents[inside], compresslevel=9)
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    finally:
-        Path(name).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Generates the C code that depends on the arm: its kinematics, from the symbolic arm model, and the layout header.
+"""Generates the C code that depends on the arm: its kinematics, from the symbolic arm model.
 
 The kinematic core has three functions in CasADi's calling convention. They need libm only:
 
@@ -9,9 +9,7 @@ The kinematic core has three functions in CasADi's calling convention. They need
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import casadi
@@ -19,74 +17,36 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.fmus.eye_variables import View
-from servobench.fmus.variables import FIXED, INPUT, PARAMETER, STATE, Layout
-from servobench.plant.checks import FloatArray
+from servobench.fmus.source import generated_source
+from servobench.fmus.variables import ArmLayout
 from servobench.plant.eyes.optics import Optics
 from servobench.plant.eyes.symbolic import EyeGeometry, features, points_in_cameras, seen_features
 from servobench.plant.robot.symbolic import SX, ArmGeometry, HandEyeGeometry, feature_and_jacobian
 
-# Generated functions do not use all of their parameters; none of them is exported by the library.
-KINEMATICS_HEAD = """/* Generated from the symbolic arm model with CasADi's code generator; not meant to be edited. */
-#ifdef __GNUC__
-#pragma GCC diagnostic ignored "-Wunused-parameter"
-#endif
-#define CASADI_SYMBOL_EXPORT
-#include "kinematics.h"
-"""
 
-
-def kinematics_source(layout: Layout) -> str:
+def kinematics_source(layout: ArmLayout) -> str:
     """Return the C source of the kinematic core for the arm that `layout` describes."""
-    functions = _core_functions(layout)
-    generator = casadi.CodeGenerator("kinematics.c", {"with_header": False, "casadi_int": "int"})
-    for function in functions:
-        generator.add(function)
-    with tempfile.TemporaryDirectory() as folder:
-        generator.generate(f"{folder}/")
-        generated = (Path(folder) / "kinematics.c").read_text(encoding="utf-8")
-    return KINEMATICS_HEAD + generated
+    return generated_source("kinematics", _core_functions(layout))
 
 
-def layout_header(layout: Layout, start: Mapping[str, FloatArray], model_name: str, token: str) -> str:
-    """Return the C header with sizes, offsets, start values and minima.
-
-    Args:
-        layout: groups of the model.
-        start: start values of parameters, flat arrays by group.
-        model_name: for log messages.
-        token: GUID that the importer passes to `fmi2Instantiate` or `fmi3Instantiate…`.
-    """
-    lines = [
-        "/* Generated from the table of variables; not meant to be edited. */",
-        "#ifndef LAYOUT_H",
-        "#define LAYOUT_H",
-    ]
-    work = max(function.sz_w() for function in _core_functions(layout))
-    lines += [f'#define MODEL_NAME "{model_name}"', f'#define TOKEN "{token}"']
-    lines += [f"#define N_JOINTS {_size(layout, 'joint_position')}", f"#define N_GROUPS {len(layout.groups)}"]
-    lines += [f"#define N_KINEMATIC {kinematic_size(layout)}", f"#define N_WORK {max(work, 1)}"]
-    lines += [f"#define N_VALUES {layout.size}", f"#define N_SETTABLE {layout.offsets['der(joint_position)']}"]
+def arm_constants(layout: ArmLayout) -> dict[str, int]:
+    """Return the sizes and offsets that the model of an arm needs beside those of every layout."""
     first, *_ = layout.computed
-    for group in layout.groups:
-        name = "FEATURE" if group is first else _macro(group.name)
-        lines.append(f"#define OFFSET_{name} {layout.offsets[group.name]}")
-    sizes = ", ".join(f"{{{layout.offsets[group.name]}, {group.size}}}" for group in layout.groups)
-    zero = np.zeros(1)
-    values = np.concatenate([np.resize(start.get(group.name, zero), group.size) for group in layout.groups])
-    settable = layout.of_role(PARAMETER, FIXED, INPUT, STATE)
-    minima = [bound for group in settable for bound in [_bound(group.minimum)] * group.size]
-    lines += [f"#define GROUPS {{{sizes}}}"]
-    lines += [_initialiser("START_VALUES", [float(value).hex() for value in values])]
-    lines += [_initialiser("MINIMA", minima), "#endif", ""]
-    return "\n".join(lines)
+    work = max(function.sz_w() for function in _core_functions(layout))
+    return {
+        "N_JOINTS": _size(layout, "joint_position"),
+        "N_KINEMATIC": kinematic_size(layout),
+        "N_WORK": max(work, 1),
+        "OFFSET_FEATURE": layout.offsets[first.name],
+    }
 
 
-def kinematic_size(layout: Layout) -> int:
+def kinematic_size(layout: ArmLayout) -> int:
     """Return the number of kinematic parameters."""
     return sum(group.size for group in layout.kinematic)
 
 
-def _core_functions(layout: Layout) -> list[Any]:
+def _core_functions(layout: ArmLayout) -> list[Any]:
     n = _size(layout, "joint_position")
     q, p = casadi.SX.sym("q", n), casadi.SX.sym("p", kinematic_size(layout))
     dq, dp = casadi.SX.sym("dq", n), casadi.SX.sym("dp", kinematic_size(layout))
@@ -100,7 +60,7 @@ def _core_functions(layout: Layout) -> list[Any]:
     ]
 
 
-def _equations(layout: Layout, q: SX, p: SX) -> tuple[SX, SX]:
+def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
     """Return the outputs before the Jacobian and the Jacobian, for joint positions and kinematic parameters."""
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
     arm, view = _arm(part), layout.view
@@ -156,17 +116,5 @@ def _rotation(rpy: SX) -> SX:
     )
 
 
-def _size(layout: Layout, name: str) -> int:
+def _size(layout: ArmLayout, name: str) -> int:
     return next(group.size for group in layout.groups if group.name == name)
-
-
-def _macro(name: str) -> str:
-    return name.upper().replace("DER(", "DER_").replace(")", "")
-
-
-def _bound(minimum: float | None) -> str:
-    return "-HUGE_VAL" if minimum is None else float(minimum).hex()
-
-
-def _initialiser(name: str, values: list[str]) -> str:
-    return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"

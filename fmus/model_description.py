@@ -1,4 +1,4 @@
-"""Writes modelDescription.xml for FMI 2.0 and FMI 3.0, each for co-simulation and model exchange.
+"""Writes modelDescription.xml for FMI 2.0 and 3.0: co-simulation and, where a model has it, model exchange.
 
 Dependencies are explicit. The text holds no date and no machine name, so equal models give equal bytes.
 """
@@ -9,8 +9,8 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
 
+from servobench.fmus.structure import Section
 from servobench.fmus.variables import (
     DERIVATIVE,
     FIXED,
@@ -18,6 +18,7 @@ from servobench.fmus.variables import (
     INPUT,
     OUTPUT,
     PARAMETER,
+    SAMPLED,
     STATE,
     Group,
     Layout,
@@ -42,13 +43,13 @@ ATTRIBUTES = {
     DERIVATIVE: {"causality": "local", "variability": "continuous", "initial": "calculated"},
     INDICATOR: {"causality": "local", "variability": "continuous", "initial": "calculated"},
     OUTPUT: {"causality": "output", "variability": "continuous", "initial": "calculated"},
+    SAMPLED: {"causality": "output", "variability": "discrete", "initial": "calculated"},
 }
 LOG_CATEGORIES = {
     "logStatusError": "What went wrong.",
     "logStatusWarning": "What was refused.",
     "logEvents": "Joints that meet a stop or leave it.",
 }
-DEFAULT_EXPERIMENT = {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": "0.05"}
 REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard that tells the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
 
@@ -62,18 +63,29 @@ class Description:
         model_identifier: file name of the libraries.
         summary: one sentence.
         layout: the variables.
-        start: start values of parameters, flat arrays by group.
+        sections: of the model structure.
+        start: start values of parameters and inputs, flat arrays by group; zero where there are none.
         sources: C files to compile, in order.
         tool: name and version of the exporter.
+        step: of the default experiment [s].
+        exchange: whether there is model exchange, with derivatives, beside co-simulation.
     """
 
     model_name: str
     model_identifier: str
     summary: str
     layout: Layout
+    sections: tuple[Section, ...]
     start: Mapping[str, FloatArray]
     sources: tuple[str, ...]
     tool: str
+    step: float = 0.05
+    exchange: bool = True
+
+    @property
+    def experiment(self) -> dict[str, str]:
+        """The default experiment."""
+        return {"startTime": "0", "stopTime": "10", "tolerance": "1e-6", "stepSize": repr(self.step)}
 
 
 def write_fmi2(description: Description, token: str) -> bytes:
@@ -87,21 +99,21 @@ def write_fmi2(description: Description, token: str) -> bytes:
         "canNotUseMemoryManagementFunctions": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
-        "providesDirectionalDerivative": "true",
+        "providesDirectionalDerivative": "true" if description.exchange else "false",
     }
-    for interface, more in (
-        ("ModelExchange", {"completedIntegratorStepNotNeeded": "true"}),
-        ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
-    ):
+    interfaces = {"CoSimulation": {"canHandleVariableCommunicationStepSize": "true"}}
+    if description.exchange:
+        interfaces = {"ModelExchange": {"completedIntegratorStepNotNeeded": "true"}, **interfaces}
+    for interface, more in interfaces.items():
         files = ET.SubElement(ET.SubElement(root, interface, {**capabilities, **more}), "SourceFiles")
         for name in description.sources:
             ET.SubElement(files, "File", name=name)
     _units(root, {group.unit for group in description.layout.groups})
     _log_categories(root)
-    ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
+    ET.SubElement(root, "DefaultExperiment", description.experiment)
     _scalar_variables(ET.SubElement(root, "ModelVariables"), description)
     structure = ET.SubElement(root, "ModelStructure")
-    for section in _Structure(description.layout).sections():
+    for section in description.sections:
         if not section.fmi2:
             continue
         element = ET.SubElement(structure, section.fmi2)
@@ -120,16 +132,17 @@ def write_fmi3(description: Description, token: str) -> bytes:
         "modelIdentifier": description.model_identifier,
         "canGetAndSetFMUState": "true",
         "canSerializeFMUState": "true",
-        "providesDirectionalDerivatives": "true",
+        "providesDirectionalDerivatives": "true" if description.exchange else "false",
     }
-    ET.SubElement(root, "ModelExchange", capabilities)
+    if description.exchange:
+        ET.SubElement(root, "ModelExchange", capabilities)
     ET.SubElement(root, "CoSimulation", capabilities, canHandleVariableCommunicationStepSize="true")
     _units(root, {group.unit for group in description.layout.groups})
     _log_categories(root)
-    ET.SubElement(root, "DefaultExperiment", DEFAULT_EXPERIMENT)
+    ET.SubElement(root, "DefaultExperiment", description.experiment)
     _array_variables(ET.SubElement(root, "ModelVariables"), description)
     structure = ET.SubElement(root, "ModelStructure")
-    for section in _Structure(description.layout).sections():
+    for section in description.sections:
         for reference, dependencies in section.arrays():
             ET.SubElement(structure, section.fmi3, {"valueReference": str(reference)} | _dependent(dependencies))
     return _bytes(root)
@@ -164,76 +177,6 @@ def write_references(files: Iterable[tuple[str, str, str]]) -> bytes:
     for source, role, text in files:
         ET.SubElement(root, "Related", type="text/csv", source=source, role=role, description=text)
     return _bytes(root)
-
-
-_Rows: TypeAlias = list[tuple[str, tuple[str, ...], bool]]  # unknown, what it depends on, elementwise or as a whole
-
-
-@dataclass(frozen=True)
-class _Section:
-    """One part of the model structure: which unknown depends on which groups, elementwise or as a whole.
-
-    FMI 2 has no element for event indicators.
-    """
-
-    fmi2: str
-    fmi3: str
-    layout: Layout
-    unknowns: tuple[tuple[Group, tuple[str, ...], bool], ...]
-
-    def scalars(self) -> Iterable[tuple[int, list[int]]]:
-        """Yield index and dependencies of every number; FMI 2 wants them in ascending order."""
-        sizes = {group.name: group.size for group in self.layout.groups}
-        for group, names, elementwise in self.unknowns:
-            for k in range(group.size):
-                dependencies: list[int] = []
-                for name in names:
-                    first = self.layout.offsets[name]
-                    dependencies += [first + k] if elementwise else range(first, first + sizes[name])
-                yield self.layout.offsets[group.name] + k, sorted(dependencies)
-
-    def arrays(self) -> Iterable[tuple[int, list[int]]]:
-        """Yield value reference and dependencies of every group."""
-        for group, names, _ in self.unknowns:
-            yield self.layout.offsets[group.name], sorted(self.layout.offsets[name] for name in names)
-
-
-class _Structure:
-    """Outputs, derivatives and initial unknowns of the arm with what they depend on."""
-
-    def __init__(self, layout: Layout) -> None:
-        self._layout = layout
-        self._group = {group.name: group for group in layout.groups}
-        self._geometry = tuple(group.name for group in layout.kinematic)
-        self._computed = tuple(group.name for group in layout.computed)
-
-    def sections(self) -> tuple[_Section, ...]:
-        state = ("joint_position", "joint_velocity")
-        outputs: _Rows = [(name, (name,), True) for name in state]
-        outputs += [("encoder_position", ("joint_position",), True)]
-        outputs += [(name, ("joint_position",), False) for name in self._computed]
-        derivatives: _Rows = [
-            ("der(joint_position)", state, True),
-            ("der(joint_velocity)", (*state, "joint_velocity_command"), True),
-        ]
-        start: _Rows = [
-            ("joint_position", ("home",), True),
-            ("joint_velocity", (), True),
-            ("der(joint_position)", (), True),
-            ("der(joint_velocity)", ("lag", "max_speed", "joint_velocity_command"), True),
-            ("encoder_position", ("encoder_resolution", "home"), True),
-        ]
-        start += [(name, (*self._geometry, "home"), False) for name in self._computed]
-        return (
-            self._section("Outputs", "Output", outputs),
-            self._section("Derivatives", "ContinuousStateDerivative", derivatives),
-            self._section("InitialUnknowns", "InitialUnknown", start),
-            self._section("", "EventIndicator", [("stop_indicator", (*state[:1], "joint_velocity_command"), False)]),
-        )
-
-    def _section(self, fmi2: str, fmi3: str, rows: _Rows) -> _Section:
-        unknowns = tuple((self._group[name], names, elementwise) for name, names, elementwise in rows)
-        return _Section(fmi2, fmi3, self._layout, unknowns)
 
 
 def _describe(root: ET.Element, description: Description) -> None:

@@ -76,12 +76,12 @@ def _features(model: SensedArm, positions: FloatArray) -> dict[str, FloatArray]:
 
 def input_csv(run: ReferenceRun, layout: Layout) -> str:
     """Return the commands as CSV with one column for each scalar."""
-    return _table(run.time, {COMMAND: run.command}, layout)
+    return table(run.time, {COMMAND: run.command}, layout)
 
 
 def output_csv(run: ReferenceRun, layout: Layout) -> str:
     """Return the outputs as CSV with one column for each scalar."""
-    return _table(run.time, run.outputs, layout)
+    return table(run.time, run.outputs, layout)
 
 
 def read_table(text: str) -> tuple[list[str], FloatArray]:
@@ -99,7 +99,8 @@ def read_table(text: str) -> tuple[list[str], FloatArray]:
     return rows[0], np.array([[float(cell) for cell in row] for row in rows[1:]])
 
 
-def _table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -> str:
+def table(time: FloatArray, columns: Mapping[str, FloatArray], layout: Layout) -> str:
+    """Return values by name, (k, size), as CSV with one column for each scalar."""
     groups = {group.name: group for group in layout.groups}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -25,7 +25,7 @@ from servobench.plant.robot.limits import JointLimits, narrowed
 from servobench.plant.robot.sensed import SensedArm
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
-DERIVATIVE, INDICATOR, OUTPUT = "derivative", "event indicator", "output"
+DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
 
 
 @dataclass(frozen=True)
@@ -129,23 +129,9 @@ class Layout:
 
     Attributes:
         groups: of the model.
-        view: of a sensing set-up; None for the ball in 3-D by a fixed camera.
     """
 
     groups: tuple[Group, ...]
-    view: View | None = None
-
-    @property
-    def kinematic(self) -> tuple[Group, ...]:
-        """The parameters of the generated core, which come first."""
-        names = [group.name for group in self.groups]
-        return self.groups[: names.index("lag")]
-
-    @property
-    def computed(self) -> tuple[Group, ...]:
-        """The outputs of the generated core, which come last: the feature first, the Jacobian last."""
-        names = [group.name for group in self.groups]
-        return self.groups[names.index("encoder_position") + 1 :]
 
     @cached_property
     def offsets(self) -> dict[str, int]:
@@ -164,6 +150,29 @@ class Layout:
     def of_role(self, *roles: str) -> list[Group]:
         """Return the groups of these roles, in order."""
         return [group for group in self.groups if group.role in roles]
+
+
+@dataclass(frozen=True)
+class ArmLayout(Layout):
+    """The layout of an arm.
+
+    Attributes:
+        view: of a sensing set-up; None for the ball in 3-D by a fixed camera.
+    """
+
+    view: View | None = None
+
+    @property
+    def kinematic(self) -> tuple[Group, ...]:
+        """The parameters of the generated core, which come first."""
+        names = [group.name for group in self.groups]
+        return self.groups[: names.index("lag")]
+
+    @property
+    def computed(self) -> tuple[Group, ...]:
+        """The outputs of the generated core, which come last: the feature first, the Jacobian last."""
+        names = [group.name for group in self.groups]
+        return self.groups[names.index("encoder_position") + 1 :]
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,25 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
     return put(tree, lanes, function(before, *(take(each, lanes) for each in arguments)), before)
 
 
+def repeat(
+    condition: Callable[[Tree], npt.ArrayLike], function: Callable[[Tree], Tree], tree: Tree, at_most: int
+) -> Tree:
+    """Return a tree after `function` was applied, `at_most` so often, in the lanes in which a condition still holds.
+
+    Args:
+        condition: of a tree, (...), bool.
+        function: as in `branch`.
+        tree: at the beginning.
+        at_most: times after which it certainly holds no more.
+    """
+    for _ in range(at_most):
+        chosen = np.asarray(condition(tree))
+        if not chosen.any():
+            break
+        tree = branch(chosen, function, tree)
+    return tree
+
+
 def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Mark a function that is written for single runs: it is called for one lane after the other.
 

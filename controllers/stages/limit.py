@@ -14,7 +14,7 @@ import numpy as np
 
 from servobench.controllers.stages.inverses import damped_inverse
 from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch
+from servobench.plant.lanes import branch, repeat
 from servobench.plant.signals import BoolArray
 
 MIN_ROOM = 1e-9  # [1] of its limit; a joint with less room is left out
@@ -95,8 +95,8 @@ def redistribute(
         wanted = np.matvec(jacobian, joint_step)
         down, up = np.minimum(limit, down), np.minimum(limit, up)
         state = _Shared(dq, 1.0 - 1.0 / excess, free, jacobian, wanted, down, up)
-        while (unfinished := _is_unfinished(state)).any():
-            state = branch(unfinished, take_over, state)
+        # Each time a joint is left out, or comes to its limit and is left out the next time, or all is done.
+        state = repeat(_is_unfinished, take_over, state, 2 * joint_step.shape[-1] + 1)
         return np.minimum(np.maximum(state.joint_step, -limit), limit)
 
     return branch(largest_excess(joint_step, limit) > 1.0, shared, joint_step, jacobian, *further)

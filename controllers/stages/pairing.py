@@ -167,7 +167,7 @@ class Pairing:
 
     def delay(self, state: PairState) -> npt.NDArray[np.int_]:
         """Return d, (...), periods."""
-        delay: npt.NDArray[np.int_] = self.delays[state.candidate]
+        delay: npt.NDArray[np.int_] = np.take(self.delays, state.candidate)
         return delay
 
     def exposed(self, state: PairState) -> tuple[FloatArray, FloatArray]:

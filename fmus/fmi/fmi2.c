@@ -27,7 +27,7 @@ fmi2Status answer(const Instance *instance, const char *function, const char *me
 void report_events(Instance *instance)
 {
     char text[MESSAGE_SIZE];
-    while ((instance->logged & LOG_EVENTS) && core_next_event(&instance->core, text)) tell(instance, fmi2OK, 2, text);
+    while ((instance->logged & LOG_EVENTS) && model_next_event(&instance->core.model, text)) tell(instance, fmi2OK, 2, text);
 }
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
@@ -61,6 +61,11 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     instance->logged = logging ? LOG_ALL : 0;
     if (strcmp(guid, TOKEN) != 0) {
         answer(instance, "fmi2Instantiate", "the GUID is not that of this model");
+        fmi2FreeInstance(instance);
+        return NULL;
+    }
+    if (type == fmi2ModelExchange && !HAS_EXCHANGE) {
+        answer(instance, "fmi2Instantiate", "the model is for co-simulation only");
         fmi2FreeInstance(instance);
         return NULL;
     }
@@ -212,7 +217,8 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component component, const fmi2Value
         if (knowns[i] >= N_SETTABLE) return answer(instance, "fmi2GetDirectionalDerivative", "this is no known");
         direction[knowns[i]] = seed[i];
     }
-    model_derive(&instance->core.model, direction, instance->core.phase == INITIALISING);
+    const ModelStatus status = model_derive(&instance->core.model, direction, instance->core.phase == INITIALISING);
+    if (status != MODEL_OK) return answer(instance, "fmi2GetDirectionalDerivative", model_explain(status));
     for (size_t i = 0; i < n_unknowns; i++) {
         if (unknowns[i] >= N_VALUES) return answer(instance, "fmi2GetDirectionalDerivative", "this is no unknown");
         sensitivity[i] = direction[unknowns[i]];

@@ -46,10 +46,10 @@ fmi2Status fmi2SetTime(fmi2Component component, fmi2Real time)
     return fmi2OK;
 }
 
-/* There are as many event indicators as states, two for each joint. */
+/* There are as many event indicators as states. */
 static fmi2Status check_count(const Instance *instance, const char *function, size_t count)
 {
-    return answer(instance, function, count == 2 * N_JOINTS ? NULL : "wrong number of values");
+    return answer(instance, function, count == N_STATES ? NULL : "wrong number of values");
 }
 
 fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real states[], size_t count)
@@ -62,14 +62,14 @@ fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real state
 
 static void copy_values(Instance *instance, size_t offset, fmi2Real values[])
 {
-    for (size_t i = 0; i < 2 * N_JOINTS; i++) model_get(&instance->core.model, offset + i, &values[i]);
+    for (size_t i = 0; i < N_STATES; i++) model_get(&instance->core.model, offset + i, &values[i]);
 }
 
 fmi2Status fmi2GetDerivatives(fmi2Component component, fmi2Real derivatives[], size_t count)
 {
     OPEN("fmi2GetDerivatives", RUNNING | TERMINATED);
     const fmi2Status status = check_count(instance, "fmi2GetDerivatives", count);
-    if (status == fmi2OK) copy_values(instance, OFFSET_DER_JOINT_POSITION, derivatives);
+    if (status == fmi2OK) copy_values(instance, OFFSET_DERIVATIVES, derivatives);
     return status;
 }
 
@@ -77,7 +77,7 @@ fmi2Status fmi2GetEventIndicators(fmi2Component component, fmi2Real indicators[]
 {
     OPEN("fmi2GetEventIndicators", READABLE);
     const fmi2Status status = check_count(instance, "fmi2GetEventIndicators", count);
-    if (status == fmi2OK) copy_values(instance, OFFSET_STOP_INDICATOR, indicators);
+    if (status == fmi2OK) copy_values(instance, OFFSET_INDICATORS, indicators);
     return status;
 }
 
@@ -85,7 +85,7 @@ fmi2Status fmi2GetContinuousStates(fmi2Component component, fmi2Real states[], s
 {
     OPEN("fmi2GetContinuousStates", READABLE);
     const fmi2Status status = check_count(instance, "fmi2GetContinuousStates", count);
-    if (status == fmi2OK) copy_values(instance, OFFSET_JOINT_POSITION, states);
+    if (status == fmi2OK) copy_values(instance, OFFSET_STATES, states);
     return status;
 }
 

@@ -22,7 +22,7 @@ void report_events(Instance *instance)
 {
     char text[MESSAGE_SIZE];
     if (instance->log == NULL) return;
-    while ((instance->logged & LOG_EVENTS) && core_next_event(&instance->core, text)) {
+    while ((instance->logged & LOG_EVENTS) && model_next_event(&instance->core.model, text)) {
         instance->log(instance->environment, fmi3OK, log_categories[2], text);
     }
 }
@@ -59,6 +59,11 @@ static Instance *instantiate(const char *function, fmi3String token, int exchang
     instance->environment = environment;
     if (token == NULL || strcmp(token, TOKEN) != 0) {
         answer(instance, function, "the token is not that of this model");
+        free(instance);
+        return NULL;
+    }
+    if (exchange && !HAS_EXCHANGE) {
+        answer(instance, function, "the model is for co-simulation only");
         free(instance);
         return NULL;
     }
@@ -143,7 +148,10 @@ fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference refere
         const size_t size = size_of(references[i]);
         if (size == 0) return answer(self, "fmi3GetFloat64", NO_SUCH_VARIABLE);
         if (k + size > n_values) return answer(self, "fmi3GetFloat64", "too few values for these variables");
-        for (size_t j = 0; j < size; j++) core_get(&self->core, references[i] + j, &values[k++]);
+        for (size_t j = 0; j < size; j++) {
+            const char *message = core_get(&self->core, references[i] + j, &values[k++]);
+            if (message != NULL) return answer(self, "fmi3GetFloat64", message);
+        }
     }
     return answer(self, "fmi3GetFloat64", k == n_values ? NULL : "too many values for these variables");
 }
@@ -230,7 +238,8 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
         memcpy(direction + knowns[i], seed + k, size * sizeof(double));
         k += size;
     }
-    model_derive(&self->core.model, direction, self->core.phase == INITIALISING);
+    const ModelStatus status = model_derive(&self->core.model, direction, self->core.phase == INITIALISING);
+    if (status != MODEL_OK) return answer(self, "fmi3GetDirectionalDerivative", model_explain(status));
     size_t j = 0;
     for (size_t i = 0; i < n_unknowns; i++) {
         const size_t size = size_of(unknowns[i]);

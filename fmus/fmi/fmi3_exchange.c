@@ -46,10 +46,10 @@ fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time)
     return fmi3OK;
 }
 
-/* There are as many event indicators as states, two for each joint. */
+/* There are as many event indicators as states. */
 static fmi3Status check_count(const Instance *self, const char *function, size_t count)
 {
-    return answer(self, function, count == 2 * N_JOINTS ? NULL : "wrong number of values");
+    return answer(self, function, count == N_STATES ? NULL : "wrong number of values");
 }
 
 fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 states[], size_t count)
@@ -70,19 +70,19 @@ static fmi3Status copy_values(Instance *self, const char *function, size_t offse
 fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 states[], size_t count)
 {
     OPEN("fmi3GetContinuousStates", READABLE);
-    return copy_values(self, "fmi3GetContinuousStates", OFFSET_JOINT_POSITION, states, count);
+    return copy_values(self, "fmi3GetContinuousStates", OFFSET_STATES, states, count);
 }
 
 fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t count)
 {
     OPEN("fmi3GetContinuousStateDerivatives", READABLE);
-    return copy_values(self, "fmi3GetContinuousStateDerivatives", OFFSET_DER_JOINT_POSITION, derivatives, count);
+    return copy_values(self, "fmi3GetContinuousStateDerivatives", OFFSET_DERIVATIVES, derivatives, count);
 }
 
 fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[], size_t count)
 {
     OPEN("fmi3GetEventIndicators", READABLE);
-    return copy_values(self, "fmi3GetEventIndicators", OFFSET_STOP_INDICATOR, indicators, count);
+    return copy_values(self, "fmi3GetEventIndicators", OFFSET_INDICATORS, indicators, count);
 }
 
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t count)
@@ -96,13 +96,13 @@ fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *count)
 {
     OPEN("fmi3GetNumberOfContinuousStates", ~0);
-    *count = 2 * N_JOINTS;
+    *count = N_STATES;
     return fmi3OK;
 }
 
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *count)
 {
     OPEN("fmi3GetNumberOfEventIndicators", ~0);
-    *count = 2 * N_JOINTS;
+    *count = N_STATES;
     return fmi3OK;
 }

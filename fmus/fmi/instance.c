@@ -16,20 +16,6 @@ const char *const log_categories[N_CATEGORIES] = {"logStatusError", "logStatusWa
 
 static double time_tolerance(double time, double step) { return STEP_SHARE * step + ROUNDING * fabs(time); }
 
-static const char *explain(ModelStatus status)
-{
-    switch (status) {
-    case MODEL_NO_SUCH_VARIABLE: return "there is no variable with this value reference";
-    case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
-    case MODEL_FIXED: return "this parameter is fixed: it can be set before the end of initialisation only";
-    case MODEL_BAD_VALUE: return "the value is not finite or below the variable's minimum";
-    case MODEL_EMPTY_RANGE: return "joint_lower is not below joint_upper";
-    case MODEL_BEYOND_STOP: return "a joint is beyond its stops joint_lower and joint_upper";
-    case MODEL_NOT_FINITE: return "a joint position is not finite";
-    default: return NULL;
-    }
-}
-
 void core_reset(Core *core, int exchange)
 {
     memset(core, 0, sizeof *core);
@@ -49,22 +35,21 @@ const char *core_begin(Core *core, double start, int stop_defined, double stop)
 
 const char *core_leave_initialisation(Core *core)
 {
-    const ModelStatus status = model_check_range(&core->model);
+    const ModelStatus status = model_check(&core->model);
     if (status == MODEL_OK) core->phase = core->model.exchange ? IN_EVENT : STEPPING;
-    return explain(status);
+    return model_explain(status);
 }
 
-const char *core_get(Core *core, size_t index, double *value) { return explain(model_get(&core->model, index, value)); }
+const char *core_get(Core *core, size_t index, double *value)
+{
+    return model_explain(model_get(&core->model, index, value));
+}
 
 const char *core_set(Core *core, size_t index, double value)
 {
     const int starting = (core->phase & (INSTANTIATED | INITIALISING)) != 0;
-    /* Solvers that know no other way may set states one by one. */
-    if (index >= OFFSET_JOINT_POSITION && index < N_SETTABLE && (core->phase & EXCHANGING) == 0) {
-        return explain(MODEL_NOT_SETTABLE);
-    }
-    if (!starting && index >= OFFSET_HOME && index < OFFSET_HOME + N_JOINTS) return explain(MODEL_FIXED);
-    return explain(model_set(&core->model, index, value));
+    const ModelStatus status = model_admits(index, starting, (core->phase & EXCHANGING) != 0);
+    return model_explain(status == MODEL_OK ? model_set(&core->model, index, value) : status);
 }
 
 const char *core_step(Core *core, double time, double step)
@@ -76,8 +61,8 @@ const char *core_step(Core *core, double time, double step)
     if (time + step > core->stop_time + tolerance) return "the step ends after the stop time";
     if (step > 0.0) {
         const ModelStatus status = model_step(model, step);
-        if (status == MODEL_NOT_FINITE) core->phase = FAILED;
-        if (status != MODEL_OK) return explain(status);
+        if (status >= MODEL_NOT_FINITE) core->phase = FAILED;
+        if (status != MODEL_OK) return model_explain(status);
     }
     model->time = time + step;
     return NULL;
@@ -91,23 +76,7 @@ const char *core_check_stop_time(const Core *core)
 
 const char *core_update_discrete_states(Core *core, int *states_changed)
 {
-    const ModelStatus status = model_has_empty_range(&core->model) ? MODEL_EMPTY_RANGE : MODEL_OK;
-    *states_changed = status == MODEL_OK && model_settle(&core->model);
-    return explain(status);
-}
-
-int core_next_event(Core *core, char text[MESSAGE_SIZE])
-{
-    model_hold(&core->model);
-    for (int i = 0; i < N_JOINTS; i++) {
-        const int held = core->model.held[i];
-        if (held == core->reported[i]) continue;
-        const char *what = held > 0 ? "is held by its upper stop" : held < 0 ? "is held by its lower stop" : "is free";
-        snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, what, core->model.time);
-        core->reported[i] = held;
-        return 1;
-    }
-    return 0;
+    return model_explain(model_settle(&core->model, states_changed));
 }
 
 /* FNV-1a */

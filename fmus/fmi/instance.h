@@ -1,4 +1,7 @@
-/* What FMI 2 and FMI 3 have in common beside the model: phases, time, saved states, messages. */
+/* What FMI 2 and FMI 3 have in common beside the model: phases, time, saved states, messages.
+
+   A model is a folder with model.h and model.c. Its Model has `time` and `exchange`; the offsets and sizes of its
+   variables are in the generated layout.h; the functions are those that are declared in either model.h. */
 #ifndef INSTANCE_H
 #define INSTANCE_H
 
@@ -30,7 +33,6 @@ typedef struct {
     Model model;
     Phase phase;
     double stop_time; /* infinite if none was given */
-    int reported[N_JOINTS]; /* stops that the joints are held by, as far as the log knows */
 } Core;
 
 typedef struct {
@@ -50,10 +52,6 @@ const char *core_step(Core *core, double time, double step);
 /* Solvers evaluate the equations beyond the stop time as well; what ends a step or changes a state may not. */
 const char *core_check_stop_time(const Core *core);
 const char *core_update_discrete_states(Core *core, int *states_changed);
-/* Writes what happened at a stop since the last call; zero if nothing (more) did. */
-#define MESSAGE_SIZE 256
-int core_next_event(Core *core, char text[MESSAGE_SIZE]);
-
 /* NULL without memory. */
 Snapshot *snapshot_take(const Core *core);
 /* NULL if `bytes` are not an intact state of this model. */

@@ -2,6 +2,7 @@
 #include "kinematics.h"
 
 #include <math.h>
+#include <stdio.h>
 #include <string.h>
 
 /* In continuous time a lag of zero would make the equations algebraic; below this it counts as this. */
@@ -56,6 +57,20 @@ static int side_met(const Model *model, size_t i)
 
 static int is_driven(const Model *model, size_t i, int side) { return clipped_command(model, i) * side > 0.0; }
 
+const char *model_explain(ModelStatus status)
+{
+    switch (status) {
+    case MODEL_NO_SUCH_VARIABLE: return "there is no variable with this value reference";
+    case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
+    case MODEL_FIXED: return "this parameter is fixed: it can be set before the end of initialisation only";
+    case MODEL_BAD_VALUE: return "the value is not finite or below the variable's minimum";
+    case MODEL_EMPTY_RANGE: return "joint_lower is not below joint_upper";
+    case MODEL_BEYOND_STOP: return "a joint is beyond its stops joint_lower and joint_upper";
+    case MODEL_NOT_FINITE: return "a joint position is not finite";
+    default: return NULL;
+    }
+}
+
 void model_reset(Model *model, int exchange)
 {
     memset(model, 0, sizeof *model);
@@ -75,7 +90,7 @@ void model_start(Model *model)
     model->stale = STALE_ALL;
 }
 
-int model_has_empty_range(const Model *model)
+static int has_empty_range(const Model *model)
 {
     for (size_t i = 0; i < N_JOINTS; i++) {
         if (!(model->values[OFFSET_JOINT_LOWER + i] < model->values[OFFSET_JOINT_UPPER + i])) return 1;
@@ -83,40 +98,63 @@ int model_has_empty_range(const Model *model)
     return 0;
 }
 
-ModelStatus model_check_range(const Model *model)
+ModelStatus model_check(const Model *model)
 {
-    if (model_has_empty_range(model)) return MODEL_EMPTY_RANGE;
+    if (has_empty_range(model)) return MODEL_EMPTY_RANGE;
     for (size_t i = 0; i < N_JOINTS; i++) {
         if (upper_room(model, i) < 0.0 || lower_room(model, i) < 0.0) return MODEL_BEYOND_STOP;
     }
     return MODEL_OK;
 }
 
-int model_settle(Model *model)
+ModelStatus model_settle(Model *model, int *changed)
 {
-    int changed = 0;
+    *changed = 0;
+    if (has_empty_range(model)) return MODEL_EMPTY_RANGE;
     for (size_t i = 0; i < N_JOINTS; i++) {
         const int side = side_met(model, i);
         if (side != 0) {
             double *position = &model->values[OFFSET_JOINT_POSITION + i];
             double *velocity = &model->values[OFFSET_JOINT_VELOCITY + i];
             const double stop = model->values[(side > 0 ? OFFSET_JOINT_UPPER : OFFSET_JOINT_LOWER) + i];
-            changed |= *position != stop || *velocity != 0.0;
+            *changed |= *position != stop || *velocity != 0.0;
             *position = stop;
             *velocity = 0.0;
         }
         model->held[i] = is_driven(model, i, side) ? side : 0;
     }
     model->stale = STALE_ALL;
-    return changed;
+    return MODEL_OK;
 }
 
-void model_hold(Model *model)
+/* Finds out which joints are held, unless only events tell. */
+static void hold(Model *model)
 {
     for (size_t i = 0; i < N_JOINTS && !model->exchange; i++) {
         const int side = side_met(model, i);
         model->held[i] = is_driven(model, i, side) ? side : 0;
     }
+}
+
+int model_next_event(Model *model, char text[MESSAGE_SIZE])
+{
+    hold(model);
+    for (int i = 0; i < N_JOINTS; i++) {
+        const int held = model->held[i];
+        if (held == model->reported[i]) continue;
+        const char *what = held > 0 ? "is held by its upper stop" : held < 0 ? "is held by its lower stop" : "is free";
+        snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, what, model->time);
+        model->reported[i] = held;
+        return 1;
+    }
+    return 0;
+}
+
+ModelStatus model_admits(size_t index, int starting, int exchanging)
+{
+    /* Solvers that know no other way may set states one by one. */
+    if (index >= OFFSET_JOINT_POSITION && index < N_SETTABLE && !exchanging) return MODEL_NOT_SETTABLE;
+    return !starting && index >= OFFSET_HOME && index < OFFSET_HOME + N_JOINTS ? MODEL_FIXED : MODEL_OK;
 }
 
 ModelStatus model_set(Model *model, size_t index, double value)
@@ -151,7 +189,7 @@ static void refresh_kinematics(Model *model, int part)
 /* Free joints meet a stop where its distance crosses zero; held ones are freed where the command does. */
 static void refresh_derivatives(Model *model)
 {
-    model_hold(model);
+    hold(model);
     for (size_t i = 0; i < N_JOINTS; i++) {
         const double v = model->values[OFFSET_JOINT_VELOCITY + i], u = clipped_command(model, i);
         const int held = model->held[i];
@@ -207,7 +245,7 @@ ModelStatus model_step(Model *model, double step)
 {
     double *position = model->values + OFFSET_JOINT_POSITION, *velocity = model->values + OFFSET_JOINT_VELOCITY;
     if (step != model->gain_step) { /* also after a parameter was set */
-        const ModelStatus status = model_check_range(model);
+        const ModelStatus status = model_check(model);
         if (status != MODEL_OK) return status;
         refresh_gains(model, step);
     }
@@ -238,9 +276,9 @@ static double derive_acceleration(const Model *model, const double *direction, s
     return (du - direction[OFFSET_JOINT_VELOCITY + i]) / lag - (u - v) / (lag * lag) * dlag;
 }
 
-void model_derive(Model *model, double direction[N_VALUES], int starting)
+ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting)
 {
-    model_hold(model);
+    hold(model);
     if (starting) {
         memcpy(direction + OFFSET_JOINT_POSITION, direction + OFFSET_HOME, N_JOINTS * sizeof(double));
         memset(direction + OFFSET_JOINT_VELOCITY, 0, N_JOINTS * sizeof(double));
@@ -260,4 +298,5 @@ void model_derive(Model *model, double direction[N_VALUES], int starting)
                                   direction + OFFSET_JOINT_POSITION, direction};
     double *results[1] = {direction + OFFSET_FEATURE}; /* the Jacobian follows it */
     arm_forward(arguments, results, NULL, work, 0);
+    return MODEL_OK;
 }

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from servobench.harness.cli import completion
 from servobench.harness.cli.named import known_robot
-from servobench.harness.cli.options import RobotOption, SensingOption
+from servobench.harness.cli.options import ConfigOption, RobotOption, SensingOption, SetOption
 from servobench.harness.cli.terminal import console
 
-fmu_app = typer.Typer(help="Export an arm as an FMU; check and show FMUs.", no_args_is_help=True)
+if TYPE_CHECKING:
+    from servobench.fmus.product import Product
+    from servobench.harness.config.settings import Settings
+
+fmu_app = typer.Typer(help="Export an arm or a controller as an FMU; check and show FMUs.", no_args_is_help=True)
 
 FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 
@@ -19,7 +24,11 @@ FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 @fmu_app.command()
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", help="The .fmu file to write.")],
-    fmi: Annotated[int, typer.Option(help="2 or 3; both offer co-simulation and model exchange.")] = 2,
+    fmi: Annotated[int, typer.Option(help="2 or 3; an arm has co-simulation and model exchange.")] = 2,
+    controller: Annotated[
+        str | None,
+        typer.Option(help="Export this controller in place of the arm.", autocompletion=completion.controllers),
+    ] = None,
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
     robot: RobotOption = "ur5",
     sensing: SensingOption = "position",
@@ -28,28 +37,53 @@ def export(
         str | None,
         typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
     ] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
 ) -> None:
-    """Export an arm with a mismatch as start values."""
+    """Export an arm with a mismatch as start values, or a controller."""
     from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
-    from servobench.fmus.export import ExportOptions, default_actuation, export_fmu
+    from servobench.harness.config.settings import ConfigurationError, read_settings
+
+    settings = read_settings(config, assignments or ())
+    if controller is None and settings.sections:
+        raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
+    drawn = known_robot(robot), sensing, mismatch, seed
+    try:
+        chosen = parse_platforms(platforms)
+        product = _arm(fmi, *drawn) if controller is None else _controller(fmi, controller, *drawn, settings)
+        product.write(output, chosen)
+    except (ValueError, OSError, CompilerMissing, CompilationFailed) as error:
+        raise ConfigurationError(str(error)) from error
+    names = ", ".join(platform.name for platform in chosen)
+    console.print(f"{output}: FMI {fmi}, {output.stat().st_size / 1024:.0f} kB, for {names}", soft_wrap=True)
+
+
+def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Product:
+    from servobench.fmus.export import ExportOptions, default_actuation, product
     from servobench.harness.config.robots import find_robot
     from servobench.harness.config.sensing import find_sensing
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
     from servobench.plant.seeds import named_seed
 
-    described = find_robot(known_robot(robot))
-    try:
-        drawn, differs = named_seed(seed, "mismatch"), Mismatch.parse(mismatch)
-        arm, sample = sample_mismatch(differs, described, drawn)
-        model, _ = find_sensing(sensing).true(described, arm, sample, differs, drawn)
-        words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
-        options = ExportOptions(fmi, model, default_actuation(described), parse_platforms(platforms), words, described)
-        export_fmu(output, options)
-    except (ValueError, OSError, CompilerMissing, CompilationFailed) as error:
-        raise ConfigurationError(str(error)) from error
-    names = ", ".join(platform.name for platform in options.platforms)
-    console.print(f"{output}: FMI {fmi}, {output.stat().st_size / 1024:.0f} kB, for {names}", soft_wrap=True)
+    described, differs, drawn = find_robot(robot), Mismatch.parse(mismatch), named_seed(seed, "mismatch")
+    arm, sample = sample_mismatch(differs, described, drawn)
+    model, _ = find_sensing(sensing).true(described, arm, sample, differs, drawn)
+    words = "none" if mismatch == "none" else f"{mismatch}, seed {seed}"
+    return product(ExportOptions(fmi, model, default_actuation(described), mismatch=words, robot=described))
+
+
+def _controller(fmi: int, name: str, robot: str, sensing: str, mismatch: str, seed: int, settings: Settings) -> Product:
+    from servobench.fmus.product import check_version
+    from servobench.harness.config.registry import choose_controller
+    from servobench.harness.run.controller_fmu import controller_model
+    from servobench.harness.run.request import RunRequest, read_mismatch
+
+    check_version(fmi)
+    run = RunRequest(
+        "kinematic", choose_controller(name), "target", read_mismatch(mismatch), seed, robot=robot, sensing=sensing
+    )
+    settings.check_sections([run.controller, "kinematic", "target", "run"])
+    return controller_model(run, settings).product(fmi)
 
 
 @fmu_app.command()

@@ -24,6 +24,7 @@ from servobench.harness.cli.init import init
 from servobench.harness.cli.new import new
 from servobench.harness.cli.options import FAILED, INTERRUPTED
 from servobench.harness.cli.record import record
+from servobench.harness.cli.shadow import shadow
 from servobench.harness.cli.sweep import sweep
 from servobench.harness.cli.verify import verify
 
@@ -45,7 +46,7 @@ WITHOUT: dict[tuple[object, object], str] = {  # why a command does not have an 
 }
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
-    "Your own controller": (new, check),
+    "Your own controller": (new, check, shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, init),
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
     "Tools": (runs.train, runs.collect, export, verify),

@@ -97,21 +97,13 @@ def record(
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
+    from servobench.harness.batch.logged import find_run
     from servobench.harness.config.engines import rendered_plant
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.replay import logged_run
-    from servobench.plant.settings import suggest
 
-    runs = results.load_runs(folder)
-    names = runs["run_id"].tolist()
-    if run_id is None and len(names) > 1:
-        raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")
-    chosen = run_id or names[0]
-    if chosen not in names:
-        raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
-    row = {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
-    configuration = results.read_manifest(folder).get("configuration", {})
-    return logged_run(row, results.load_steps(folder, [chosen]), configuration.get(rendered_plant(row["plant"]), {}))
+    row = find_run(folder, run_id)
+    settings = results.read_manifest(folder).get("configuration", {}).get(rendered_plant(row["plant"]), {})
+    return logged_run(row, results.load_steps(folder, [row["run_id"]]), settings)
 
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import TYPE_CHECKING
 
 from servobench.harness.config.extras import has_no_wheel
 from servobench.harness.config.registry import RENDERED, UNRENDERED, find_plant, installed_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.plant import PlantEntry
+
+if TYPE_CHECKING:
+    from servobench.plant.rendered.engine import OpenScene
 
 
 def engine_of(name: str) -> str:
@@ -37,6 +41,17 @@ def default_plant() -> tuple[str, str]:
         else:
             return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
     return UNRENDERED, missing[RENDERED[has_no_wheel()]]
+
+
+def scene_of(plant: str) -> OpenScene:
+    """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
+    if plant == "mujoco":
+        from servobench.plant.mujoco.scene import MujocoScene  # noqa: PLC0415
+
+        return MujocoScene
+    from servobench.plant.bullet.scene import BulletScene  # noqa: PLC0415
+
+    return BulletScene
 
 
 def rendered_plant(named: str | None = None) -> str:

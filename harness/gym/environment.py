@@ -11,13 +11,15 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.harness.config.robots import DEFAULT_ROBOT
-from servobench.harness.config.settings import Settings
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.gym.outside import OutsideView
 from servobench.harness.gym.view import Floats32, View
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.faults import FeatureLost, RunFault
+from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.seeds import named_seed
 from servobench.plant.signals import Command, Observation
 
@@ -63,7 +65,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         resolved: what all runs have in common.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - declared so by Gymnasium
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,
@@ -73,16 +75,24 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         robot: str = DEFAULT_ROBOT,
         sensing: str = DEFAULT_SENSING,
         settings: Mapping[str, Mapping[str, Any]] | None = None,
+        render_mode: str | None = None,
     ) -> None:
         """Look everything up; names and settings are those of `servobench.run`.
 
+        With the `render_mode` "rgb_array", `render` returns pictures.
+
         Raises:
-            ConfigurationError: a name, setting or mismatch that cannot be used.
+            ConfigurationError: a name, setting, mismatch or mode that cannot be used.
         """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigurationError(f"render_mode must be rgb_array or None, got {render_mode!r}")
+        self.render_mode = render_mode
         self.observation: Observation | None = None
         self.resolved: Final = resolve_environment(plant, task, mismatch, robot, sensing, settings)
         self._experiment: Experiment | None = build(self.resolved)
         self._view = View(self._experiment.plant.spec, self.resolved.run.preview_rows)
+        self.metadata = self.metadata | {"render_fps": 1.0 / self._view.spec.period}
+        self._outside: OutsideView | None = None
         self.natural_size = self._view.spec.feature.scale
         self.observation_space, self.action_space = self._view.observations, self._view.actions
 
@@ -149,8 +159,34 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         rows = self.resolved.run.preview_rows + 1
         return self._view.see(self.observation, self._desired[self._k : self._k + rows], self._action)
 
+    def render(self) -> ByteArray | None:
+        """Return the present picture, (h, w, 3): what the plant's camera sees, or the arm from outside.
+
+        The camera's picture has the detected ball or discs marked, that from outside the target of the ball.
+
+        Raises:
+            gymnasium.error.ResetNeeded: `reset` has not been called.
+            ConfigurationError: the plant has no camera, and its arm is not known or nothing can render it.
+        """
+        experiment = self._experiment
+        if experiment is None or self.observation is None:
+            raise gymnasium.error.ResetNeeded("call reset before render")
+        if self.render_mode is None:
+            return None
+        picture = experiment.plant.picture()
+        if picture is not None:
+            return picture
+        if self._outside is None:
+            self._outside = OutsideView(experiment.drawn, self.resolved.request)
+        move = experiment.loop.camera_move
+        moved = move is not None and self._k > move.period
+        return self._outside.picture(self.observation.joint_position, self._desired[self._k], moved=moved)
+
     def close(self) -> None:
         """Free the plant; calling it twice is allowed."""
+        if self._outside is not None:
+            self._outside.close()
+            self._outside = None
         if self._experiment is not None:
             self._experiment.plant.close()
             self._experiment = None

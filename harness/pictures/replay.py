@@ -11,33 +11,28 @@ import math
 import re
 from dataclasses import dataclass, fields, replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
 import pandas as pd
 
-from servobench.harness.config.engines import rendered_plant
+from servobench.harness.config.engines import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
 from servobench.plant.checks import FloatArray
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
+from servobench.plant.rendered.overview import Overview
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import Robot
 from servobench.plant.seeds import named_seed
 
-if TYPE_CHECKING:
-    from servobench.plant.rendered.engine import OpenScene
-
 JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
-EYE, TARGET = (1.75, -1.35, 1.35), (0.40, 0.0, 0.26)  # m, base frame of a UR5: from the front right, down to it
-OVERVIEW = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball
 ROUNDING = 1e-6  # [s] by which an instant may lie outside a stretch
 HIDDEN_OPACITY = 0.3  # of the parts of a trail that are hidden
@@ -155,15 +150,13 @@ class Replay:
             run: what to show.
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
-        self._run, self._fineness, scale = run, fineness, run.robot.workspace.scale
+        self._run, self._fineness = run, fineness
         open_scene = scene_of(rendered_plant(str(run.track.row["plant"])))
         self._scene = open_scene(Room(run.model.arm, scenery=True, robot=run.robot))
         self._camera = run.config.camera()
         self._poses = [model.X_BC for model in (run.model, run.moved) if model]
         self._pose = self._poses[0]
-        self._overview_pose = _look_at(scale * np.array(EYE), scale * np.array(TARGET))
-        width, height = round(fineness * OVERVIEW.width), round(fineness * OVERVIEW.height)
-        self._overview = replace(OVERVIEW, width=width, height=height)
+        self._overview = Overview.of(run.robot.workspace.scale, fineness)
 
     def __enter__(self) -> Self:
         """Return the replay."""
@@ -186,9 +179,9 @@ class Replay:
 
     def overview(self, trails: list[Trail]) -> ByteArray:
         """Return the arm from outside with trails, pale where they are hidden: (480, 640, 3) times the fineness."""
-        rgba, buffer = self._scene.render(self._overview, self._overview_pose)
+        rgba, buffer = self._scene.render(self._overview.camera, self._overview.X_BC)
         picture = np.ascontiguousarray(rgba[..., :3])
-        depth = self._overview.metric_depth(buffer)
+        depth = self._overview.camera.metric_depth(buffer)
         for trail in trails:
             self._draw(picture, depth, trail)
         return picture
@@ -196,14 +189,13 @@ class Replay:
     def _draw(self, picture: ByteArray, depth: FloatArray, trail: Trail) -> None:
         if len(trail.points) < 2 or not np.isfinite(trail.points).all():
             return
-        camera, X = self._overview, self._overview_pose
-        p_C = (trail.points - X[:3, 3]) @ X[:3, :3]
-        if (p_C[:, 2] < camera.near).any():
+        camera = self._overview.camera
+        pixels, far = self._overview.pixels(trail.points)
+        if (far < camera.near).any():
             return
-        pixels = camera.project(p_C)
         columns = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
         rows = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
-        hidden = p_C[:, 2] > depth[rows, columns] + SEEN_DEPTH
+        hidden = far > depth[rows, columns] + SEEN_DEPTH
         corners = np.round(pixels * 16).astype(np.int32)
         width = max(1, round(trail.width * self._fineness))
         covered = hidden[1:] | hidden[:-1]
@@ -213,17 +205,6 @@ class Replay:
                 cv2.line(layer, corners[i].tolist(), corners[i + 1].tolist(), trail.colour, width, cv2.LINE_AA, 4)
             if wanted:
                 cv2.addWeighted(layer, HIDDEN_OPACITY, picture, 1 - HIDDEN_OPACITY, 0.0, dst=picture)
-
-
-def scene_of(plant: str) -> OpenScene:
-    """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
-    if plant == "mujoco":
-        from servobench.plant.mujoco.scene import MujocoScene  # noqa: PLC0415
-
-        return MujocoScene
-    from servobench.plant.bullet.scene import BulletScene  # noqa: PLC0415
-
-    return BulletScene
 
 
 def _true_model(row: dict[str, Any], robot: Robot) -> tuple[HandEyeModel, HandEyeModel | None]:
@@ -255,14 +236,3 @@ def _first_seen_by(moved: HandEyeModel, model: HandEyeModel, q: FloatArray, feat
     )
     seen = np.flatnonzero(after < before)
     return int(seen[0]) if len(seen) else len(q)
-
-
-def _look_at(eye: FloatArray, target: FloatArray) -> FloatArray:
-    """Return X_BC, (4, 4), of a camera at `eye` that looks at `target`, both (3,) m, with the horizon level."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
-    pose[:3, 3] = eye
-    return pose

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from servobench.harness.config.robots import OWN_ROBOT
@@ -27,7 +26,7 @@ from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.side_by_side import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
 from servobench.harness.run.tasks import Scenario
-from servobench.harness.run.threads import one_thread
+from servobench.harness.run.threads import careful
 from servobench.harness.run.together import Together, build_together
 from servobench.plant.checks import FloatArray
 from servobench.plant.plant import ImageArray
@@ -87,7 +86,7 @@ def carry_out(
     log = StepLog(plant.spec, experiment.periods)
     ending = Ending()
     try:
-        with _careful():
+        with careful():
             desired = scenario.reference.sampled(plant.spec.period, experiment.periods + experiment.run.preview_rows)
             pair = held_to_contract(plant, experiment.controller)
             run_loop(*pair, desired, experiment.loop, resolved.request.seed, log)
@@ -135,7 +134,7 @@ def _carry_out_part(runs: Sequence[ResolvedRun], keep: Path | None) -> list[RunR
     ends = Ends(len(runs))
     log = ManyLogs(many.bench.spec, many.loop.periods, ends)
     try:
-        with _careful(), contextlib.suppress(AllEnded):
+        with careful(), contextlib.suppress(AllEnded):
             plant, controller = ManyBenches(many.bench, ends), ManyServos(many.servo, ends)
             run_loop(plant, controller, many.desired, many.loop, [run.request.seed for run in runs], log)
     finally:
@@ -162,13 +161,6 @@ def _judge_together(runs: Sequence[ResolvedRun], many: Together, ends: Ends, log
 def _judge(logged: Steps, task: Scenario) -> dict[str, FloatArray]:
     """Return the metrics of a run or of runs side by side; none without rows."""
     return judge_run(logged, task.kind, task.evaluate_from, task.lap_time) if len(logged) else {}
-
-
-@contextlib.contextmanager
-def _careful() -> Iterator[None]:
-    """One thread, and an error where a number leaves its range."""
-    with one_thread(), np.errstate(divide="raise", over="raise", invalid="raise"):
-        yield
 
 
 def _numbers(metrics: dict[str, FloatArray]) -> dict[str, float]:

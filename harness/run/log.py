@@ -186,6 +186,11 @@ class StepLog:
         return Steps(rows.spec, **arrays, diagnostics={name: values[:k] for name, values in rows.diagnostics.items()})
 
 
+def column_name(kind: str, name: str, unit: str) -> str:
+    """Return the name of a column, such as `feature_x_m`."""
+    return f"{kind}_{name}_{column_unit(unit)}"
+
+
 def column_unit(unit: str) -> str:
     """Return a unit as the names of columns end with it: `rad/s` -> `rad_s`."""
     return re.sub(r"\W+", "_", unit)
@@ -204,4 +209,4 @@ def _flat(jacobian: FloatArray) -> FloatArray:
 
 def _named(kind: str, names: tuple[str, ...], unit: str, values: FloatArray) -> Iterator[tuple[str, FloatArray]]:
     for name, column in zip(names, values.T, strict=True):
-        yield f"{kind}_{name}_{column_unit(unit)}", column
+        yield column_name(kind, name, unit), column

@@ -1,10 +1,12 @@
-"""One thread for linear algebra: the same sums, and so the same bits, on any number of processors."""
+"""How numbers are computed in a run: on one thread, for the same bits on any number of processors, and checked."""
 
 from __future__ import annotations
 
 import sys
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 
+import numpy as np
 from threadpoolctl import ThreadpoolController
 
 _found: list[tuple[int, ThreadpoolController]] = []
@@ -20,3 +22,10 @@ def one_thread() -> AbstractContextManager[object]:
         _found[:] = [(modules, ThreadpoolController())]
     context: AbstractContextManager[object] = _found[0][1].limit(limits=1)
     return context
+
+
+@contextmanager
+def careful() -> Iterator[None]:
+    """One thread, and an error where a number leaves its range."""
+    with one_thread(), np.errstate(divide="raise", over="raise", invalid="raise"):
+        yield

@@ -31,10 +31,11 @@ ONLY_READ = {
     "report": "needs the folder of a run, which test_report.py makes",
     "statistics": "needs the folder of a run; docs/five_minutes.md carries it out",
     "export": "needs the folder of a batch; tests/harness/test_exports.py exports one",
+    "shadow": "needs a logged run; tests/harness/test_shadow.py shows some",
     "verify": "needs the folder of a batch; tests/harness/test_integrity.py damages some",
     "collect": "needs a batch that was killed; the tests of batches kill one",
 }
-OWN = ("my_ur10e.yaml", "my_arm.urdf", "mine.toml", "crane.toml", "planar", "nominal_rate", "learned.py")  # yours
+OWN = ("my_ur10e.yaml", "my_arm.urdf", "mine.toml", "crane.toml", "planar", "nominal_rate", "learned")  # yours
 
 
 def shown_lines():

@@ -94,7 +94,7 @@ def test_the_fingerprint_changes_with_whatever_decides_how_the_fmu_behaves(monke
     assert fingerprint(ExportOptions(2)) == plain
     others = [fingerprint(ExportOptions(3)), fingerprint(ExportOptions(2, mismatched("severe")))]
     others.append(fingerprint(ExportOptions(2, platforms=tuple(PLATFORMS.values()))))
-    monkeypatch.setattr("servobench.fmus.export.CODE", ("-O3",))
+    monkeypatch.setattr("servobench.fmus.product.CODE", ("-O3",))
     others.append(fingerprint(ExportOptions(2)))
     assert len({plain, *others}) == 5
 

@@ -11,18 +11,25 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from kit.documents import blocks
+from kit.plants import plant_parameters
 from servobench.harness.batch.api import run
+from servobench.harness.config.engines import default_plant
+from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym import ENVIRONMENT
 from servobench.harness.gym.environment import ServoEnv
+from servobench.harness.gym.outside import MARK
 from servobench.harness.gym.vector import ServoVectorEnv
+from servobench.plant.rendered.overview import Overview
+
+RENDERS = default_plant()[0] in RENDERED
 
 
 def test_gymnasium_finds_nothing_to_warn_of():
     env = gymnasium.make(ENVIRONMENT)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(env.unwrapped)
+        check_env(env.unwrapped, skip_render_check=not RENDERS)
     env.close()
 
 
@@ -94,6 +101,46 @@ def test_a_run_that_fails_terminates_and_is_charged_for_the_rest():
     assert ended.all()
     assert terminated.any()
     env.close(), many.close()
+
+
+@pytest.mark.skipif(not RENDERS, reason="nothing that renders is installed")
+def test_a_plant_without_a_camera_is_shown_from_outside_with_its_ball_and_the_target():
+    env = ServoEnv(task="exp2", mismatch="moderate+camera_move=20deg", render_mode="rgb_array")
+    env.reset(seed=1)
+    drawn, view = env._experiment.drawn, Overview.of(1.0)
+    for k in (0, 120):  # before and after the camera is moved
+        for _ in range(k):
+            env.step(np.array([0.1, -0.05, 0.05, 0.0, 0.0, 0.0]))
+        picture = env.render()
+        assert (picture.shape, picture.dtype) == ((480, 640, 3), np.uint8)
+        red = np.argwhere((picture[..., 0] > 120) & (picture[..., 1:] < 60).all(axis=-1))
+        (ball,), _ = view.pixels(drawn.true.arm.ball_position(env.observation.joint_position)[None])
+        np.testing.assert_allclose(red.mean(axis=0)[::-1], ball, atol=3.0)
+        model = drawn.moved if k else drawn.true
+        (target,), _ = view.pixels(model.to_base(env._desired[0])[None])
+        x, y = np.round(target).astype(int)
+        np.testing.assert_array_equal(picture[y, x], MARK)
+    env.close()
+
+
+@pytest.mark.parametrize("plant", plant_parameters(RENDERED))
+def test_a_plant_with_a_camera_shows_what_that_sees(plant):
+    env = ServoEnv(plant, task="exp2", render_mode="rgb_array")
+    env.reset(seed=1)
+    np.testing.assert_array_equal(env.render(), env._experiment.plant.picture())
+    assert env.render().shape == (240, 320, 3)
+    env.close()
+
+
+def test_nothing_is_rendered_unless_it_is_asked_for():
+    env = ServoEnv()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.render()
+    env.reset(seed=1)
+    assert env.render() is None
+    env.close()
+    with pytest.raises(ConfigurationError, match="render_mode must be rgb_array or None, got 'human'"):
+        ServoEnv(render_mode="human")
 
 
 def test_bad_environments_are_refused():

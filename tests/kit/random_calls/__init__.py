@@ -9,7 +9,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from servobench.fmus.export import FMI_SOURCES, SHARED_SOURCES, ExportOptions, source_files
+from servobench.fmus.export import ExportOptions, product
 
 HERE = Path(__file__).parent
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
@@ -31,14 +31,15 @@ def can_sanitize() -> bool:
 
 def build(folder: Path, version: int, defect: str = "") -> Path:
     """Compile the driver with the sources of the exported UR5, without the check `defect`, to test the test."""
-    for name, text in source_files(ExportOptions(version)).items():
+    exported = product(ExportOptions(version))
+    for name, text in exported.sources().items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text if not defect else text.replace(defect, "0"))
     sources = folder / "sources"
     shutil.copy(HERE / "calls.h", sources)
     shutil.copy(HERE / f"calls{version}.c", sources)
-    files = [f"calls{version}.c", *FMI_SOURCES[version], *SHARED_SOURCES]
+    files = [f"calls{version}.c", *exported.description.sources]
     command = [shutil.which("cc") or "cc", *COMMON, *SANITIZED, *files, "-o", str(folder / "calls"), "-lm"]
     subprocess.run(command, cwd=sources, check=True)
     return folder / "calls"

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
-
 from kit.rendered import IDEAL
-from servobench.plant.bullet.bullet_plant import build_bullet
-from servobench.plant.bullet.scene import BulletScene
+from servobench.harness.config.engines import scene_of
+from servobench.harness.config.registry import find_plant
 from servobench.plant.eyes.eye import Eye
 from servobench.plant.eyes.registry import Sensing
 from servobench.plant.faults import FeatureLost
@@ -34,12 +32,12 @@ def true_model(word, robot=UR5):
 
 
 @pytest.fixture
-def open_eye():
+def open_eye(engine):
     """A builder of noiseless plants under a sensing set-up, which are closed after the test."""
     plants = []
 
-    def build(model, config=IDEAL, start=HOME):
-        plants.append(build_bullet(config, PlantSetup(model, start, 0.05, UR5)))
+    def build(model, config=IDEAL, start=HOME, robot=UR5):
+        plants.append(find_plant(engine).build(config, PlantSetup(model, start, 0.05, robot)))
         return plants[-1]
 
     yield build
@@ -48,9 +46,9 @@ def open_eye():
 
 
 @pytest.mark.parametrize("word", IN_PIXELS)
-def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word):
+def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word, engine):
     model, rng = true_model(word), np.random.default_rng(5)
-    scene = BulletScene(Room(model.arm, scenery=False, rig=Rig.of(model, UR5)))
+    scene = scene_of(engine)(Room(model.arm, scenery=False, rig=Rig.of(model, UR5)))
     sight, errors, poses = open_sight(model, scene, IDEAL, UR5), [], 0
     sight.reset(0)
     while poses < 25:
@@ -82,11 +80,10 @@ def test_a_plant_sees_its_target_from_the_start_and_follows_it(word, open_eye):
     assert plant.picture().shape == (240, 320 * model.eye.cameras, 3)
 
 
-def test_another_arm_carries_the_plate_at_its_own_scale():
+def test_another_arm_carries_the_plate_at_its_own_scale(open_eye):
     panda, model = find_robot("panda"), true_model("plate", find_robot("panda"))
-    plant = build_bullet(rendered_config(panda), PlantSetup(model, panda.workspace.home, 0.05, panda))
+    plant = open_eye(model, rendered_config(panda), panda.workspace.home, panda)
     assert plant.reset(0).feature_valid
-    plant.close()
 
 
 def test_a_hidden_disc_is_lost_alone_and_held(open_eye):
@@ -114,13 +111,13 @@ def test_a_saved_state_goes_on_with_the_same_bits(open_eye):
     assert np.std(np.subtract(first, [plant.step(turn).feature for _ in range(3)])) > 0.0
 
 
-def test_what_cannot_be_rendered_is_refused():
+def test_what_cannot_be_rendered_is_refused(open_eye):
     model = true_model("pixel")
     with pytest.raises(ValueError, match="the images of pixel have 320 x 240 px and 60 deg"):
-        build_bullet(replace(IDEAL, width=640), PlantSetup(model, HOME, 0.05, UR5))
+        open_eye(model, replace(IDEAL, width=640))
     two = Eye("two", "", ("a", "b", "c", "d"), "px", model.eye.measure, target=((0.0,) * 3, (0.1, 0.0, 0.0)))
     with pytest.raises(ValueError, match="a ball, of one point, or a plate with three or four discs"):
-        build_bullet(IDEAL, PlantSetup(replace(model, eye=two, target=np.array(two.target)), HOME, 0.05, UR5))
+        open_eye(replace(model, eye=two, target=np.array(two.target)))
     deep = replace(model.eye, name="deep", measure=lambda points, optics: optics.focal * points[..., 0, 0, :2])
     with pytest.raises(ValueError, match="sensing deep needs depth, and the intrinsics"):
-        build_bullet(IDEAL, PlantSetup(replace(model, eye=deep), HOME, 0.05, UR5))
+        open_eye(replace(model, eye=deep))

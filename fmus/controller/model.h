@@ -1,0 +1,63 @@
+/* A controller as a system in discrete time, free of FMI: one flat vector of values, and a sample each period.
+
+   u(k) = [time, inputs],   x(0) = start(u(0)),   x(k+1), y(k) = step(x(k), u(k))
+
+   At a sampling instant the outputs follow the inputs as soon as one is set; until then, and between the instants, they
+   are those of the last sample. A step makes the samples of the instants from its beginning on and before its end. */
+#ifndef MODEL_H
+#define MODEL_H
+
+#include "layout.h"
+#include <stddef.h>
+
+/* Nothing is continuous. */
+enum { HAS_EXCHANGE = 0, N_STATES = 0, OFFSET_STATES = 0, OFFSET_DERIVATIVES = 0, OFFSET_INDICATORS = 0 };
+
+typedef struct {
+    double time;
+    int exchange;
+    double values[N_VALUES];    /* inputs, then outputs of the last sample */
+    double first;               /* time of the first sample */
+    double sample;              /* k, a whole number */
+    int begun;                  /* there is a state */
+    int touched;                /* an input was set after the last sample */
+    int known;                  /* the next three are those of the present inputs */
+    double fault;               /* of the step, as the generated code numbers them */
+    double next[N_MEMORY];      /* x(k+1) */
+    double answers[N_ANSWERS];  /* y(k) */
+    double memory[N_MEMORY];    /* x(k) */
+} Model;
+
+typedef enum {
+    MODEL_OK,
+    MODEL_NO_SUCH_VARIABLE,
+    MODEL_NOT_SETTABLE,
+    MODEL_BAD_VALUE,
+    MODEL_NO_DERIVATIVES,
+    MODEL_NOT_FINITE, /* this and what follows ends a run */
+    MODEL_NOT_DEFINITE,
+    MODEL_NO_MEMORY
+} ModelStatus;
+
+/* What a status says to the user; NULL for MODEL_OK. */
+const char *model_explain(ModelStatus status);
+
+/* Start values, before the first sample. */
+void model_reset(Model *model, int exchange);
+void model_start(Model *model);
+ModelStatus model_check(const Model *model);
+
+ModelStatus model_admits(size_t index, int starting, int exchanging);
+ModelStatus model_set(Model *model, size_t index, double value);
+/* Computes outputs of the present inputs where these are due. */
+ModelStatus model_get(Model *model, size_t index, double *value);
+ModelStatus model_step(Model *model, double step);
+
+/* There are no events, no continuous states and no derivatives. */
+#define MESSAGE_SIZE 256
+ModelStatus model_settle(Model *model, int *changed);
+int model_next_event(Model *model, char text[MESSAGE_SIZE]);
+void model_set_states(Model *model, const double *states);
+ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting);
+
+#endif

@@ -1,0 +1,152 @@
+"""Exports a controller as a co-simulation FMU: a recorded step, its variables, its reference run."""
+
+from __future__ import annotations
+
+import html
+import string
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from servobench.fmus.model_description import Description
+from servobench.fmus.product import Product, c_files, committed, tool, word
+from servobench.fmus.reference import table
+from servobench.fmus.source import generated_source
+from servobench.fmus.structure import sampled_sections
+from servobench.fmus.trace.faults import NOT_DEFINITE
+from servobench.fmus.trace.record import Recorded
+from servobench.fmus.variables import INPUT, SAMPLED, Group, Layout
+from servobench.plant.checks import FloatArray
+
+MODEL: Final = "controller"
+CORE: Final = "controller"
+POSITION, FEATURE, SEEN, REFERENCE = "joint_position", "feature", "seen", "reference"
+COMMAND, JACOBIAN = "joint_velocity_command", "jacobian"
+
+
+def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]:
+    """Return the variables of a controller.
+
+    Args:
+        n: joints.
+        m: features.
+        rows: of the reference.
+        unit: of a feature.
+    """
+    return (
+        Group(POSITION, (n,), INPUT, "rad", "Joint position as the encoders report it."),
+        Group(FEATURE, (m,), INPUT, unit, "What is measured; the last valid value of what is not seen."),
+        Group(SEEN, (m,), INPUT, "1", "1 where the feature was measured for this instant, else 0."),
+        Group(REFERENCE, (rows, m), INPUT, unit, "Desired feature now, in row 1, and at the next instants."),
+        Group(COMMAND, (n,), SAMPLED, "rad/s", "Joint velocity for the period that begins at this instant."),
+        Group(JACOBIAN, (m, n), SAMPLED, f"{unit}/rad", "Estimated Jacobian, 0 before there is one; for evaluation."),
+    )
+
+
+@dataclass(frozen=True)
+class ControllerRun:
+    """A run of the original: what it saw and what it answered in each period.
+
+    Attributes:
+        time: (K,), s.
+        inputs: by name, (K, size).
+        outputs: by name, (K, size).
+    """
+
+    time: FloatArray
+    inputs: Mapping[str, FloatArray]
+    outputs: Mapping[str, FloatArray]
+
+    def tables(self, layout: Layout) -> tuple[str, str]:
+        """Return inputs and outputs as CSV; the outputs at an instant, before its inputs, are those of the last one."""
+        before = {name: np.vstack([np.zeros(rows.shape[1]), rows[:-1]]) for name, rows in self.outputs.items()}
+        return table(self.time, self.inputs, layout), table(self.time, before, layout)
+
+
+@dataclass(frozen=True)
+class ControllerModel:
+    """A controller that is to be exported.
+
+    Attributes:
+        name: by which it is known.
+        summary: one line.
+        recorded: its step, of the columns [time, inputs].
+        groups: from `controller_groups`.
+        period: s.
+        run: of the original.
+        settings: what it was built with, for the documentation.
+    """
+
+    name: str
+    summary: str
+    recorded: Recorded
+    groups: tuple[Group, ...]
+    period: float
+    run: ControllerRun
+    settings: str
+
+    @property
+    def identifier(self) -> str:
+        """Name of the libraries."""
+        return word(self.name, "controller")
+
+    @cached_property
+    def source(self) -> str:
+        """The generated C file."""
+        return generated_source(CORE, (self.recorded.start, self.recorded.step))
+
+    def product(self, fmi_version: int) -> Product:
+        """Return what goes into the FMU of a version of FMI, 2 or 3."""
+        layout = Layout(self.groups)
+        return Product(
+            fmi_version=fmi_version,
+            folder=MODEL,
+            core=CORE,
+            source=self.source,
+            constants=self._constants(layout),
+            description=Description(
+                model_name=f"Controller {self.name}",
+                model_identifier=self.identifier,
+                summary=f"{self.name}: {self.summary}.",
+                layout=layout,
+                sections=sampled_sections(layout),
+                start={SEEN: np.ones_like(self.run.inputs[SEEN][0])},
+                sources=c_files(fmi_version, CORE),
+                tool=tool(),
+                step=self.period,
+                exchange=False,
+            ),
+            documentation=self._documentation(layout),
+            reference=self.run.tables(layout),
+        )
+
+    def _constants(self, layout: Layout) -> dict[str, float]:
+        parts = self.recorded.start, self.recorded.step
+        pointers = max(size for part in parts for size in (part.sz_arg(), part.sz_res()))
+        return {
+            "PERIOD": self.period,
+            "N_MEMORY": max(self.recorded.states, 1),
+            "N_ANSWERS": sum(group.size for group in layout.of_role(SAMPLED)),
+            "N_POINTERS": pointers,
+            "N_WORK": max(1, *(part.sz_w() for part in parts)),
+            "N_WHOLE_WORK": max(1, *(part.sz_iw() for part in parts)),
+            "FAULT_NOT_DEFINITE": NOT_DEFINITE,
+        }
+
+    def _documentation(self, layout: Layout) -> str:
+        rows = [
+            f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
+            f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
+            for group in layout.groups
+        ]
+        return string.Template(committed(MODEL, "documentation.html")).substitute(
+            name=html.escape(self.name),
+            summary=html.escape(self.summary),
+            period=f"{self.period:g}",
+            memory=self.recorded.states,
+            settings=html.escape(self.settings),
+            rows="\n".join(rows),
+        )

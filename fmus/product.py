@@ -1,0 +1,207 @@
+"""What goes into an FMU, whatever the model, and how it is written: sources, libraries, description, documentation.
+
+Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import Final
+
+from servobench.fmus.compile import CODE, Platform, compile_library, library_files
+from servobench.fmus.model_description import (
+    REFERENCES,
+    Description,
+    write_build_description,
+    write_fmi2,
+    write_fmi3,
+    write_references,
+)
+from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
+from servobench.fmus.source import layout_header
+
+MACHINERY: Final = "fmi"  # folder of the FMI functions, which know no model
+HEADERS: Final = {
+    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
+    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
+}
+FMI_SOURCES: Final = {2: ("fmi2.c", "fmi2_exchange.c"), 3: ("fmi3.c", "fmi3_exchange.c", "fmi3_absent.c")}
+INSTANCE_HEADERS: Final = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
+SHARED_SOURCES: Final = ("model.c", "instance.c")
+ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
+PLACEHOLDER: Final = "{token}"
+RELATED_FILES: Final = (
+    (INPUT_FILE, "testcase", "Inputs of the reference run, each held over the step that begins at its time."),
+    (OUTPUT_FILE, "result", "Outputs of the reference run, computed by an independent implementation."),
+)
+
+
+@dataclass(frozen=True)
+class Product:
+    """What goes into an FMU.
+
+    Attributes:
+        fmi_version: 2 or 3.
+        folder: of the model below `fmus`, with model.c, model.h and license.txt.
+        core: name of the generated C file and of its header in that folder.
+        source: text of that C file.
+        constants: what the model needs in layout.h beside sizes and offsets of its variables.
+        description: of the model.
+        documentation: HTML.
+        reference: text of the reference run's inputs and outputs.
+    """
+
+    fmi_version: int
+    folder: str
+    core: str
+    source: str
+    constants: Mapping[str, float]
+    description: Description
+    documentation: str
+    reference: tuple[str, str]
+
+    def sources(self) -> dict[str, str]:
+        """Return the C files by their path in the archive, with a placeholder for the token."""
+        described, version_ = self.description, self.fmi_version
+        machinery = ("instance.h", "instance.c", INSTANCE_HEADERS[version_], *FMI_SOURCES[version_])
+        texts = {name: committed(MACHINERY, name) for name in machinery}
+        texts |= {name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")}
+        texts |= {name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8") for name in HEADERS[version_]}
+        texts[f"{self.core}.c"] = self.source
+        layout = described.layout, described.start, self.constants
+        texts["layout.h"] = layout_header(*layout, described.model_identifier, PLACEHOLDER)
+        return {f"sources/{name}": text for name, text in texts.items()}
+
+    def descriptions(self, token: str) -> dict[str, bytes]:
+        """Return the XML files by their path in the archive."""
+        if self.fmi_version == 2:
+            return {"modelDescription.xml": write_fmi2(self.description, token)}
+        return {
+            "modelDescription.xml": write_fmi3(self.description, token),
+            "sources/buildDescription.xml": write_build_description(self.description),
+        }
+
+    def companions(self) -> dict[str, str]:
+        """Return documentation, licence and reference run by their path in the archive."""
+        inputs, outputs = self.reference
+        related = ((f"../{file.removeprefix('extra/')}", role, text) for file, role, text in RELATED_FILES)
+        return {
+            INPUT_FILE: inputs,
+            OUTPUT_FILE: outputs,
+            f"extra/{REFERENCES}/fmi-ls-manifest.xml": write_references(related).decode(),
+            "documentation/index.html": self.documentation,
+            "documentation/licenses/license.txt": committed("ur5_mismatched", "license.txt"),
+        }
+
+    def fingerprint(self, platforms: tuple[Platform, ...]) -> str:
+        """Return a hash of all that determines the behaviour of the FMU: sources, descriptions, compilation."""
+        contents = {name: text.encode() for name, text in self.sources().items()}
+        contents |= self.descriptions(PLACEHOLDER)
+        for platform in platforms:
+            contents[f"binaries/{platform.name}"] = repr((CODE, platform)).encode()
+        return _token(contents)
+
+    def write(self, path: Path, platforms: tuple[Platform, ...]) -> Path:
+        """Write the FMU atomically.
+
+        Args:
+            path: the .fmu file; its folder must exist.
+            platforms: to compile for.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: the folder does not exist.
+            CompilerMissing: no compiler for one of the platforms.
+            CompilationFailed: a compiler rejected the sources.
+        """
+        if not path.parent.is_dir():
+            raise ValueError(f"the folder {path.parent} for the FMU does not exist")
+        contents = {name: text.encode() for name, text in (self.sources() | self.companions()).items()}
+        token = _token(contents)
+        layout_name = "sources/layout.h"
+        contents[layout_name] = contents[layout_name].replace(PLACEHOLDER.encode(), token.encode())
+        contents |= self.descriptions(token)
+        contents |= self._libraries(contents, platforms)
+        write_archive(path, contents)
+        return path
+
+    def _libraries(self, contents: Mapping[str, bytes], platforms: tuple[Platform, ...]) -> dict[str, bytes]:
+        identifier = self.description.model_identifier
+        with tempfile.TemporaryDirectory(prefix="servobench-export-") as name:
+            folder = Path(name)
+            (folder / "sources").mkdir()
+            for inside in (each for each in contents if each.startswith("sources/")):
+                (folder / inside).write_bytes(contents[inside])
+            libraries = {}
+            for target in platforms:
+                library = folder / "library" / target.name / f"{identifier}{target.suffix}"
+                compile_library(folder / "sources", self.description.sources, target, library)
+                libraries[target] = library.read_bytes()
+        return library_files(libraries, identifier, self.fmi_version)
+
+
+def check_version(fmi_version: int) -> None:
+    """Refuse a version of FMI that is not exported.
+
+    Raises:
+        ValueError: neither 2 nor 3.
+    """
+    if fmi_version not in FMI_SOURCES:
+        raise ValueError(f"fmi_version must be 2 or 3, got {fmi_version}")
+
+
+def c_files(fmi_version: int, core: str) -> tuple[str, ...]:
+    """Return the C files to compile, in order."""
+    return (*FMI_SOURCES[fmi_version], *SHARED_SOURCES, f"{core}.c")
+
+
+def committed(folder: str, name: str) -> str:
+    """Return the text of a file of this package."""
+    return (files("servobench.fmus") / folder / name).read_text(encoding="utf-8")
+
+
+def tool() -> str:
+    """Return name and version of the exporter."""
+    return f"servobench {version('servobench')}"
+
+
+def word(text: str, otherwise: str) -> str:
+    """Return a text as a word of C, which begins with `otherwise` where it does not begin with a letter."""
+    plain = re.sub(r"[^A-Za-z0-9_]", "_", text)
+    return plain if plain[:1].isalpha() else f"{otherwise}_{plain}"
+
+
+def _token(contents: Mapping[str, bytes]) -> str:
+    """Return a GUID that is a hash of everything in the FMU except its libraries."""
+    digest = hashlib.sha256()
+    for name in sorted(contents):
+        digest.update(name.encode() + b"\0" + contents[name] + b"\0")
+    text = digest.hexdigest()
+    return "{" + "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:32])) + "}"
+
+
+def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "modelDescription.xml") -> None:
+    """Write files by their path in a zip archive, the `first` one first; atomically."""
+    handle, name = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
+            for inside in sorted(contents, key=lambda name: (name != first, name)):
+                entry = zipfile.ZipInfo(inside, ZIP_EPOCH)
+                entry.compress_type, entry.create_system = zipfile.ZIP_DEFLATED, 3
+                entry.external_attr = 0o644 << 16
+                archive.writestr(entry, contents[inside], compresslevel=9)
+        Path(name).chmod(0o644)
+        Path(name).replace(path)
+    finally:
+        Path(name).unlink(missing_ok=True)

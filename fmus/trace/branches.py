@@ -1,0 +1,107 @@
+"""Decisions of `servobench.plant.lanes` over arrays of expressions: C takes one of two ways, as the code did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from typing import Any, TypeVar
+
+import casadi
+import numpy as np
+
+from servobench.fmus.trace.array import NotTraceable, Traced, as_traced
+from servobench.fmus.trace.faults import frame, note_code
+from servobench.plant.lanes import map_arrays
+
+Tree = TypeVar("Tree")
+_NUMBERS = count()
+
+
+def leaves_of(tree: Any) -> list[Any]:  # noqa: ANN401 - any tree
+    """Return the arrays of a tree, in order."""
+    leaves: list[Any] = []
+    map_arrays(leaves.append, tree)
+    return leaves
+
+
+def with_leaves(tree: Tree, leaves: list[Any]) -> Tree:
+    """Return a tree of the same form with other arrays."""
+    rest = iter(leaves)
+    renewed: Tree = map_arrays(lambda _: next(rest), tree)
+    return renewed
+
+
+def symbols_like(leaves: list[Any]) -> list[Traced]:
+    """Return an array of symbols for each array."""
+    return [Traced.of(casadi.MX.sym(f"x{k}", int(np.size(leaf))), np.shape(leaf), leaf.dtype.kind)
+            for k, leaf in enumerate(leaves)]  # fmt: skip
+
+
+def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
+    """Return `function(tree, *arguments)` if `chosen`, else `tree`; see `servobench.plant.lanes.branch`.
+
+    Raises:
+        NotTraceable: the function uses expressions that are not among its arguments.
+    """
+    if not isinstance(chosen, Traced) or chosen.constant:
+        return function(tree, *arguments) if chosen else tree
+    given = leaves_of((tree, arguments))
+    places = [k for k, leaf in enumerate(given) if isinstance(leaf, Traced) and not leaf.constant]
+    symbols = symbols_like([given[k] for k in places])
+    own = list(given)
+    for k, symbol in zip(places, symbols, strict=True):
+        own[k] = symbol
+    inside, among = with_leaves((tree, arguments), own)
+    before = leaves_of(inside)
+    with frame() as faults:
+        result = function(inside, *among)
+    after = leaves_of(result)
+    if [np.shape(leaf) for leaf in after] != [np.shape(leaf) for leaf in before]:
+        raise NotTraceable(f"the shape of what {_name(function)} returns depends on the run")
+    changed = [k for k, (new, old) in enumerate(zip(after, before, strict=True)) if new is not old]
+    parts = [[as_traced(leaves[k]).flat() for k in changed] for leaves in (after, before)]
+    inputs = [symbol.buffer.content for symbol in symbols]
+    ways = [
+        _function(function, inputs, [*outputs, code])
+        for outputs, code in zip(parts, (faults.code, casadi.MX(0.0)), strict=True)
+    ]
+    switch = casadi.Function.if_else(f"branch{next(_NUMBERS)}", *ways)
+    results = switch(chosen.flat(), *(given[k].flat() for k in places))
+    results = list(results) if isinstance(results, (tuple, list)) else [results]
+    note_code(results.pop())
+    merged = leaves_of(tree)
+    for k, expression in zip(changed, results, strict=True):
+        kind = max(as_traced(after[k]).kind, as_traced(before[k]).kind, key="bif".index)
+        merged[k] = Traced.of(expression, np.shape(before[k]), kind)
+    return with_leaves(tree, merged)
+
+
+def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int) -> Tree:
+    """Apply a function for as long as a condition holds; see `servobench.plant.lanes.repeat`.
+
+    One pass is recorded and called `at_most` times.
+    """
+    leaves = leaves_of(tree)
+    symbols = symbols_like(leaves)
+    inside = with_leaves(tree, symbols)
+    with frame() as faults:
+        after = leaves_of(branch(condition(inside), function, inside))
+    outputs = [*(as_traced(leaf).flat() for leaf in after), faults.code]
+    once = _function(function, [symbol.buffer.content for symbol in symbols], outputs)
+    columns = [as_traced(leaf).flat() for leaf in leaves]
+    for _ in range(at_most):
+        *columns, code = once(*columns)
+        note_code(code)
+    shown = zip(columns, after, strict=True)
+    return with_leaves(tree, [Traced.of(column, np.shape(leaf), as_traced(leaf).kind) for column, leaf in shown])
+
+
+def _function(function: Any, inputs: list[Any], outputs: list[Any]) -> Any:  # noqa: ANN401 - of CasADi
+    try:
+        return casadi.Function(f"way{next(_NUMBERS)}", inputs, outputs, {"cse": True})
+    except RuntimeError as error:
+        raise NotTraceable(f"{_name(function)} uses more of the run than its arguments") from error
+
+
+def _name(function: Any) -> str:  # noqa: ANN401 - any callable
+    return str(getattr(function, "__qualname__", function))

@@ -1,0 +1,99 @@
+"""A logged run as another controller can see it: a run of a results folder, or a table of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+
+from servobench.harness.batch import results
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.request import TIMES, RunRequest
+from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.plant.robot.mismatch import Mismatch
+from servobench.plant.settings import suggest
+
+READERS: Final[Mapping[str, Callable[..., Any]]] = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
+PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known
+TASK: Final = "circle"  # likewise, without effect
+
+
+def find_run(folder: Path, run_id: str | None) -> dict[str, Any]:
+    """Return the row of a run of a results folder; without a name the only one.
+
+    Raises:
+        ConfigurationError: not a results folder, no such run, or several without a name.
+    """
+    runs = results.load_runs(folder)
+    names = runs["run_id"].tolist()
+    if run_id is None and len(names) > 1:
+        raise ConfigurationError(f"{folder} holds {len(names)} runs; name one with --run, such as {names[0]}")
+    chosen = run_id or names[0]
+    if chosen not in names:
+        raise ConfigurationError(f"{folder} has no run {chosen!r}: {suggest(chosen, names[:20])}")
+    return {str(name): value for name, value in runs[runs["run_id"] == chosen].iloc[0].items()}
+
+
+def logged_in_folder(folder: Path, run_id: str | None, controller: str | None) -> tuple[ResolvedRun, pd.DataFrame]:
+    """Return a run of a results folder and its steps.
+
+    Args:
+        folder: of results, with steps.
+        run_id: of the run; None for the only one.
+        controller: that is to see it, with its default settings; None for the one of the run, with those of the run.
+
+    Raises:
+        ConfigurationError: no such run, one without steps, or one that cannot be made ready here.
+    """
+    row = find_run(folder, run_id)
+    steps = results.load_steps(folder, [row["run_id"]])
+    if steps.empty:
+        raise ConfigurationError(f"run {row['run_id']} has no steps: it ended before its first period")
+    configuration = results.read_manifest(folder).get("configuration", {})
+    read = ["run", row["plant"], row["task"], *([] if controller else [row["controller"]])]
+    sections = {name: _nested(configuration.get(name, {})) for name in read}
+    names = ("plant", "task", "mismatch", "seed", "noise_factor", "robot", "sensing")
+    times = {name: float(row[f"{name}_s"]) for name in TIMES if pd.notna(row.get(f"{name}_s"))}
+    asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])} | times
+    return resolve(RunRequest(controller=controller or row["controller"], **asked), Settings(sections)), steps
+
+
+def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tuple[ResolvedRun, pd.DataFrame]:
+    """Return a log of one's own, of which robot and sensing are known, and a run of a controller on them.
+
+    Args:
+        path: CSV or Parquet, a row a control period, with columns as `steps.parquet` has them.
+        controller: that is to see it.
+        robot: by name or file.
+        sensing: set-up or file.
+
+    Raises:
+        ConfigurationError: a file that cannot be read, or a name that cannot be used.
+    """
+    reader = READERS.get(path.suffix)
+    if reader is None:
+        raise ConfigurationError(f"{path} must be a results folder, or a table in {' or '.join(READERS)}")
+    try:
+        table = reader(path)
+        period = float(table["time_s"].diff().median())
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigurationError(f"{path} is no table with a column time_s: {error}") from error
+    if not period > 0.0:
+        raise ConfigurationError(f"{path} needs two rows or more whose time_s grows; it has {len(table)}")
+    request = RunRequest(PLANT, controller, TASK, Mismatch(), 0, period=period, robot=robot, sensing=sensing)
+    return resolve(request, Settings()), table
+
+
+def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings by nested keys of those by dotted keys; what was not set is left out."""
+    nested: dict[str, Any] = {}
+    for key, value in flat.items():
+        *path, name = key.split(".")
+        target = nested
+        for part in path:
+            target = target.setdefault(part, {})
+        if value is not None:
+            target[name] = value
+    return nested

@@ -1,0 +1,181 @@
+"""A controller beside a logged run: what it would have commanded at each instant, given what was seen there.
+
+The loop is open. Joint positions and features are those of the log whatever the controller commands, so nothing here
+says how a run under its commands would have gone; what is compared is its answer to the same observations.
+"""
+
+from __future__ import annotations
+
+from typing import Final, final
+
+import numpy as np
+import pandas as pd
+
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.contract import held_to_contract
+from servobench.harness.run.experiment import build
+from servobench.harness.run.log import JOINT_UNIT, StepLog, column_name
+from servobench.harness.run.loop import LoopSettings, run_loop
+from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.threads import careful
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import RunFault
+from servobench.plant.plant import Plant
+from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+
+COMMAND: Final = "joint_velocity_command"
+LOGGED: Final = "logged_"  # before the name of a column with what was commanded when the log was made
+TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
+
+
+@final
+class LoggedPlant(Plant):
+    """A logged run as a plant that shows what was seen, row by row, and does not answer to commands.
+
+    After the last row it shows that row again.
+    """
+
+    def __init__(self, spec: PlantSpec, table: pd.DataFrame) -> None:
+        """Read the observations.
+
+        Args:
+            spec: names, units and period.
+            table: a row a control period, with columns as `steps.parquet` has them; `feature_valid` and
+                `true_feature_…` may be missing.
+
+        Raises:
+            ConfigurationError: a column or a number is missing, or the rows are not a control period apart.
+        """
+        self.spec, self._k = spec, 0
+        time = _columns(table, ["time_s"])[:, 0]
+        self._time = time - time[0]
+        late = np.abs(self._time - spec.period * np.arange(len(time)))
+        if late.max() > TIME_TOLERANCE:
+            row = int(late.argmax())
+            raise ConfigurationError(
+                f"rows of a log must be the control period of {spec.period:g} s apart, but row {row} of {len(time)} is "
+                f"at {time[row]:g} s after {time[0]:g} s"
+            )
+        self._joints = _columns(table, joint_columns(spec, "joint_position", JOINT_UNIT))
+        self._features = _columns(table, feature_columns(spec, "feature"))
+        valid = table["feature_valid"] if "feature_valid" in table else np.ones(len(table))
+        self._valid = np.asarray(valid, dtype=np.bool_)
+        true = feature_columns(spec, "true_feature")
+        known = set(true) <= set(table)
+        self._true = table[true].to_numpy(np.float64) if known else np.full_like(self._features, np.nan)
+
+    def reset(self, seed: int) -> Observation:
+        """Go back to the first row; nothing is random. See `Plant.reset`."""
+        self._k = 0
+        return self._row()
+
+    def step(self, command: Command) -> Observation:
+        """Show the next row, whatever the command. See `Plant.step`."""
+        self._k = min(self._k + 1, len(self._time) - 1)
+        return self._row()
+
+    def _row(self) -> Observation:
+        k = self._k
+        return Observation(float(self._time[k]), self._joints[k], self._features[k], bool(self._valid[k]))
+
+    def truth(self) -> Truth:
+        """Return the true feature of the log, NaN where it has none."""
+        return Truth(self._true[self._k], None)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
+    """Step a controller through a logged run.
+
+    Args:
+        resolved: the run that was logged, with the controller that is to see it. After the last row the reference goes
+            on as its task has it; it stays where it is if the log's reference is another one.
+        table: a row a control period; see `LoggedPlant`. Where commands were logged, they are kept for comparison.
+
+    Returns:
+        The table of steps with the controller's commands, and those of the log under names that begin with `LOGGED`.
+
+    Raises:
+        ConfigurationError: settings or a log that cannot be used, or the controller failed.
+    """
+    experiment = build(resolved)
+    spec, request = experiment.plant.spec, resolved.request
+    try:
+        plant = LoggedPlant(spec, table)
+        log = StepLog(spec, len(table))
+        loop = LoopSettings(len(table), experiment.run.preview_rows, lost_after_periods=len(table) + 1)
+        desired = experiment.scenario.reference.sampled(spec.period, loop.periods + loop.preview)
+        logged = _columns(table, feature_columns(spec, "reference"))
+        if not np.array_equal(desired[: len(logged)], logged):
+            desired = np.concatenate([logged, np.repeat(logged[-1:], loop.preview, axis=0)])
+        with careful():
+            run_loop(*held_to_contract(plant, experiment.controller), desired, loop, request.seed, log)
+    except RunFault as fault:
+        row = len(log.steps())
+        raise ConfigurationError(f"controller {request.controller} fails in row {row} of the log: {fault}") from fault
+    finally:
+        experiment.plant.close()
+    seen = log.steps().table(request.run_id)
+    names = command_columns(spec)
+    if set(names) <= set(table):
+        seen[[LOGGED + name for name in names]] = _columns(table, names)
+    return seen
+
+
+def has_commands(seen: pd.DataFrame) -> bool:
+    """Return whether a table of `shadow` has the commands of its log."""
+    return any(str(name).startswith(LOGGED) for name in seen)
+
+
+def differences(seen: pd.DataFrame) -> pd.DataFrame:
+    """Return how far the commands of a table of `shadow` are from those of its log.
+
+    Returns:
+        A row a command: RMS of the logged one, RMS and largest of the difference, in the unit that its name ends with.
+
+    Raises:
+        ConfigurationError: the log had no commands.
+    """
+    logged = [name for name in map(str, seen) if name.startswith(LOGGED)]
+    if not logged:
+        raise ConfigurationError(f"the log has no commands to compare with, columns {COMMAND}_…")
+    names = [name.removeprefix(LOGGED) for name in logged]
+    was, apart = seen[logged].to_numpy(), seen[names].to_numpy() - seen[logged].to_numpy()
+    rms = (np.sqrt(np.mean(each**2, axis=0)) for each in (was, apart))
+    joints = [name.removeprefix(f"{COMMAND}_") for name in names]
+    columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")
+    return pd.DataFrame(dict(zip(columns, (joints, *rms, np.abs(apart).max(axis=0)), strict=True)))
+
+
+def feature_columns(spec: PlantSpec, kind: str) -> list[str]:
+    """Return the names of the columns with the features of a kind, such as "reference"."""
+    return [column_name(kind, name, spec.feature_unit) for name in spec.feature_names]
+
+
+def joint_columns(spec: PlantSpec, kind: str, unit: str) -> list[str]:
+    """Return the names of the columns with what a kind has for each joint."""
+    return [column_name(kind, name, unit) for name in spec.joint_names]
+
+
+def command_columns(spec: PlantSpec) -> list[str]:
+    """Return the names of the columns with the commands."""
+    return joint_columns(spec, COMMAND, spec.command.unit)
+
+
+def _columns(table: pd.DataFrame, names: list[str]) -> FloatArray:
+    """Return the numbers of columns, (k, …).
+
+    Raises:
+        ConfigurationError: one of them is missing, or has something else than finite numbers, or there are no rows.
+    """
+    missing = [name for name in names if name not in table]
+    if missing or table.empty:
+        raise ConfigurationError(f"the log has no {f'column {missing[0]}' if missing else 'rows'}; it needs "
+                                 f"{', '.join(names)}")  # fmt: skip
+    values: FloatArray = table[names].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise ConfigurationError(f"row {row} of the log has no finite number in {names[column]}")
+    return values

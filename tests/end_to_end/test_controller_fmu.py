@@ -1,0 +1,185 @@
+"""Exported controllers in FMPy's hands: equal to the original over a run, saved, reset, in steps of other lengths."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+
+import numpy as np
+import pytest
+from fmpy import extract, read_model_description
+from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi3 import FMU3Slave
+from fmpy.validation import validate_fmu as validate_by_fmpy
+
+from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods, recorded
+from servobench.fmus.validate import validate_fmu
+from servobench.harness.config.settings import ConfigurationError
+
+PERIOD, N, M = 0.05, 6, 3
+METHODS = ["ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac", "ukf_mfac", "rbfnn_mfac"]
+INPUTS = 0  # value reference of the first input
+
+
+class Loaded:
+    """A controller as FMPy has it, with all inputs and all outputs at once."""
+
+    def __init__(self, name: str, version: int) -> None:
+        path = exported(name, version)
+        self.folder, self.version = extract(str(path)), version
+        description = read_model_description(str(path))
+        variables = {variable.name: variable.valueReference for variable in description.modelVariables}
+        command = variables["joint_velocity_command" if version == 3 else "joint_velocity_command[1]"]
+        self.inputs, self.outputs = list(range(command)), list(range(command, command + N))
+        names = ("joint_position", "feature", "seen", "reference")
+        self.arrays = [variables[name] for name in names] if version == 3 else []
+        kind = FMU3Slave if version == 3 else FMU2Slave
+        self.fmu = kind(
+            guid=description.guid,
+            unzipDirectory=self.folder,
+            modelIdentifier=description.coSimulation.modelIdentifier,
+            instanceName="controller",
+        )
+        self.fmu.instantiate()
+        self.begin()
+
+    def begin(self, stop: float | None = None) -> None:
+        if self.version == 2:
+            self.fmu.setupExperiment(startTime=0.0, stopTime=stop)
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.enterInitializationMode(startTime=0.0, stopTime=stop)
+        self.fmu.exitInitializationMode()
+
+    def set(self, values) -> None:
+        if self.version == 2:
+            self.fmu.setReal(self.inputs, values.tolist())
+        else:
+            self.fmu.setFloat64(self.arrays, values.tolist())
+
+    def get(self) -> np.ndarray:
+        if self.version == 2:
+            return np.array(self.fmu.getReal(self.outputs))
+        return np.array(self.fmu.getFloat64([self.outputs[0]], N))
+
+    def step(self, time: float, size: float = PERIOD) -> None:
+        self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
+
+    def answer(self, k: int, values) -> np.ndarray:
+        self.set(values)
+        self.step(k * PERIOD)
+        return self.get()
+
+
+@contextmanager
+def loaded(name: str, version: int) -> Iterator[Loaded]:
+    controller = Loaded(name, version)
+    try:
+        yield controller
+    finally:
+        controller.fmu.terminate()
+        controller.fmu.freeInstance()
+        shutil.rmtree(controller.folder)
+
+
+@cache
+def original(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return inputs and commands of a run of the original."""
+    run = experiment(name)
+    try:
+        rows = [(inputs_of(seen, reference), command.joint_velocity) for seen, reference, command in periods(run)]
+    finally:
+        run.plant.close()
+    inputs, commands = zip(*rows, strict=True)
+    return np.array(inputs), np.array(commands)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("name", METHODS)
+def test_an_exported_controller_equals_the_original_over_a_run(name, version):
+    inputs, commands = original(name)
+    assert (inputs[:, N + M] == 0.0).any()  # frames are lost
+    with loaded(name, version) as controller:
+        came = [controller.answer(k, values) for k, values in enumerate(inputs)]
+    assert np.abs(commands).max() > 0.1
+    np.testing.assert_allclose(came, commands, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("name", METHODS[:4])
+def test_fmpy_and_the_reference_run_find_no_problem(name, version):
+    assert validate_by_fmpy(str(exported(name, version))) == []
+    found = validate_fmu(exported(name, version))
+    assert found.problems == ()
+    assert found.deviation < 1e-9
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_outputs_follow_inputs_at_once_and_hold_until_the_next_ones(version):
+    inputs, commands = original("ukf_mfac:published")
+    with loaded("ukf_mfac:published", version) as controller:
+        assert not controller.get().any()
+        for k in range(5):
+            controller.set(inputs[(k + 1) % 5])
+            controller.get()  # is tried and changes nothing
+            controller.set(inputs[k])
+            np.testing.assert_allclose(controller.get(), commands[k], rtol=0, atol=1e-12)
+            controller.step(k * PERIOD)
+            np.testing.assert_allclose(controller.get(), commands[k], rtol=0, atol=1e-12)
+
+
+def test_short_steps_take_a_sample_a_period_and_a_long_one_takes_several():
+    inputs, commands = original("ukf_mfac:published")
+    with loaded("ukf_mfac:published", 2) as controller:
+        for k in range(4):
+            for part in range(5):
+                controller.set(inputs[k] if part == 0 else inputs[(k + 2) % 4])
+                controller.step(k * PERIOD + part * PERIOD / 5, PERIOD / 5)
+                np.testing.assert_allclose(controller.get(), commands[k], rtol=0, atol=1e-12)
+    with loaded("ukf_mfac:published", 2) as controller, loaded("ukf_mfac:published", 2) as other:
+        for k in range(3):
+            other.answer(k, inputs[0])
+        controller.set(inputs[0])
+        controller.step(0.0, 3 * PERIOD)
+        np.testing.assert_allclose(controller.get(), other.get(), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_saved_state_goes_on_with_equal_bits_and_reset_begins_anew(version):
+    inputs, _ = original("map_mfac")
+    with loaded("map_mfac", version) as controller:
+        fmu = controller.fmu
+        save, restore = (fmu.getFMUstate, fmu.setFMUstate) if version == 2 else (fmu.getFMUState, fmu.setFMUState)
+        before = [controller.answer(k, inputs[k]) for k in range(30)]
+        state = save()
+        after = [controller.answer(k, inputs[k]) for k in range(30, PERIODS)]
+        restore(state)
+        np.testing.assert_array_equal([controller.answer(k, inputs[k]) for k in range(30, PERIODS)], after)
+        (fmu.freeFMUstate if version == 2 else fmu.freeFMUState)(state)
+        fmu.reset()
+        controller.begin()
+        np.testing.assert_array_equal([controller.answer(k, inputs[k]) for k in range(30)], before)
+
+
+def test_inputs_that_are_not_finite_and_values_that_are_computed_are_refused():
+    with loaded("ukf_mfac:published", 2) as controller:
+        with pytest.raises(Exception, match="fmi2SetReal failed"):
+            controller.fmu.setReal([INPUTS], [np.nan])
+        with pytest.raises(Exception, match="fmi2SetReal failed"):
+            controller.fmu.setReal(controller.outputs[:1], [0.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("ukf_mpc", "controller 'ukf_mpc' has no exported form: it holds something that is no formula"),
+        ("calibrated", "controller 'calibrated' cannot be exported: it is given the true robot"),
+        ("ukf_mfak", "ukf_mfac"),
+    ],
+)
+def test_a_controller_without_an_exported_form_is_refused_by_a_line(name, message):
+    with pytest.raises(ConfigurationError, match=message) as refused:
+        recorded(name)
+    assert "\n" not in str(refused.value)

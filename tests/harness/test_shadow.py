@@ -1,0 +1,125 @@
+"""A controller beside a logged run: its own run gives its own commands, and the log answers to nobody."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from kit.command import servobench
+from servobench import compare
+from servobench.harness.batch.logged import logged_in_file, logged_in_folder
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.shadow import COMMAND, LOGGED, differences, shadow
+
+MOVED = "moderate+camera_move=5deg"
+SECTIONS = {
+    "kinematic": {"sensing": {"latency": 0.1, "drop_probability": 0.2}},
+    "exp2": {"duration": 4.0},
+    "ukf_mfac": {"law": {"gain": 2.0}},
+}
+
+
+PROPORTIONAL = """
+import numpy as np
+from servobench import Command, Controller
+
+
+class Proportional(Controller):
+    def __init__(self, knowledge):
+        self.n = knowledge.spec.n
+
+    def reset(self, observation, seed):
+        self.steps = 0
+
+    def step(self, observation, reference):
+        self.steps += 1
+        u = np.zeros(self.n)
+        u[:3] = 0.1 * (reference[-1] - observation.feature) + 0.001 * self.steps
+        return Command(u)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    out = tmp_path_factory.mktemp("shadow") / "runs"
+    compare(["ukf_mfac"], tasks=["exp2"], mismatches=[MOVED], seeds=[3], settings=SECTIONS, out=out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def steps(folder):
+    return logged_in_folder(folder, None, None)[1]
+
+
+def commands(table, prefix=""):
+    return table.filter(regex=f"^{prefix}{COMMAND}_").to_numpy()
+
+
+def as_file(steps, path):
+    steps[[name for name in steps if name.startswith(("time_s", "reference_", "feature_", "joint_position_"))]].to_csv(
+        path, index=False
+    )
+    return path
+
+
+def test_a_run_shown_to_its_own_controller_gives_its_commands_to_the_bit(folder, steps):
+    seen = shadow(*logged_in_folder(folder, None, None))
+    assert len(seen) == 80
+    np.testing.assert_array_equal(commands(seen), commands(steps))
+    assert (differences(seen)["difference, largest"] == 0.0).all()
+    assert not seen["feature_valid"].all()
+
+
+def test_another_controller_sees_the_log_whatever_it_commands(folder, steps, tmp_path, monkeypatch):
+    (tmp_path / "proportional.py").write_text(PROPORTIONAL, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "seen.csv"
+    assert servobench(monkeypatch, "shadow", str(folder), "--controller", "./proportional.py", "--out", str(out)) == 0
+    seen = pd.read_csv(out)
+    for kind in ("feature_[xyz]_m", "joint_position_", "true_feature_"):
+        np.testing.assert_allclose(seen.filter(regex=f"^{kind}"), steps.filter(regex=f"^{kind}"), rtol=1e-14)
+    target = steps.filter(regex="^reference_").to_numpy()  # of a fixed target the preview is the same
+    feature = steps.filter(regex="^feature_[xyz]_m").to_numpy()
+    wanted = 0.1 * (target - feature) + 0.001 * np.arange(1, len(steps) + 1)[:, None]
+    np.testing.assert_allclose(commands(seen)[:, :3], wanted, rtol=1e-9)
+    np.testing.assert_allclose(commands(seen, LOGGED), commands(steps), rtol=1e-14)
+    apart = commands(seen) - commands(steps)
+    np.testing.assert_allclose(differences(seen)["difference, RMS"], np.sqrt(np.mean(apart**2, axis=0)), rtol=1e-12)
+
+
+def test_a_table_of_ones_own_needs_no_truth_no_commands_and_no_folder(steps, tmp_path, monkeypatch, capsys):
+    table = as_file(steps, tmp_path / "robot.csv")
+    seen = shadow(*logged_in_file(table, "constant", "ur5", "position"))
+    assert seen["error_norm"].isna().all()
+    assert np.abs(commands(seen)).max() > 0.1
+    with pytest.raises(ConfigurationError, match="the log has no commands to compare with"):
+        differences(seen)
+    assert servobench(monkeypatch, "shadow", str(table), "--controller", "constant") == 2
+    assert "--out FILE.csv keeps those of the controller" in capsys.readouterr().err
+    assert servobench(monkeypatch, "shadow", str(table)) == 2
+    assert "name one with --controller" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.drop(columns="feature_y_m"), "the log has no column feature_y_m; it needs feature_x_m, "),
+        (lambda table: table.drop(index=5), "but row 5 of 79 is at 0.3 s after 0 s"),
+        (lambda table: table.assign(reference_z_m="near"), "row 0 of the log has no finite number in reference_z_m"),
+        (lambda table: table.iloc[:0], "needs two rows or more whose time_s grows; it has 0"),
+        (lambda table: table.drop(columns="time_s"), "is no table with a column time_s"),
+    ],
+)
+def test_a_log_that_cannot_be_shown_is_refused(steps, tmp_path, change, message):
+    path = tmp_path / "robot.csv"
+    change(pd.read_csv(as_file(steps, path))).to_csv(path, index=False)
+    with pytest.raises(ConfigurationError, match=message):
+        shadow(*logged_in_file(path, "constant", "ur5", "position"))
+
+
+def test_what_is_no_log_is_refused(folder, tmp_path):
+    with pytest.raises(ConfigurationError, match="has no run 'other'"):
+        logged_in_folder(folder, "other", None)
+    with pytest.raises(ConfigurationError, match="must be a results folder, or a table in .csv or .parquet"):
+        logged_in_file(tmp_path / "log.txt", "constant", "ur5", "position")

@@ -1,0 +1,69 @@
+"""Exported controllers: each is recorded once, and compiled once for a version of FMI."""
+
+from __future__ import annotations
+
+import atexit
+import shutil
+import tempfile
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from servobench.fmus.compile import this_platform
+from servobench.fmus.controller_export import ControllerModel
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.controller_fmu import controller_model
+from servobench.harness.run.experiment import Experiment, build
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve
+from servobench.plant.signals import Command, Observation
+
+PERIODS = 120
+
+
+@cache
+def recorded(name: str) -> ControllerModel:
+    """Return a controller, recorded for another robot and another run than those below."""
+    return controller_model(RunRequest("kinematic", name, "target", "moderate", 3), Settings())
+
+
+@cache
+def exported(name: str, version: int) -> Path:
+    """Return a controller as an FMU."""
+    return (
+        recorded(name).product(version).write(_folder() / f"{name.replace(':', '_')}_{version}.fmu", (this_platform(),))
+    )
+
+
+@cache
+def _folder() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="servobench-tests-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def experiment(name: str, **settings: object) -> Experiment:
+    """Return a run on a circle with noise, latency, delay, lost frames and a camera that is turned."""
+    lossy = {"sensing": {"drop_probability": 0.05}} | settings
+    request = RunRequest("kinematic", name, "circle", "severe", 8)
+    return build(resolve(request, Settings({"kinematic": lossy})))
+
+
+def periods(run: Experiment) -> Iterator[tuple[Observation, np.ndarray, Command]]:
+    """Yield what the controller of a run sees, its reference and its answer in each period."""
+    rows = 1 + run.run.preview_rows
+    desired = run.scenario.reference.sampled(run.plant.spec.period, PERIODS + rows)
+    observation = run.plant.reset(0)
+    run.controller.reset(observation, 0)
+    for k in range(PERIODS):
+        command = run.controller.step(observation, desired[k : k + rows])
+        yield observation, desired[k : k + rows], command
+        observation = run.plant.step(command)
+
+
+def inputs_of(observation: Observation, reference: np.ndarray) -> np.ndarray:
+    """Return the inputs of an exported controller, in the order of its variables."""
+    rows = observation.joint_position, observation.feature, observation.valid, reference
+    return np.concatenate([np.ravel(row).astype(np.float64) for row in rows])
