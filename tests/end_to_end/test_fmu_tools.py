@@ -1,15 +1,22 @@
-"""Other tools run the exported UR5 and agree with the kinematic plant: fmpy, libcosimpy, CasADi's integrator."""
+"""Other tools run the exported UR5 and agree with the kinematic plant: fmpy, fmusim, libcosimpy, CasADi's integrator.
+
+fmusim is the C program of the Reference FMUs (folder `fmusim` up to v0.0.39). Where it is not on the path, the
+environment variable FMUSIM names it; its tests are skipped where it is not installed.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import shutil
 import subprocess
 import sys
 from functools import cache
 
 import casadi
 import numpy as np
+import pandas as pd
 import pytest
 from fmpy import simulate_fmu
 
@@ -81,6 +88,49 @@ def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch)
     )
     came = np.column_stack([result[name] for name in outputs])[1:]
     np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)
+
+
+FMUSIM = os.environ.get("FMUSIM") or shutil.which("fmusim")
+NEEDS_FMUSIM = pytest.mark.skipif(FMUSIM is None, reason="fmusim is not installed; FMUSIM=PATH names it")
+JOINTS = [f"[{i + 1}]" for i in range(6)]
+
+
+def by_fmusim(version: int, kind: str, commands, folder) -> np.ndarray:
+    """Return joint positions and features after each step, (k, 9), as fmusim computes them."""
+    time, stop = np.arange(len(commands)) * PERIOD, len(commands) * PERIOD
+    if version == 2:
+        outputs = [*(f"joint_position{each}" for each in JOINTS), *(f"ball_position[{i + 1}]" for i in range(3))]
+        inputs = {f"joint_velocity_command{each}": commands[:, i] for i, each in enumerate(JOINTS)}
+    else:
+        outputs = ["joint_position", "ball_position"]
+        inputs = {"joint_velocity_command": [" ".join(map(repr, row)) for row in commands.tolist()]}
+    pd.DataFrame({"time": time, **inputs}).to_csv(folder / "in.csv", index=False)
+    wanted = [word for name in outputs for word in ("--output-variable", name)]
+    times = ["--stop-time", str(stop), "--output-interval", str(PERIOD), "--tolerance", "1e-8", "--solver", "cvode"]
+    files = ["--input-file", folder / "in.csv", "--output-file", folder / "out.csv", cached_fmu(version)]
+    done = subprocess.run(
+        [FMUSIM, "--interface-type", kind, *times, *wanted, *files], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = (folder / "out.csv").read_text(encoding="utf-8").replace('"', "").replace(",", " ").splitlines()[1:]
+    came = np.array([[float(word) for word in row.split()] for row in rows])
+    np.testing.assert_allclose(came[1:, 0], time + PERIOD, atol=1e-9)
+    return came[1:, 1:]
+
+
+@NEEDS_FMUSIM
+@pytest.mark.parametrize("version", [2, 3])
+def test_fmusim_runs_it_and_agrees_over_a_thousand_random_steps(version, tmp_path):
+    np.testing.assert_allclose(by_fmusim(version, "cs", COMMANDS, tmp_path), oracle("none"), rtol=0, atol=1e-9)
+
+
+@NEEDS_FMUSIM
+@pytest.mark.parametrize("version", [2, 3])
+def test_fmusim_integrates_its_model_exchange_side_and_agrees(version, tmp_path):
+    held = np.tile(COMMANDS[0] / 3.0, (40, 1))  # as its solver is not restarted at a jump of an input
+    exact = by_fmusim(version, "cs", held, tmp_path)
+    np.testing.assert_allclose(by_fmusim(version, "me", held, tmp_path), exact, rtol=0, atol=1e-6)
+    assert np.ptp(exact, axis=0).max() > 0.1
 
 
 COSIM = """
