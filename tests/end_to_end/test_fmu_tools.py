@@ -1,7 +1,8 @@
-"""Other tools run the exported UR5 and agree with the kinematic plant: fmpy, fmusim, libcosimpy, CasADi's integrator.
+"""Other tools run the exported UR5 and agree with the kinematic plant, or find nothing to say about it.
 
-fmusim is the C program of the Reference FMUs (folder `fmusim` up to v0.0.39). Where it is not on the path, the
-environment variable FMUSIM names it; its tests are skipped where it is not installed.
+They are fmpy, fmusim, libcosimpy, CasADi's integrator and the FMU compliance checker. fmusim is the C program of the
+Reference FMUs (folder `fmusim` up to v0.0.39), the checker that of modelica-tools with FMI Library 2.0.3. Both are
+built from source; their tests are skipped where neither the path nor FMUSIM or FMUCHECK in the environment has them.
 """
 
 from __future__ import annotations
@@ -38,15 +39,19 @@ COMMANDS = np.random.default_rng(1).uniform(-1.3, 1.3, (STEPS, 6))  # some beyon
 COMMANDS.setflags(write=False)
 
 
-@cache
-@cache
-def oracle(mismatch: str):
-    """Return joint positions and true features after each step, (STEPS, 9), by numpy."""
+def simulated(mismatch: str, commands) -> np.ndarray:
+    """Return joint positions and true features after each step, (k, 9), by numpy."""
     config = configure(KinematicConfig, feature_noise=0.0, command_delay=0.0)
     plant = build_kinematic(config, PlantSetup(mismatched(mismatch), np.array(HOME), PERIOD))
     plant.reset(0)
-    rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in COMMANDS]
+    rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in commands]
     return np.array(rows)
+
+
+@cache
+def oracle(mismatch: str) -> np.ndarray:
+    """Return what `simulated` gives for `COMMANDS`."""
+    return simulated(mismatch, COMMANDS)
 
 
 def parameters(mismatch: str):
@@ -91,6 +96,7 @@ def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch)
 
 
 FMUSIM = os.environ.get("FMUSIM") or shutil.which("fmusim")
+CHECKER = os.environ.get("FMUCHECK") or shutil.which("fmuCheck.linux64")
 NEEDS_FMUSIM = pytest.mark.skipif(FMUSIM is None, reason="fmusim is not installed; FMUSIM=PATH names it")
 JOINTS = [f"[{i + 1}]" for i in range(6)]
 
@@ -128,9 +134,31 @@ def test_fmusim_runs_it_and_agrees_over_a_thousand_random_steps(version, tmp_pat
 @pytest.mark.parametrize("version", [2, 3])
 def test_fmusim_integrates_its_model_exchange_side_and_agrees(version, tmp_path):
     held = np.tile(COMMANDS[0] / 3.0, (40, 1))  # as its solver is not restarted at a jump of an input
-    exact = by_fmusim(version, "cs", held, tmp_path)
+    exact = simulated("none", held)
     np.testing.assert_allclose(by_fmusim(version, "me", held, tmp_path), exact, rtol=0, atol=1e-6)
     assert np.ptp(exact, axis=0).max() > 0.1
+
+
+@pytest.mark.skipif(CHECKER is None, reason="the compliance checker is not installed; FMUCHECK=PATH names it")
+@pytest.mark.parametrize("kind", ["cs", "me"])
+def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
+    names = ["time", *(f"joint_velocity_command{each}" for each in JOINTS)]
+    held = np.tile(COMMANDS[0] / 3.0, (21, 1))
+    lines = [",".join(map(repr, line)) for line in np.c_[PERIOD * np.arange(21), held].tolist()]
+    (tmp_path / "in.csv").write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
+    step = PERIOD if kind == "cs" else PERIOD / 1000  # it integrates by Euler's method
+    times = ["-s", "1", "-n", "20", "-h", str(step), "-l", "4", "-k", kind]
+    done = subprocess.run(
+        [CHECKER, *times, "-i", tmp_path / "in.csv", "-o", tmp_path / "out.csv", cached_fmu(2)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for line in ("0 warning(s) and error(s)", "0 Warning(s)", "0 Error(s)"):
+        assert f"\t{line}" in done.stderr
+    came = pd.read_csv(tmp_path / "out.csv").filter(regex=r"^joint_position")
+    exact = simulated("none", held[:20])[-1, :6]
+    np.testing.assert_allclose(came.iloc[-1], exact, rtol=0, atol=1e-9 if kind == "cs" else 1e-3)
+    assert np.ptp(came, axis=0).max() > 0.1
 
 
 COSIM = """
