@@ -1,8 +1,8 @@
 """What a period of the `mujoco` plant costs over the render and physics calls it needs, and beside one of `bullet`.
 
 All are measured in the same run, in turns: a whole `Bench.step` of `mujoco`; the calls of MuJoCo in it, which are the
-physics steps, contact, and one image with its depths from the same camera; and, where PyBullet is installed, a whole
-`Bench.step` of `bullet`, whose bare calls are in `bullet_period.py`.
+physics steps, contact, and one image with its depths from the same camera; the two largest parts of a step; and, where
+PyBullet is installed, a whole `Bench.step` of `bullet`, whose bare calls are in `bullet_period.py`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,13 @@ from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]
+KINDS = (
+    "bare calls",
+    "`Bench.step`",
+    "of it: drives and physics",
+    "of it: image, its noise and detection",
+    "`Bench.step` of `bullet`",
+)
 
 
 class BareCalls:
@@ -68,7 +75,7 @@ class BareCalls:
 
 
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
-    """Return the times of bare periods, whole ones and, if it is there, those of `bullet`, (2 or 3, repeats) ms."""
+    """Return the times of `KINDS`, (4 or 5, repeats) ms; without PyBullet the last one is missing."""
     setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
     plants = [build_mujoco(config, setup)]
     if find_spec("pybullet") is not None:
@@ -77,10 +84,13 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
         plants.append(build_bullet(config, setup))
     for plant in plants:
         plant.reset(0)
-    times = np.empty((1 + len(plants), repeats))
+    world, steps = plants[0].world, whole_steps(PERIOD, PHYSICS_STEP)
+    times = np.empty((3 + len(plants), repeats))
     for k in range(repeats):
-        command = Command(0.2 * np.sin(0.3 * k) * np.ones(6))
-        for row, call in enumerate((bare.period, *(partial(plant.step, command) for plant in plants))):
+        speed = 0.2 * np.sin(0.3 * k) * np.ones(6)
+        whole = [partial(plant.step, Command(speed)) for plant in plants]
+        motion = partial(world._simulation.advance, world._joints, speed, steps)
+        for row, call in enumerate((bare.period, whole[0], motion, world.see, *whole[1:])):
             times[row, k] = milliseconds(call)
     for plant in plants:
         plant.close()
@@ -89,4 +99,4 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
 
 
 if __name__ == "__main__":
-    print_periods(__doc__, "mujoco", ("bare calls", "`Bench.step`", "`Bench.step` of `bullet`"), measure)
+    print_periods(__doc__, "mujoco", KINDS, measure)

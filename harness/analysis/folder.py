@@ -13,7 +13,16 @@ from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import COMPLETED
 
-DESCRIBED: Final = ("plant", "sensing", "controller", "task", "mismatch", "noise_factor", "latency_s", "period_s")
+DESCRIBED: Final = {
+    "plant": "plant",
+    "sensing": "sensing",
+    "controller": "controller",
+    "task": "task",
+    "mismatch": "mismatch",
+    "noise_factor": "noise factor",
+    "latency_s": "latency [s]",
+    "period_s": "period [s]",
+}  # column -> heading
 MAX_LISTED: Final = 15  # values of a column
 
 
@@ -26,7 +35,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
-    facts |= {name.replace("_", " "): _listed(runs[name].unique().tolist()) for name in DESCRIBED if name in runs}
+    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in DESCRIBED.items() if name in runs}
     packages = manifest.get("packages") or {}
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
     commit = manifest.get("git_commit")

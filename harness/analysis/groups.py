@@ -26,7 +26,14 @@ from servobench.harness.analysis.measures import MEASURES
 from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, success_rate
 from servobench.harness.analysis.verdict import scores
 from servobench.harness.run.ending import COMPLETED
-from servobench.harness.run.outcome import ACHIEVED, OUTCOMES
+from servobench.harness.run.outcome import (
+    ACHIEVED,
+    JOINT_AT_LIMIT,
+    NOT_FOLLOWED,
+    NOT_SETTLED,
+    OUTCOMES,
+    TARGET_UNREACHABLE,
+)
 
 WHICH: Final = ""  # the group of columns that say which runs a row is about
 CONDITIONS: Final = {
@@ -56,6 +63,12 @@ RUN_GROUPS: Final = {
     "Time": ("settling_time_s",),
     "Error": ("steady_state_error", "rms_error_evaluated"),
     "Motion": ("control_effort_rad",),
+}
+MEANINGS: Final = {
+    NOT_SETTLED: "the true error did not come into the settling band, or left it again",
+    NOT_FOLLOWED: "the RMS error of the judged part of the curve is too large",
+    TARGET_UNREACHABLE: "the true arm cannot come that near to the target or to the judged part of the curve",
+    JOINT_AT_LIMIT: "a joint stood at its stop for a second while the error was too large",
 }
 MOST_PLACES: Final = 5  # that have columns of their own in the overview
 
@@ -111,6 +124,12 @@ def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
             row[_kind_of(word), f"{word} [%]"] = f"{share:.0f}" if word in counts else MISSING
         table.append(row)
     return pd.DataFrame(table)
+
+
+def meanings(table: pd.DataFrame) -> dict[str, str]:
+    """Return what the outcomes mean that are columns of an outcome table; the words of faults say it themselves."""
+    shown = {str(name[1]).removesuffix(" [%]") for name in list(table) if isinstance(name, tuple)}
+    return {word: meaning for word, meaning in MEANINGS.items() if word in shown}
 
 
 def cost_table(runs: pd.DataFrame) -> pd.DataFrame:

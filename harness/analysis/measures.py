@@ -45,7 +45,7 @@ MEASURES: Final = {
     "overshoot": Measure("overshoot", 1, "%", 100.0),
     "steady_state_error": Measure("last second", 2),
     "rms_error_second_lap": Measure("RMS of the second lap", 2),
-    "rms_error_evaluated": Measure("RMS of the evaluated part", 2),
+    "rms_error_evaluated": Measure("RMS of the judged part", 2),
     "max_error": Measure("largest error", 1),
     "pose_error_mm": Measure("pose error, last second", 1, "mm"),
     "pose_error_deg": Measure("angle error, last second", 2, "deg"),

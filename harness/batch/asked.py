@@ -10,6 +10,7 @@ from servobench.harness.config.settings import Assignment, ConfigurationError, S
 from servobench.harness.run.request import RunRequest
 
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that say what runs
+SOURCES: Final = ("own_controllers", "own_plants", "plugins")  # entries that have the hash of code by its name
 REST: Final = "noise, latencies, periods, axes that are varied, or the command"  # of which a manifest has a digest only
 
 
@@ -59,6 +60,34 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
         if old.get(key) != new.get(key):
             return f"{key} {_short(old.get(key, 'unknown'))} there, {_short(new.get(key, 'unknown'))} here"
     return REST
+
+
+def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """Return what of the code and the files of users is no longer what two batches have in common; empty if nothing.
+
+    Args:
+        there: manifest of the folder; what it does not tell counts as unchanged.
+        here: manifest of what is asked for.
+    """
+    for key in SOURCES:
+        for name, record in here[key].items():
+            if record.get("sha256") != there.get(key, {}).get(name, record).get("sha256"):
+                return f"text of {record['place']}"
+    known = {each["name"]: each for each in there.get("sensings", [])}
+    for each in here["sensings"]:
+        if each.get("sha256") != known.get(each["name"], each).get("sha256"):
+            return f"text of {each['name']}"
+    arms = {each["name"]: _numbers(each) for each in there.get("robots", [])}
+    for each in here["robots"]:
+        if _numbers(each) != arms.get(each["name"], _numbers(each)):
+            return f"arm in {each['name']}"
+    return ""
+
+
+def _numbers(robot: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the numbers of a robot, as JSON has them."""
+    own = {key: value for key, value in robot.items() if isinstance(value, list)}
+    return dict(json.loads(json.dumps(own)))
 
 
 def _flat(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

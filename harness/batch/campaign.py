@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.harness.batch import results
-from servobench.harness.batch.asked import check_effects, difference
+from servobench.harness.batch.asked import changed_source, check_effects, difference
 from servobench.harness.batch.blocks import (
     BLOCK,
     CHUNK,
@@ -33,7 +33,7 @@ from servobench.harness.batch.compare import Batch, refuse_tuning_seeds
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.integrity import check_resumable, mend, restore_manifest
 from servobench.harness.batch.lock import Lock, check_empty, is_unused, locked
-from servobench.harness.batch.manifest import OWN, describe_batch
+from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Bounds, Workers, open_workers
 from servobench.harness.config.registry import Offer, offered
@@ -199,12 +199,8 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
             f"{folder} holds results of other runs or settings: {difference(there, manifest)}; "
             "name another folder with --out"
         )
-    for key in OWN.values():
-        for name, record in manifest[key].items():
-            if record["sha256"] != there.get(key, {}).get(name, record)["sha256"]:
-                raise ConfigurationError(
-                    f"{folder} was begun with another text of {record['place']}; name another folder with --out"
-                )
+    if changed := changed_source(there, manifest):
+        raise ConfigurationError(f"{folder} was begun with another {changed}; name another folder with --out")
     for key, what in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
             observer.note(f"note: {folder} was begun with other {what}; later runs may differ")

@@ -75,14 +75,17 @@ class End:
     alone: bool = False  # whether to be certain each run must be a task by itself: answers may have been lost
 
 
-def keep_guard(link: Connection, limits: Limits, modules: Sequence[str]) -> None:
+def keep_guard(link: Connection, limits: Limits, modules: Sequence[str], inherited: Sequence[Connection] = ()) -> None:
     """Be a guard: take tasks from a link until it closes.
 
     Args:
         link: to the process that has the tasks.
         limits: of each run.
         modules: imported once; those of users are left to the runner.
+        inherited: the other ends of links, which a copy of the process that has the tasks must not keep open.
     """
+    for each in inherited:
+        each.close()
     processes.lead_session()
     processes.adopt_orphans()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))

@@ -222,8 +222,10 @@ def _fault(folder: Path, name: str, sums: Sums | None) -> str | None:
     what = fault(folder, name, sums)
     if what is None and sums is None and name.endswith(".parquet"):
         try:
-            for _ in parquet.row_groups(folder, name, parquet.common_schema(folder, [name]).names):
+            columns = parquet.common_schema(folder, [name]).names
+            for _ in parquet.row_groups(folder, name, columns):
                 pass
+            what = results.lacking(RUNS if name.endswith(RUNS) else STEPS, columns) or None
         except DamagedFile as error:
             return error.what
     return what

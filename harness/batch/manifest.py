@@ -5,16 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch.survey import Survey
-from servobench.harness.config.registry import Offer, find_plant
+from servobench.harness.config.own import digest_of_module
+from servobench.harness.config.registry import Offer, find_plant, published
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.sensing import find_sensing, sensing_file
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
+from servobench.plant.plant import PlantEntry
 
 PACKAGES = (
     "servobench",
@@ -61,6 +64,7 @@ def describe_batch(
         "plants": list(runs.plants),
         "controllers": list(runs.controllers),
         **{key: {each.name: each.record() for each in own if each.word == word} for word, key in OWN.items()},
+        "plugins": dict(_plugins(runs)),
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "robots": [describe_robot(name) for name in runs.robots],
@@ -76,6 +80,20 @@ def describe_batch(
         "run_count": runs.count,
         "campaign": hashlib.sha256(identity.encode()).hexdigest(),
     }
+
+
+def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield names of controllers and plants that others have installed, and what a manifest says about each."""
+    kinds: tuple[tuple[type[ControllerEntry | PlantEntry], Iterable[str]], ...] = (
+        (ControllerEntry, runs.controllers),
+        (PlantEntry, runs.plants),
+    )
+    for kind, names in kinds:
+        for name in names:
+            point = published(kind, name)
+            if point is not None:
+                made = f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
+                yield name, {"place": point.value, "distribution": made, "sha256": digest_of_module(point.module)}
 
 
 def describe_sensing(word: str) -> dict[str, Any]:

@@ -9,15 +9,17 @@ import contextlib
 import pickle
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from queue import SimpleQueue
 from typing import Any, Final
 
+from servobench.harness.batch import processes
 from servobench.harness.batch.guard import ALIVE, DONE, ENDED, LOST, START_TIME, End, Limits, Task, keep_guard
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import CRASHED, TIMED_OUT, Ending
@@ -47,7 +49,7 @@ class Pool:
     def __init__(self, count: int, limits: Limits, modules: Sequence[str]) -> None:
         self._count, self._limits, self._modules = count, limits, modules
         self._waiting: SimpleQueue[tuple[Future[Answer], Task, Callable[[Any], None] | None] | None] = SimpleQueue()
-        self._guards: list[_Guarded] = []
+        self._guards: list[Guarded] = []
         self._threads: list[threading.Thread] = []
         self._stopped = False
 
@@ -59,7 +61,7 @@ class Pool:
             hear: receives the items instead of the answer, in another thread.
         """
         if len(self._threads) < self._count:
-            self._guards.append(_Guarded(self._limits, self._modules))
+            self._guards.append(Guarded(self._limits, self._modules))
             self._threads.append(threading.Thread(target=self._serve, args=(self._guards[-1],), daemon=True))
             self._threads[-1].start()
         future: Future[Answer] = Future()
@@ -76,7 +78,7 @@ class Pool:
         for guard in self._guards:
             guard.end()
 
-    def _serve(self, guard: _Guarded) -> None:
+    def _serve(self, guard: Guarded) -> None:
         while (taken := self._waiting.get()) is not None and not self._stopped:
             future, task, hear = taken
             try:
@@ -88,17 +90,23 @@ class Pool:
                 future.set_result(answer)
 
 
-class _Guarded:
-    """A guard as seen from here."""
+class Guarded:
+    """A guard as seen from here.
 
-    def __init__(self, limits: Limits, modules: Sequence[str]) -> None:
-        self._limits, self._modules = limits, modules
+    Args:
+        limits: of each run.
+        modules: that it imports once.
+        copied: whether it is a copy of this process where the system has such, which nothing else may be busy in.
+    """
+
+    def __init__(self, limits: Limits, modules: Sequence[str], *, copied: bool = False) -> None:
+        self._limits, self._modules, self._copied = limits, modules, copied
         self._lock, self._ended = threading.Lock(), False
-        self._process: SpawnProcess | None = None
+        self._process: BaseProcess | None = None
         self._link: Connection | None = None
 
     def carry_out(self, task: Task, hear: Callable[[Any], None] | None) -> Answer:
-        """Carry one task out.
+        """Carry one task out; `hear` receives the items instead of the answer.
 
         Raises:
             ConfigurationError: no process can be started.
@@ -152,13 +160,18 @@ class _Guarded:
         """Return the link to a guard that runs."""
         if self._link is not None:
             return self._link
-        context = get_context("spawn")
+        copied = self._copied and processes.LINUX
+        context = get_context("fork") if copied else get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=keep_guard, args=(theirs, self._limits, tuple(self._modules)))
+        inherited = (ours,) if copied else ()
+        process: BaseProcess = context.Process(
+            target=keep_guard, args=(theirs, self._limits, tuple(self._modules), inherited)
+        )
         with self._lock:
             if self._ended:
                 raise EOFError
-            with _interrupts_blocked():  # a process inherits this
+            with _interrupts_blocked(), warnings.catch_warnings():  # a process inherits the former
+                warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: threads of libraries, which wait
                 process.start()
             self._process = process
         theirs.close()

@@ -46,6 +46,10 @@ RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 FAILURES = "failures.log"
 MANIFEST = "manifest.json"
+NEEDED: Final = {
+    RUNS: ("run_id", "plant", "controller", "task", "mismatch", "seed", "status"),
+    STEPS: ("run_id", "time_s", "error_norm"),
+}  # columns of every table
 PART: Final = re.compile(rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})")
 
 
@@ -202,10 +206,30 @@ def load_runs(folder: Path) -> pd.DataFrame:
     """Return the table of runs of a results folder, also of one whose batch was killed.
 
     Raises:
-        ConfigurationError: not a results folder, one of another schema, or a file of it is not what was written.
+        ConfigurationError: not a results folder, one of another schema, a file of it is not what was written, or the
+            table lacks a column that says which run a row is.
     """
     check_folder(folder)
-    return parquet.read_tables(folder, _intact(folder, RUNS))
+    names = _intact(folder, RUNS)
+    runs = parquet.read_tables(folder, names)
+    _refuse_lacking(folder, names[0], RUNS, runs.columns)
+    return runs
+
+
+def lacking(kind: str, columns: Collection[str]) -> str:
+    """Return which columns a table of runs or steps lacks that it needs, as a predicate; empty where it has all."""
+    missing = [name for name in NEEDED[kind] if name not in columns]
+    return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}" if missing else ""
+
+
+def _refuse_lacking(folder: Path, name: str, kind: str, columns: Collection[str]) -> None:
+    """Refuse a table that is none of runs or steps.
+
+    Raises:
+        ConfigurationError: names the table and what it lacks.
+    """
+    if lack := lacking(kind, columns):
+        raise ConfigurationError(f"{folder / name} is no table of {kind.partition('.')[0]}: it {lack}")
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
@@ -223,11 +247,14 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
         columns: these only, as far as there are such; None for all.
 
     Raises:
-        ConfigurationError: not a results folder, one of another schema, or a file of it is not what was written.
+        ConfigurationError: as for `load_runs`.
     """
     check_folder(folder)
+    names = _intact(folder, STEPS)
+    for name in names:
+        _refuse_lacking(folder, name, STEPS, parquet.common_schema(folder, [name]).names)
     only = None if run_ids is None else ds.field("run_id").isin(run_ids)
-    steps = parquet.read_tables(folder, _intact(folder, STEPS), only, columns)
+    steps = parquet.read_tables(folder, names, only, columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
     return steps

@@ -25,9 +25,10 @@ def check(
     """
     from rich.text import Text
 
+    from servobench.harness.batch.apart import Checks, check_apart
     from servobench.harness.check.controllers import check_controller
-    from servobench.harness.check.guarded import Checks, check_guarded
     from servobench.harness.check.plants import check_plant
+    from servobench.harness.check.report import Finding
     from servobench.harness.config.settings import ConfigurationError
 
     if subject == ["plant"]:
@@ -39,13 +40,16 @@ def check(
         checks, name = check_controller, subject[0]
     else:
         raise ConfigurationError(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
-    findings = []
-    for finding in check_guarded(checks, name, limit):
+    findings: list[Finding] = []
+
+    def hear(finding: Finding) -> None:
         findings.append(finding)
         console.print(
             Text.assemble((f"{finding.verdict:7s}", COLOURS[finding.verdict]), f"{finding.check:15s}", finding.text),
             soft_wrap=True,
         )
+
+    check_apart(checks, name, limit, hear)
     failed = sum(finding.verdict == "failed" for finding in findings)
     console.print(f"{name}: " + (f"{failed} of {len(findings)} checks failed" if failed else "keeps its contract"))
     if failed:

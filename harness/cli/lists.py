@@ -24,12 +24,13 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
+    from servobench.harness.batch.apart import choose_plants
     from servobench.harness.batch.trial import try_plants
-    from servobench.harness.config.registry import choose_plant, find_plant, unused_points
+    from servobench.harness.config.registry import find_plant, unused_points
     from servobench.plant.plant import PlantEntry
 
     if name:
-        name = choose_plant(name)
+        (name,) = choose_plants([name])
         _show_settings(name, find_plant(name).config(), as_json=as_json)
     else:
         _show_names(_listed(try_plants(), unused_points(PlantEntry)), as_json=as_json)
@@ -42,12 +43,13 @@ def controllers(
     """List the controllers, or show the settings of one."""
     from servobench.controllers.controller import ControllerEntry
     from servobench.controllers.parts import ESTIMATORS, LAWS
+    from servobench.harness.batch.apart import choose_controllers
     from servobench.harness.batch.trial import try_controllers
     from servobench.harness.config.defaults import default_config
-    from servobench.harness.config.registry import choose_controller, find_controller, unused_points
+    from servobench.harness.config.registry import find_controller, unused_points
 
     if name:
-        name = choose_controller(name)
+        (name,) = choose_controllers([name])
         _show_settings(name, default_config(find_controller(name)), as_json=as_json)
         return
     _show_names(_listed(try_controllers(), unused_points(ControllerEntry)), as_json=as_json)

@@ -105,13 +105,14 @@ def _usable(all_of_them: Sequence[Tried]) -> list[str]:
 
 def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of the plants that a user named, or whose place was given, such as ./cell.py:Cell."""
+    from servobench.harness.batch.apart import choose_plants
     from servobench.harness.batch.trial import try_plants
-    from servobench.harness.config.registry import ALL, choose_plant, find_plant, plant_names
+    from servobench.harness.config.registry import ALL, find_plant, plant_names
     from servobench.plant.plant import PlantEntry
 
     known, names = plant_names(), list[str]()
     for word in split_words(text):
-        names += _usable(try_plants(robot)) if word == ALL else [choose_plant(word)]
+        names += _usable(try_plants(robot)) if word == ALL else choose_plants([word])
     tell_unused(PlantEntry, split_words(text))
     return split_names(option, ",".join(names), known, find_plant)
 
@@ -119,12 +120,13 @@ def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple
 def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of the controllers that a user named, or whose place was given, such as ./mine.py:Mine."""
     from servobench.controllers.controller import ControllerEntry
+    from servobench.harness.batch.apart import choose_controllers
     from servobench.harness.batch.trial import try_controllers
-    from servobench.harness.config.registry import ALL, choose_controller, controller_names, find_controller
+    from servobench.harness.config.registry import ALL, controller_names, find_controller
 
     known, names = controller_names(), list[str]()
     for word in split_words(text):
-        names += _usable(try_controllers(robot)) if word == ALL else [choose_controller(word)]
+        names += _usable(try_controllers(robot)) if word == ALL else choose_controllers([word])
     tell_unused(ControllerEntry, split_words(text))
     return split_names("controllers", ",".join(names), known, find_controller)
 

@@ -108,8 +108,8 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     """Carry out a run to be shown."""
+    from servobench.harness.batch.apart import choose_controllers, choose_plants
     from servobench.harness.config.engines import rendered_plant
-    from servobench.harness.config.registry import choose_controller, choose_plant
     from servobench.harness.config.settings import ConfigurationError, flatten
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
@@ -117,11 +117,8 @@ def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.rendered.settings import RenderedConfig
 
-    chosen = {
-        "plant": choose_plant(asked["plant"]),
-        "mismatch": read_mismatch(asked["mismatch"]),
-        "controller": choose_controller(asked["controller"]),
-    }
+    (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
+    chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
     request = RunRequest(**asked | chosen)
     if request.seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {request.seed}")

@@ -71,19 +71,19 @@ def run(
     The exit code is 1 if the run failed.
     """
     from servobench.controllers.controller import ControllerEntry
+    from servobench.harness.batch.apart import choose_controllers, choose_plants
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.registry import choose_controller, choose_plant
     from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.plant import PlantEntry
 
     if method and controller and method != controller:
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     controller = method or controller or DEFAULT_CONTROLLER
-    plant = named.default_plant() if plant is None else choose_plant(plant)
+    (plant,) = [named.default_plant()] if plant is None else choose_plants([plant])
     if view and plant != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
-    name = choose_controller(f"{controller}+{estimator}" if estimator else controller)
+    (name,) = choose_controllers([f"{controller}+{estimator}" if estimator else controller])
     named.tell_unused(ControllerEntry, [name])
     named.tell_unused(PlantEntry, [plant])
     batch = Batch(
@@ -149,14 +149,14 @@ def train(
     """
     from rich.table import Table
 
+    from servobench.harness.batch.apart import choose_controllers
     from servobench.harness.cli.progress import telling
-    from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import NETWORKS
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.cache import cache_folder
 
-    settings, controller = overrides.settings(), choose_controller(controller)
+    settings, (controller,) = overrides.settings(), choose_controllers([controller])
     check_settings(settings, [controller])
     with telling(console, "training") as tell:
         trained = train_networks(controller, settings, tell, robot, sensing)

@@ -7,6 +7,7 @@ import json
 import signal
 import sys
 from collections.abc import Iterable, Iterator
+from itertools import takewhile
 from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 
 TERMINATED = 128 + signal.SIGTERM  # exit code
 
-LEFT = ("controller", "mismatch", "noise", "latency", "period", "pair", "failures", "outcome")  # columns of words
+KEYS = ("controller", "mismatch", "noise", "latency", "period", "pair")  # first columns that say what a row is about
+LEFT = (*KEYS, "failures", "outcome")  # columns of words
 WHOLE = ("controller", "pair")  # columns whose cells are not broken over lines
 CONTROLLER_WIDTH = 15  # [characters] at least, so that tables below each other begin alike
 GAP = 2  # [characters] that a table needs for each column beside its cells
@@ -43,7 +45,7 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
     """Print tables of text with their titles, and a legend below all of them.
 
     Cells are broken between words where a table is wider than the terminal. Columns for which there is no room even so
-    follow in a table of their own below, after the first column again.
+    follow in a table of their own below, after the columns again that say what a row is about.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
@@ -71,12 +73,13 @@ def _fit(rows: pd.DataFrame, room: int) -> Iterator[dict[str, int]]:
         words = lines if name in WHOLE else [word for line in lines for word in line.split()]
         least[name] = max([CONTROLLER_WIDTH * (name == "controller"), *map(len, words)])
         whole[name] = max([least[name], *map(len, lines)])
-    first, *others = rows.columns
-    part = [first]
-    for name in others:
-        if len(part) > 1 and sum(least[each] + GAP for each in (*part, name)) > room:
+    names = [str(name) for name in rows.columns]
+    keys = list(takewhile(KEYS.__contains__, names)) or names[:1]
+    part = list(keys)
+    for name in names[len(keys) :]:
+        if len(part) > len(keys) and sum(least[each] + GAP for each in (*part, name)) > room:
             yield _shares(part, least, whole, room)
-            part = [first]
+            part = list(keys)
         part.append(name)
     yield _shares(part, least, whole, room)
 

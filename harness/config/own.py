@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import inspect
 import re
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -87,8 +88,7 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
     else:
         source, module = None, _import(found["module"])
         given = _pick(kind, module, found["module"], found["attribute"])
-        file = Path(module.__file__ or found["module"])
-        digest = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+        file, digest = Path(module.__file__ or found["module"]), digest_of_module(found["module"])
     entry = make_entry(kind, given, place, found["alias"])
     return Own(kind.word, entry, place, source, str(file), digest)
 
@@ -163,6 +163,12 @@ def _import(module: str) -> ModuleType:
 def describe_import(error: BaseException, module: str) -> str:
     """Return why a module cannot be imported, as one line with the place in it where there is one."""
     return describe_at(error, folder_of_module(module))
+
+
+def digest_of_module(module: str) -> str:
+    """Return the SHA-256 of the file of a module that is imported; empty where it has none."""
+    file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
 def folder_of_module(module: str) -> Path:

@@ -17,17 +17,19 @@ def sensing_names() -> list[str]:
     return [str(Sensing(eye, mount)) for eye in EYES.values() for mount in (FIXED, HAND)]
 
 
-@lru_cache(maxsize=64)
 def find_sensing(word: str) -> Sensing:
     """Return the sensing that a word stands for, such as `pixel`, `stereo:hand` or `./polar.py:hand`.
 
     Raises:
         ConfigurationError: an unknown word, or a file that cannot be used.
     """
+    return _find(word, sensing_file(word))
+
+
+@lru_cache(maxsize=64)
+def _find(word: str, file: SourceFile | None) -> Sensing:
     place, found = _place(word)
-    own = {}
-    if found is not None and found["file"]:
-        own = {place: _read_eye(found["file"], found["name"])}
+    own = {} if file is None or found is None else {place: _pick(file, found["file"], found["name"])}
     try:
         return Sensing.parse(word, {**EYES, **own})
     except ValueError as error:
@@ -47,10 +49,9 @@ def _place(word: str) -> tuple[str, re.Match[str] | None]:
     return place, PLACE.fullmatch(place)
 
 
-def _read_eye(file: str, name: str | None) -> Eye:
+def _pick(source: SourceFile, file: str, name: str | None) -> Eye:
     """Return the set-up called `name` that a file defines, or without a name its only one."""
-    module = SourceFile.read(file).load()
-    known = EYES.values()
+    module, known = source.load(), EYES.values()
     found = {key: value for key, value in vars(module).items() if isinstance(value, Eye) and value not in known}
     if name is None and len(found) == 1:
         return next(iter(found.values()))

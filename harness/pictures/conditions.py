@@ -38,16 +38,17 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -
 def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each condition with at least two sizes the runs concerned, with the column `size`.
 
-    Where a sweep says along which axis a run stands, the axes are its own; else the mismatches are read, and runs
-    without mismatch have size 0 on each axis.
+    Where a sweep says along which axis a run stands, the axes are its own, and the numbers that vary at one place of
+    an axis; else the mismatches are read, and runs without mismatch have size 0 on each axis.
     """
-    sweeps, none = {}, runs.head(0)
+    none = runs.head(0)
+    places = [runs] if "axis" not in runs else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
+    sweeps = {
+        label: runs.assign(size=factor * runs[name].astype(float))
+        for name, (label, factor) in NUMBERS.items()
+        if name in runs and any(own[name].nunique() > 1 for own in places)
+    }
     if "axis" not in runs or (runs["axis"].fillna("") == "").all():
-        sweeps = {
-            label: runs.assign(size=factor * runs[name].astype(float))
-            for name, (label, factor) in NUMBERS.items()
-            if name in runs
-        }
         none = runs[runs["mismatch"] == "none"].assign(size=0.0)
         runs = runs.assign(**runs["mismatch"].str.extract(SIZED_AXIS))
     along = runs[runs["axis"].fillna("") != ""]

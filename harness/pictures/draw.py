@@ -102,9 +102,10 @@ def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
         low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
         box = Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
         figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
-    # A line drawing has few colours; a palette makes half the size of it.
+    # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
     with Image.open(large) as picture:
-        picture.convert("RGB").quantize(PALETTE, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        indexed.save(small, "PNG", optimize=True)
     return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
 
 

@@ -22,6 +22,7 @@ SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
 NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)  # in a legend
 EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
 FLOOR: Final = 0.1  # settling bands: the least error that is told apart over time
+FEW_DECADES: Final = 50.0  # upper over lower end of a logarithmic axis
 OUTSIDE: Final = 1e12  # of every picture
 MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
 LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of the line beside it
@@ -162,10 +163,15 @@ def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
 
 
 def plain_logarithms(axes: Axes) -> None:
-    """Make the value axis logarithmic with plain numbers."""
+    """Make the value axis logarithmic with plain numbers; where it spans few decades, 2 and 5 have numbers as well."""
+
+    def between(value: float, _position: int | None) -> str:
+        low, high = axes.get_ylim()
+        return f"{value:g}" if high < FEW_DECADES * low and f"{value:e}"[0] in "25" else ""
+
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    axes.yaxis.set_minor_formatter(mpl.ticker.FuncFormatter(between))
 
 
 def mark_settling_band(axes: Axes, runs: Track | Ensemble) -> None:

@@ -63,7 +63,7 @@ def draw_paths(tasks: Mapping[str, Tracks], styles: Styles, layout: Layout = WID
     width = SINGLE if layout is WIDE and columns == 1 else layout.width / columns - BESIDE
     lines_below = LINE * sum(len(block.tracks) for block in blocks) * (0.1 if layout is WIDE else 1.0)
     height = 1.1 + width * sum(ratios) + rows * (0.55 + 0.3 * len(views)) + lines_below
-    figure = Figure(figsize=(layout.width, height), layout="constrained")
+    figure = Figure(figsize=(layout.width, height), layout="compressed")
     grid = figure.subplots(rows * len(views), columns, squeeze=False, height_ratios=ratios)
     for number, block in enumerate(blocks):
         row, column = divmod(number, columns)

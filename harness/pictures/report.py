@@ -19,6 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import outcomes, split_tasks
 from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
@@ -39,6 +40,8 @@ TEMPLATE: Final = "report.html.j2"
 PICTURE_BYTES: Final = 3_000_000  # of all figures in the page
 SHOWN_RUNS: Final = 1000  # rows of the table of runs
 LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
+COUNTED: Final = {"controller": "controllers", "task": "tasks", "plant": "plants", "mismatch": "mismatches"}
+SWEPT: Final = {"noise_factor": "factors of noise", "latency_s": "latencies", "period_s": "control periods"}
 KINDS: Final = ("errors", "paths", "settling", "tracking", "tracking_path", "jacobian", "step_times", "smoothness")
 
 
@@ -117,7 +120,7 @@ def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
     with figure_style(TEXT):
         wide, narrow = (draw_conditions(split_tasks(runs)[0], styles, layout) for layout in (WIDE, NARROW))
     if wide is not None and narrow is not None:
-        title = "Share of moves that settle over what was varied; bands are 95 % intervals"
+        title = "Share of moves that settle over each condition, all others together; bands are 95 % intervals"
         yield Picture("conditions", title, (), _drawing(wide, WIDE), _drawing(narrow, NARROW))
     for named, slim in page_figures(folder, KINDS):
         drawings = _drawing(named.figure, WIDE), _drawing(slim.figure, NARROW)
@@ -135,7 +138,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
     shown = _shown(runs)
     style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
     pictures = report_pictures(folder, runs)
-    moves, curves = groups.move_tables(runs), groups.curve_tables(runs)
+    moves, curves, ended = groups.move_tables(runs), groups.curve_tables(runs), groups.outcome_table(runs)
     others = [(name, table.map(lambda value: value)) for name, table in other_tables(folder)]
     estimates = any(picture.kind == "jacobian" for picture in pictures)
     sections = {"result": True, "outcomes": True, "moves": moves, "curves": curves, "space": views,
@@ -155,10 +158,12 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         band=settling_band(runs),
         following=settling_band(runs, FOLLOWING_BANDS),
         overview=groups.overview(runs),
+        published=runs["controller"].str.endswith(PUBLISHED).any(),
         leaders=leaders(runs),
         moves=moves,
         curves=curves,
-        outcomes=groups.outcome_table(runs),
+        outcomes=ended,
+        meanings=groups.meanings(ended),
         failures=groups.failure_table(runs),
         pictures=pictures,
         views=views,
@@ -206,9 +211,10 @@ def _digests(texts: list[str]) -> str:
 
 def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
     """Return in a line what was compared on what."""
-    counts = (("controller", "controllers"), ("task", "tasks"), ("plant", "plants"), ("mismatch", "mismatches"))
     words = [f"{runs[name].nunique()} {many}" if runs[name].nunique() > 1 else str(runs[name].iloc[0])
-             for name, many in counts]  # fmt: skip
+             for name, many in COUNTED.items()]  # fmt: skip
+    words += [f"{runs[name].nunique(dropna=False)} {many}" for name, many in SWEPT.items()
+              if name in runs and runs[name].nunique(dropna=False) > 1]  # fmt: skip
     count = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     return f"{count}: {', '.join(words)}; {'seeds' if runs['seed'].nunique() > 1 else 'seed'} {facts['seeds']}."
 

@@ -21,6 +21,7 @@ BREAKS: Final = re.compile(r"([_:+=/,.])")  # signs after which a long name may 
 TICKED: Final = re.compile(r"`([^`]*)`")
 CONTROLLER: Final = (WHICH, "controller")
 INFINITE: Final = "∞"
+LENGTHY: Final = 24  # letters of a word that may be broken anywhere
 FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
 
 
@@ -39,6 +40,11 @@ class Cell:
     interval: str = ""
     number: bool = False
     link: str = ""
+
+    @property
+    def lengthy(self) -> bool:
+        """Whether it has a word that has to be broken where there is little room."""
+        return any(len(word) > LENGTHY for word in BREAKS.sub(" ", self.text).split())
 
 
 @dataclass(frozen=True)
@@ -67,12 +73,14 @@ class Sheet:
         headings: of each column, with its unit apart.
         rows: in order.
         size: `few`, `some` or `many` columns, for the width at which rows become cards.
+        pairs: whether every group has two columns, which stay beside each other in a card.
     """
 
     groups: list[tuple[str, int]]
     headings: list[tuple[str, str]]
     rows: list[SheetRow]
     size: str
+    pairs: bool
 
 
 def sheet(table: pd.DataFrame, *, linked: bool = False) -> Sheet:
@@ -86,7 +94,9 @@ def sheet(table: pd.DataFrame, *, linked: bool = False) -> Sheet:
     groups = [(name, len(list(own))) for name, own in groupby(group for group, _ in columns)]
     headings = [_heading(heading) for _, heading in columns]
     size = "few" if len(columns) <= FEW else "some" if len(columns) <= SOME else "many"
-    return Sheet(groups if len(groups) > 1 else [], headings, list(_rows(table, columns, linked=linked)), size)
+    pairs = len(groups) > 1 and [count for _, count in groups] == [1, *[2] * (len(groups) - 1)]
+    rows = list(_rows(table, columns, linked=linked))
+    return Sheet(groups if len(groups) > 1 else [], headings, rows, size, pairs)
 
 
 def breakable(text: object) -> Markup:

@@ -56,13 +56,25 @@
     return found;
   }
 
+  // Texts of which none covers another: the names of the axes come first, then the numbers for which there is room.
+  const taken = [];
+
+  function write(text, x, y, across) {
+    const width = pen.measureText(text).width;
+    const left = Math.min(Math.max(x - { right: width, center: width / 2, left: 0 }[across], 4), canvas.clientWidth - width - 4);
+    const place = { left: left - 3, right: left + width + 3, top: y - 8, bottom: y + 8 };
+    if (taken.some((other) => place.left < other.right && other.left < place.right && place.top < other.bottom && other.top < place.bottom)) return;
+    taken.push(place);
+    pen.textAlign = "left";
+    pen.textBaseline = "middle";
+    pen.fillText(text, left, y);
+  }
+
   // Of the four parallel edges of the box, an axis has its scale at the outermost low one, so that scales stay apart.
   function drawBox() {
     for (let a = 0; a < 8; a += 1) for (let i = 0; i < 3; i += 1) if (!((a >> i) & 1)) line([corner(a), corner(a | (1 << i))], "#d5d5d5", 1);
-    pen.fillStyle = "#333";
-    pen.font = "12px system-ui, sans-serif";
     const centre = project(box.middle);
-    for (let i = 0; i < 3; i += 1) {
+    const scales = [0, 1, 2].map((i) => {
       const edges = [0, 1, 2, 3].map((k) => {
         const [j, l] = [0, 1, 2].filter((n) => n !== i);
         const start = ((k & 1) << j) | (((k >> 1) & 1) << l);
@@ -75,23 +87,24 @@
       line(ends, "#666", 1.4);
       const away = [middle[0] - centre[0], middle[1] - centre[1]];
       const length = Math.hypot(...away) || 1;
-      const out = away.map((v) => v / length);
+      return { ends, middle, out: away.map((v) => v / length) };
+    });
+    taken.length = 0;
+    pen.fillStyle = "#333";
+    pen.font = "bold 13px system-ui, sans-serif";
+    scales.forEach(({ middle, out }, i) => {
+      const y = Math.min(Math.max(middle[1] + 34 * out[1], 10), canvas.clientHeight - 10);
+      write(view.axes[i], middle[0] + 58 * out[0], y, "center");
+    });
+    pen.font = "12px system-ui, sans-serif";
+    scales.forEach(({ ends, out }, i) => {
       for (const tick of niceTicks(box.low[i], box.high[i])) {
         const at = [...ends[0]];
         at[i] = tick;
         const [x, y] = project(at);
-        pen.textAlign = out[0] < -0.3 ? "right" : out[0] > 0.3 ? "left" : "center";
-        pen.textBaseline = "middle";
-        pen.fillText(String(tick), x + 12 * out[0], y + 12 * out[1]);
+        write(String(tick), x + 12 * out[0], y + 12 * out[1], out[0] < -0.3 ? "right" : out[0] > 0.3 ? "left" : "center");
       }
-      pen.font = "bold 13px system-ui, sans-serif";
-      const width = pen.measureText(view.axes[i]).width / 2;
-      const x = Math.min(Math.max(middle[0] + 58 * out[0], width + 4), canvas.clientWidth - width - 4);
-      const y = Math.min(Math.max(middle[1] + 34 * out[1], 10), canvas.clientHeight - 10);
-      pen.textAlign = "center";
-      pen.fillText(view.axes[i], x, y);
-      pen.font = "12px system-ui, sans-serif";
-    }
+    });
   }
 
   function mark(point, text, filled) {

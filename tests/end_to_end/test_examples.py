@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import re
 import runpy
+import shutil
+import sys
+from itertools import pairwise
 
+import numpy as np
 import pytest
 
+import servobench
 from kit.documents import ROOT
+from servobench.harness.gym.environment import ServoEnv
 
+FOLDER = ROOT / "docs" / "examples"
 EXAMPLES = {
     "own_controller": r"ResolvedRate +\d.*\n.*constant.*\n.*ukf_mfac",
     "fmu_in_fmpy": r"nominal: ball at \[.*\n.*off by 3°: ball at",
@@ -17,13 +24,42 @@ EXAMPLES = {
 }
 
 
+LEARNING = {"train_policy", "learned_policy"}  # tested below
+
+
 def test_every_example_is_listed_here():
-    assert {path.stem for path in (ROOT / "docs" / "examples").glob("*.py")} == set(EXAMPLES)
+    assert {path.stem for path in FOLDER.glob("*.py")} == set(EXAMPLES) | LEARNING
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_runs_and_prints(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(ROOT / "docs" / "examples" / f"{name}.py"), run_name="__main__")
+    runpy.run_path(str(FOLDER / f"{name}.py"), run_name="__main__")
     printed = capsys.readouterr().out
     assert re.search(EXAMPLES[name], printed), printed
+
+
+def test_a_learned_policy_is_the_network_that_was_written(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(FOLDER / "learned_policy.py", tmp_path)
+    env, rng = ServoEnv(task="exp2"), np.random.default_rng(0)
+    seen, _ = env.reset(seed=2)
+    sizes = (len(seen), 5, 4, 6)
+    layers = [(rng.normal(0.0, 0.3, (m, n)), rng.normal(0.0, 0.1, m)) for n, m in pairwise(sizes)]
+    np.savez("policy.npz", *(part.astype(np.float32) for layer in layers for part in layer))
+    steps = servobench.run("./learned_policy.py", task="exp2", seed=2).steps
+    (w1, b1), (w2, b2), (w3, b3) = [tuple(part.astype(np.float32).astype(float) for part in each) for each in layers]
+    for feature in steps.filter(regex="^feature_.*_m$").to_numpy()[:40]:
+        np.testing.assert_allclose(env.observation.feature, feature, rtol=1e-12)
+        seen, *_ = env.step(w3 @ np.tanh(w2 @ np.tanh(w1 @ seen + b1) + b2) + b3)
+    env.close()
+
+
+def test_a_policy_is_trained_and_written(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed, and no requirement")
+    monkeypatch.setattr(sys, "argv", ["train_policy.py", "--steps", "1", "--out", str(tmp_path / "policy.npz")])
+    runpy.run_path(str(FOLDER / "train_policy.py"), run_name="__main__")
+    assert "policy.npz: trained for 1 steps" in capsys.readouterr().out
+    with np.load(tmp_path / "policy.npz") as kept:
+        shapes = [kept[name].shape for name in kept.files]
+    assert [shape[0] for shape in shapes] == [64, 64, 64, 64, 6, 6]

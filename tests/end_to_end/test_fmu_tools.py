@@ -1,15 +1,23 @@
-"""Other tools run the exported UR5 and agree with the kinematic plant: fmpy, libcosimpy, CasADi's integrator."""
+"""Other tools run the exported UR5 and agree with the kinematic plant, or find nothing to say about it.
+
+They are fmpy, fmusim, libcosimpy, CasADi's integrator and the FMU compliance checker. fmusim is the C program of the
+Reference FMUs (folder `fmusim` up to v0.0.39), the checker that of modelica-tools with FMI Library 2.0.3. Both are
+built from source; their tests are skipped where neither the path nor FMUSIM or FMUCHECK in the environment has them.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import shutil
 import subprocess
 import sys
 from functools import cache
 
 import casadi
 import numpy as np
+import pandas as pd
 import pytest
 from fmpy import simulate_fmu
 
@@ -31,15 +39,19 @@ COMMANDS = np.random.default_rng(1).uniform(-1.3, 1.3, (STEPS, 6))  # some beyon
 COMMANDS.setflags(write=False)
 
 
-@cache
-@cache
-def oracle(mismatch: str):
-    """Return joint positions and true features after each step, (STEPS, 9), by numpy."""
+def simulated(mismatch: str, commands) -> np.ndarray:
+    """Return joint positions and true features after each step, (k, 9), by numpy."""
     config = configure(KinematicConfig, feature_noise=0.0, command_delay=0.0)
     plant = build_kinematic(config, PlantSetup(mismatched(mismatch), np.array(HOME), PERIOD))
     plant.reset(0)
-    rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in COMMANDS]
+    rows = [np.r_[plant.step(Command(command)).joint_position, plant.truth().feature] for command in commands]
     return np.array(rows)
+
+
+@cache
+def oracle(mismatch: str) -> np.ndarray:
+    """Return what `simulated` gives for `COMMANDS`."""
+    return simulated(mismatch, COMMANDS)
 
 
 def parameters(mismatch: str):
@@ -81,6 +93,72 @@ def test_fmpy_runs_it_and_agrees_over_a_thousand_random_steps(version, mismatch)
     )
     came = np.column_stack([result[name] for name in outputs])[1:]
     np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)
+
+
+FMUSIM = os.environ.get("FMUSIM") or shutil.which("fmusim")
+CHECKER = os.environ.get("FMUCHECK") or shutil.which("fmuCheck.linux64")
+NEEDS_FMUSIM = pytest.mark.skipif(FMUSIM is None, reason="fmusim is not installed; FMUSIM=PATH names it")
+JOINTS = [f"[{i + 1}]" for i in range(6)]
+
+
+def by_fmusim(version: int, kind: str, commands, folder) -> np.ndarray:
+    """Return joint positions and features after each step, (k, 9), as fmusim computes them."""
+    time, stop = np.arange(len(commands)) * PERIOD, len(commands) * PERIOD
+    if version == 2:
+        outputs = [*(f"joint_position{each}" for each in JOINTS), *(f"ball_position[{i + 1}]" for i in range(3))]
+        inputs = {f"joint_velocity_command{each}": commands[:, i] for i, each in enumerate(JOINTS)}
+    else:
+        outputs = ["joint_position", "ball_position"]
+        inputs = {"joint_velocity_command": [" ".join(map(repr, row)) for row in commands.tolist()]}
+    pd.DataFrame({"time": time, **inputs}).to_csv(folder / "in.csv", index=False)
+    wanted = [word for name in outputs for word in ("--output-variable", name)]
+    times = ["--stop-time", str(stop), "--output-interval", str(PERIOD), "--tolerance", "1e-8", "--solver", "cvode"]
+    files = ["--input-file", folder / "in.csv", "--output-file", folder / "out.csv", cached_fmu(version)]
+    done = subprocess.run(
+        [FMUSIM, "--interface-type", kind, *times, *wanted, *files], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = (folder / "out.csv").read_text(encoding="utf-8").replace('"', "").replace(",", " ").splitlines()[1:]
+    came = np.array([[float(word) for word in row.split()] for row in rows])
+    np.testing.assert_allclose(came[1:, 0], time + PERIOD, atol=1e-9)
+    return came[1:, 1:]
+
+
+@NEEDS_FMUSIM
+@pytest.mark.parametrize("version", [2, 3])
+def test_fmusim_runs_it_and_agrees_over_a_thousand_random_steps(version, tmp_path):
+    np.testing.assert_allclose(by_fmusim(version, "cs", COMMANDS, tmp_path), oracle("none"), rtol=0, atol=1e-9)
+
+
+@NEEDS_FMUSIM
+@pytest.mark.parametrize("version", [2, 3])
+def test_fmusim_integrates_its_model_exchange_side_and_agrees(version, tmp_path):
+    held = np.tile(COMMANDS[0] / 3.0, (40, 1))  # as its solver is not restarted at a jump of an input
+    exact = simulated("none", held)
+    np.testing.assert_allclose(by_fmusim(version, "me", held, tmp_path), exact, rtol=0, atol=1e-6)
+    assert np.ptp(exact, axis=0).max() > 0.1
+
+
+@pytest.mark.skipif(CHECKER is None, reason="the compliance checker is not installed; FMUCHECK=PATH names it")
+@pytest.mark.parametrize("kind", ["cs", "me"])
+def test_the_compliance_checker_has_nothing_to_say_and_agrees(kind, tmp_path):
+    names = ["time", *(f"joint_velocity_command{each}" for each in JOINTS)]
+    held = np.tile(COMMANDS[0] / 3.0, (21, 1))
+    lines = [",".join(map(repr, line)) for line in np.c_[PERIOD * np.arange(21), held].tolist()]
+    (tmp_path / "in.csv").write_text("\n".join([",".join(names), *lines, ""]), encoding="utf-8")
+    step = PERIOD if kind == "cs" else PERIOD / 1000  # it integrates by Euler's method
+    times = ["-s", "1", "-n", "20", "-h", str(step), "-l", "4", "-k", kind]
+    done = subprocess.run(
+        [CHECKER, *times, "-i", tmp_path / "in.csv", "-o", tmp_path / "out.csv", cached_fmu(2)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    for line in ("0 warning(s) and error(s)", "0 Warning(s)", "0 Error(s)"):
+        assert f"\t{line}" in done.stderr
+    came = pd.read_csv(tmp_path / "out.csv").filter(regex=r"^joint_position")
+    exact = simulated("none", held[:20])[-1, :6]
+    np.testing.assert_allclose(came.iloc[-1], exact, rtol=0, atol=1e-9 if kind == "cs" else 1e-3)
+    assert np.ptp(came, axis=0).max() > 0.1
 
 
 COSIM = """

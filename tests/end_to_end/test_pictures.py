@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.text import Text
+from PIL import Image
 
 from kit.folders import CONTROLLERS, comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
 from servobench.harness.analysis.comparison import split_tasks
@@ -19,7 +21,7 @@ from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import HEADINGS, draw_figures, folder_figures, page_figures, picture_of
 from servobench.harness.pictures.interactive import path_views
 from servobench.harness.pictures.panels import ENDED
-from servobench.harness.pictures.style import NARROW, TEXT, WIDE, fitted, method_styles
+from servobench.harness.pictures.style import NARROW, TEXT, WIDE, figure_style, fitted, method_styles
 from servobench.harness.pictures.tracks import Track, load_groups
 
 OTHERS = [f"method_{i}" for i in range(20)]
@@ -229,6 +231,33 @@ def test_a_sweep_is_drawn_over_what_it_varies_and_a_lost_run_has_not_settled(tmp
     np.testing.assert_allclose(share, [100.0, 100 * 4 / 6, 50.0])
     moves, _ = split_tasks(results.load_runs(comparison(tmp_path / "same")))
     assert draw_conditions(moves, method_styles(CONTROLLERS)) is None
+
+
+def test_noise_that_is_crossed_with_an_axis_has_a_panel_and_noise_that_is_the_axis_none_of_its_own(tmp_path):
+    runs = results.load_runs(sweep(tmp_path / "out"))
+    moves = split_tasks(runs)[0].assign(axis="links", magnitude=5.0, unit="%", latency_s=np.nan)
+    turned = moves.assign(axis="tool", magnitude=9.0)
+
+    def labels(table):
+        figure = draw_conditions(table, method_styles(CONTROLLERS))
+        return None if figure is None else [axes.get_xlabel() for axes in figure.axes if axes.get_visible()]
+
+    assert labels(pd.concat([moves.assign(noise_factor=0.0), turned.assign(noise_factor=4.0)])) is None
+    assert labels(pd.concat([each.assign(noise_factor=n) for each in (moves, turned) for n in (0.0, 4.0)])) == [
+        "noise factor"
+    ]
+
+
+def test_a_picture_for_a_page_keeps_the_colour_of_each_method(tmp_path):
+    moves, _ = split_tasks(results.load_runs(sweep(tmp_path / "out")))
+    styles = method_styles(CONTROLLERS)
+    with figure_style(TEXT):
+        figure = draw_conditions(moves, styles)
+    with Image.open(io.BytesIO(picture_of(figure, WIDE)[0])) as picture:
+        known = np.asarray(picture.convert("RGB")).reshape(-1, 3).astype(int)
+    for name in moves["controller"].unique():
+        wanted = [int(styles[name].colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert np.abs(known - wanted).max(axis=1).min() <= 4, name
 
 
 def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):

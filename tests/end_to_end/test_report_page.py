@@ -10,9 +10,10 @@ import pytest
 
 from kit.browser import browser_page, find_browser
 from kit.folders import comparison, failed_only, made_up_row, made_up_steps, sweep, write_folder
+from servobench.controllers.methods import METHODS
 from servobench.harness.batch import results
 from servobench.harness.pictures import report
-from servobench.harness.pictures.style import NARROW, TEXT, WIDE
+from servobench.harness.pictures.style import NARROW, TEXT, WIDE, method_styles
 
 pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
 
@@ -25,6 +26,33 @@ TOO_WIDE = """Array.from(document.querySelectorAll('body *')).filter(e => e.getC
   && (e.getBoundingClientRect().right > innerWidth + 0.5 || e.getBoundingClientRect().left < -0.5
       || (e.scrollWidth > e.clientWidth + 1 && e.clientWidth > 0 && getComputedStyle(e).display !== 'inline')))
   .map(e => `${e.tagName} ${e.className} ${e.textContent.slice(0, 60)}`)"""
+
+SHORT: str = "24"  # letters of a word that has to stay in one line
+BROKEN_WORDS = """(() => { const found = []; const range = document.createRange();
+  for (const cell of document.querySelectorAll('td span, th')) {
+    const texts = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
+    while (texts.nextNode()) for (const word of texts.currentNode.data.matchAll(/[^\\s_:+=/,.-]+/g)) {
+      range.setStart(texts.currentNode, word.index);
+      range.setEnd(texts.currentNode, word.index + word[0].length);
+      const lines = new Set(Array.from(range.getClientRects(), r => Math.round(r.top)));
+      if (word[0].length <= SHORT && lines.size > 1) found.push(word[0]);
+    } }
+  return found; })()""".replace("SHORT", SHORT)
+UNLEVEL = """Array.from(document.querySelectorAll('table.many tbody tr:not(.detail)')).flatMap(row => {
+  const lines = {};
+  for (const cell of row.cells) if (cell.checkVisibility()) {
+    (lines[Math.round(cell.getBoundingClientRect().top)] ??= []).push(cell.firstChild.getBoundingClientRect().top); }
+  return Object.values(lines).filter(tops => Math.max(...tops) - Math.min(...tops) > 1.5); })"""
+TEXTS_ON_EACH_OTHER = """(() => { const boxes = [], pen = CanvasRenderingContext2D.prototype, fill = pen.fillText;
+  pen.fillText = function (text, x, y) { const width = this.measureText(text).width;
+    boxes.push([text, x - { right: width, center: width / 2 , left: 0 }[this.textAlign], y, width]);
+    fill.call(this, text, x, y); };
+  dispatchEvent(new Event('resize'));
+  pen.fillText = fill;
+  const scales = boxes.filter(b => !['start', 'target'].includes(b[0]));
+  return scales.length < 6 ? ['too few texts'] : scales.flatMap((a, i) => scales.slice(i + 1)
+    .filter(b => a[1] < b[1] + b[3] && b[1] < a[1] + a[3] && Math.abs(a[2] - b[2]) < 12)
+    .map(b => `${a[0]} on ${b[0]}`)); })()"""
 
 
 def one_run(folder):
@@ -87,6 +115,40 @@ def test_nothing_is_cut_or_wider_than_the_window(browser, pages, name, width):
     assert browser.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)")
     assert browser.complaints() == []
     assert browser.requests() == []
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", FOLDERS)
+def test_no_short_word_of_a_table_is_broken(browser, pages, name, width):
+    show(browser, pages[name], width)
+    assert browser.evaluate(BROKEN_WORDS) == []
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_values_beside_each_other_in_a_card_stand_on_one_line(browser, pages, name):
+    show(browser, pages[name], 390)
+    assert browser.evaluate(UNLEVEL) == []
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_the_hint_of_the_filter_is_not_cut(browser, pages, width):
+    show(browser, pages["sweep"], width)
+    hint = """(() => { const pen = document.createElement('canvas').getContext('2d'), style = getComputedStyle(filter);
+      pen.font = style.font;
+      return pen.measureText(filter.placeholder).width + 2 * parseFloat(style.paddingLeft); })()"""
+    assert browser.evaluate(f"{hint} < filter.clientWidth")
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_no_scale_of_paths_in_space_covers_another(browser, pages, width):
+    show(browser, pages["comparison"], width)
+    assert browser.evaluate(TEXTS_ON_EACH_OTHER) == []
+    for key in ("ArrowLeft", "ArrowUp", "ArrowUp"):
+        event = f"new KeyboardEvent('keydown', {{key: '{key}'}})"
+        browser.evaluate(
+            f"for (let i = 0; i < 4; i += 1) document.getElementById('space-canvas').dispatchEvent({event})"
+        )
+        assert browser.evaluate(TEXTS_ON_EACH_OTHER) == []
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -234,6 +296,24 @@ def test_dark_is_dark_and_light_on_it_can_be_read(browser, pages):
         assert inverted.startswith("invert") == (scheme == "dark")
     assert brightness["light"][0] > 700 > 300 > brightness["light"][1]
     assert brightness["dark"][0] < 150 < 600 < brightness["dark"][1]
+
+
+def test_every_colour_of_a_method_can_be_told_from_the_dark_page(browser, pages):
+    show(browser, pages["comparison"], scheme="dark")
+    colours = sorted({style.colour for style in method_styles(METHODS).values()})
+    assert len(colours) > 8
+    for colour in (*colours, "#ffffff"):
+        draw = f"""(() => {{ const canvas = document.createElement('canvas'); const pen = canvas.getContext('2d');
+          pen.filter = getComputedStyle(document.querySelector('img.drawn')).filter; pen.fillStyle = '{colour}';
+          pen.fillRect(0, 0, 300, 150); return Array.from(pen.getImageData(9, 9, 1, 1).data.slice(0, 3)); }})()"""
+        contrast = luminance(browser.evaluate(draw)) / luminance([0x1A, 0x1A, 0x1A])
+        assert contrast < 1.02 if colour == "#ffffff" else contrast > 3.0, colour
+
+
+def luminance(colour):
+    """Return the relative luminance that WCAG 2 compares, with its offset."""
+    linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in np.array(colour) / 255]
+    return np.dot([0.2126, 0.7152, 0.0722], linear) + 0.05
 
 
 def test_on_paper_tables_are_tables_and_controls_are_gone(browser, pages):

@@ -167,11 +167,11 @@ UNUSED_PLANT = (
 DRIVER = """
 import contextlib, io, json, sys
 from servobench.controllers import methods
-from servobench.harness.batch import trial
+from servobench.harness.batch import apart, trial
 from servobench.harness.cli.main import main
 from servobench.harness.config import registry
 
-trial.ANSWER_LIMIT = 4.0
+trial.ANSWER_LIMIT = apart.IMPORT_LIMIT = 4.0
 registry.METHODS = {name: registry.METHODS[name] for name in ("ukf_mfac", "constant")}
 told = []
 for arguments in json.loads(sys.argv[1]):
@@ -185,7 +185,8 @@ for arguments in json.loads(sys.argv[1]):
 print(json.dumps(told))
 """
 SHORT = ("--set", "exp1.duration=0.3", "--task", "exp1")
-RUNS = {name: ["run", name, "--plant", "kinematic", *SHORT] for name in [*CONTROLLERS, "whole", "ukf_mfac"]}
+NAMED = [*CONTROLLERS, "whole", "ukf_mfac", "import-ends", "import-hangs"]
+RUNS = {name: ["run", name, "--plant", "kinematic", *SHORT] for name in NAMED}
 COMMANDS = {
     "controllers": ["controllers", "--json"],
     "plants": ["plants", "--json"],
@@ -252,6 +253,20 @@ def test_a_run_of_it_is_refused_with_the_same_line(told, name):
     code, _, errors = told[name]
     assert code == 2, told[name]
     assert errors == f"servobench: {CONTROLLERS[name]}\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("import-ends", "it ended the process with exit code 0; raise an error instead, so that the other runs go on"),
+        (
+            "import-hangs",
+            "site/some_wait.py:3: no answer after 4 s; is there a loop without an end, or something that waits?",
+        ),
+    ],
+)
+def test_a_run_of_one_whose_import_harms_the_process_is_refused(told, name, why):
+    assert told[name] == [2, "", f"servobench: {name} cannot be imported: {why}\n"]
 
 
 def test_what_is_whole_runs_beside_them(told):

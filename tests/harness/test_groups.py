@@ -36,7 +36,7 @@ def test_moves_stand_apart_by_task_and_curves_beside_them(tmp_path):
     runs = results.load_runs(comparison(tmp_path / "out"))
     assert list(groups.move_tables(runs)) == ["exp1", "exp2"]
     (table,) = groups.curve_tables(runs).values()
-    assert table["RMS error", "RMS of the evaluated part [mm]"].tolist() == ["2.00"] * 3
+    assert table["RMS error", "RMS of the judged part [mm]"].tolist() == ["2.00"] * 3
     assert table["Runs", "followed [%]"].tolist() == ["100 [21, 100]"] * 3
 
 

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from kit.command import judged
+from kit.folders import made_up_row
 from servobench.harness.batch import parquet, results
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.checksums import SUMS, DamagedFile, UnwritableFolder, fault, read_sums, writing
@@ -304,7 +305,7 @@ def test_rows_that_are_not_those_of_their_part_are_named_where_nothing_vouches_f
     place = folder / results.part_name(name, results.RUNS)
     if source is None:
         (folder / results.part_name(8, results.RUNS)).unlink()
-        rows = [{"run_id": f"run{index}", "status": "completed"} for index in range(6)]
+        rows = [made_up_row(f"run{index}") for index in range(6)]
         parquet.write_table(parquet.as_table(rows), folder / results.part_name(8, results.RUNS))
         parquet.write_table(parquet.as_table(rows), place)
     else:

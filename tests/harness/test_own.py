@@ -13,6 +13,7 @@ import servobench
 from kit.command import PACKAGE
 from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, install, write
+from servobench.harness.batch import apart
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offered, offering
 from servobench.harness.config.settings import ConfigurationError
@@ -290,3 +291,47 @@ def test_a_file_that_an_installed_module_would_hide_is_refused(tmp_path, name):
         choose_controller("./mine.py")
     write(tmp_path, WHOLE, "other.py")  # which does not import it
     assert choose_controller("./other.py") == "Mine"
+
+
+HARMFUL = {
+    "os._exit(3)": "it ended the process with exit code 3; raise an error instead",
+    "ctypes.string_at(0)": "mine.py:4: it killed the process by SIGSEGV",
+    "time.sleep(1000)": "mine.py:4: no answer after 2 s; is there a loop without an end",
+    "signal.raise_signal(signal.SIGKILL)": "it killed the process by SIGKILL",
+    "raise KeyboardInterrupt": "KeyboardInterrupt (mine.py:4 in <module>)",
+}
+COMMANDS = {
+    "run": ("run", "./mine.py", "--plant", "kinematic", "--out", "out"),
+    "compare": ("compare", "--controllers", "constant,./mine.py:Mine", "--out", "out"),
+    "sweep of a module": ("sweep", "--controllers", "mine:Mine", "--out", "out"),
+    "list": ("controllers", "./mine.py"),
+    "plant": ("run", "constant", "--plant", "./mine.py", "--out", "out"),
+    "check": ("check", "./mine.py"),
+}
+
+
+@pytest.mark.parametrize(("line", "why"), HARMFUL.items())
+def test_an_import_that_ends_or_hangs_its_process_is_one_line(tmp_path, monkeypatch, capfd, line, why):
+    monkeypatch.setattr(apart, "IMPORT_LIMIT", 2.0)
+    write(tmp_path, f"import ctypes, os, signal, time\nprint('a banner')\n\n{line}\n{WHOLE}")
+    assert command(monkeypatch, *COMMANDS["run"]) == 2
+    out, errors = capfd.readouterr()
+    assert out == ""
+    assert errors.startswith(f"servobench: ./mine.py cannot be imported: {why}")
+    assert len(errors.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_outlives_an_import_that_ends_its_process(tmp_path, monkeypatch, capfd, name):
+    write(tmp_path, f"import os\nos._exit(3)\n{WHOLE}")
+    assert command(monkeypatch, *COMMANDS[name]) == (1 if name == "check" else 2)
+    told = "".join(capfd.readouterr())
+    assert "it ended the process with exit code 3" in told
+    assert "Traceback" not in told
+
+
+def test_what_an_import_prints_is_printed_once(tmp_path, monkeypatch, capfd):
+    write(tmp_path, f"print('a banner')\n{CONFIGURED}")
+    assert command(monkeypatch, "controllers", "./mine.py") == 0
+    assert capfd.readouterr().out.count("a banner") == 1

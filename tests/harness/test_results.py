@@ -6,18 +6,32 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from kit.folders import comparison, made_up_row
+from servobench.harness.analysis import groups
+from servobench.harness.analysis.comparison import split_tasks
+from servobench.harness.analysis.summary import summary_legend, summary_tables
+from servobench.harness.analysis.tables import statistics_rows
+from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import parquet, results
 from servobench.harness.batch.checksums import SUMS
+from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, locked
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.pictures.conditions import draw_conditions
+from servobench.harness.pictures.ensembles import load_ensembles
+from servobench.harness.pictures.interactive import error_curves, path_views
+from servobench.harness.pictures.style import method_styles
+from servobench.harness.pictures.tracks import load_groups
 from servobench.harness.run.episode import RunResult
 from servobench.plant.files import point_latest, write_atomically
+
+STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}
 
 
 def add_part(folder, index: int, **extra: float) -> None:
     run_id = f"run{index}"
-    steps = pd.DataFrame({"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | extra)
-    results.write_part(folder, index, [RunResult({"run_id": run_id, "seed": index} | extra, steps)])
+    steps = pd.DataFrame({"run_id": run_id, "step": np.arange(3), "value": index + np.arange(3.0)} | STEPS | extra)
+    results.write_part(folder, index, [RunResult(made_up_row(run_id, seed=index) | extra, steps)])
 
 
 @pytest.fixture
@@ -59,7 +73,7 @@ def test_a_run_without_its_row_does_not_count(folder):
 
 
 def test_a_run_that_ended_before_its_first_period_has_a_row_and_no_steps(folder):
-    results.write_part(folder, 0, [RunResult({"run_id": "run0"}, pd.DataFrame())])
+    results.write_part(folder, 0, [RunResult(made_up_row("run0"), pd.DataFrame())])
     assert results.collect(folder) == 1
     with pytest.raises(ConfigurationError, match="holds no steps"):
         results.load_steps(folder)
@@ -124,7 +138,7 @@ def test_the_manifest_is_json_for_every_reader(tmp_path):
 
 def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(folder):
     for index, latency in enumerate((None, 2, None)):
-        results.write_part(folder, index, [RunResult({"run_id": f"run{index}", "latency_s": latency}, None)])
+        results.write_part(folder, index, [RunResult(made_up_row(f"run{index}", latency_s=latency), None)])
     before = results.load_runs(folder)
     results.collect(folder)
     pd.testing.assert_frame_equal(results.load_runs(folder), before)
@@ -132,7 +146,7 @@ def test_columns_that_one_part_has_only_as_nothing_take_the_type_of_the_others(f
 
 
 def test_a_part_of_several_runs_says_which_runs_are_there(folder):
-    results.write_part(folder, 8, [RunResult({"run_id": f"run{index}"}, None) for index in (8, 9, 10)])
+    results.write_part(folder, 8, [RunResult(made_up_row(f"run{index}"), None) for index in (8, 9, 10)])
     add_part(folder, 2)
     assert results.finished_runs(folder) == [range(2, 3), range(8, 11)]
 
@@ -164,7 +178,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):
 def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
     cv2 = pytest.importorskip("cv2")
     picture = np.full((6, 8, 3), (200, 30, 10), dtype=np.uint8)
-    results.write_part(folder, 0, [RunResult({"run_id": "run0"}, None, picture), RunResult({"run_id": "run1"}, None)])
+    results.write_part(folder, 0, [RunResult(made_up_row("run0"), None, picture), RunResult(made_up_row("run1"), None)])
     written = list((folder / results.PICTURES).iterdir())
     assert [path.name for path in written] == ["run0.png"]
     colours = cv2.cvtColor(cv2.imread(str(written[0])), cv2.COLOR_BGR2RGB)
@@ -172,7 +186,7 @@ def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
 
 
 def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
-    tables = {name: pd.DataFrame({"run_id": [f"{name}{i}" for i in range(2)], "seed": [0, 1]}) for name in "ab"}
+    tables = {name: pd.DataFrame([made_up_row(f"{name}{i}", seed=i) for i in range(2)]) for name in "ab"}
     results.write_summary(folder, tables, {"parts": ["a", "b"]})
     runs = results.load_runs(folder)
     assert runs[["run_id", "part"]].values.tolist() == [["a0", "a"], ["a1", "a"], ["b0", "b"], ["b1", "b"]]
@@ -189,3 +203,54 @@ def test_a_long_table_is_read_in_groups_with_the_columns_that_it_has(folder, mon
     groups = list(results.iterate_runs(folder, ["seed", "no such column"]))
     assert [list(group.columns) for group in groups] == [["seed"]] * 3
     assert [group["seed"].tolist() for group in groups] == [[0, 1], [2, 3], [4]]
+
+
+def read_runs(folder):
+    """Make of a table of runs what `statistics`, `compare`, `report` and the notebook make of it."""
+    runs = results.load_runs(folder)
+    list(statistics_rows(runs))
+    list(summary_tables(runs))
+    summary_legend(runs)
+    makers = (groups.overview, groups.move_tables, groups.curve_tables, groups.cost_table, groups.outcome_table)
+    for make in (*makers, groups.failure_table, groups.runs_table, judge, leaders):
+        make(runs)
+    draw_conditions(split_tasks(runs)[0], method_styles(runs["controller"]))
+
+
+def read_steps(folder):
+    """Read what figures, paths and curves are drawn of."""
+    results.load_steps(folder)
+    runs = results.load_runs(folder)
+    for group in load_groups(folder):
+        load_ensembles(folder, runs[runs["mismatch"] == group.mismatch])
+    path_views(folder)
+    error_curves(folder, runs)
+
+
+@pytest.mark.parametrize(("kind", "read"), [(results.RUNS, read_runs), (results.STEPS, read_steps)])
+def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_one_line(tmp_path, kind, read):
+    folder = comparison(tmp_path / "out", controllers=("ukf_mfac", "rls"), tasks=("exp1", "circle"))
+    (folder / SUMS).unlink()
+    whole = pd.read_parquet(folder / kind)
+    refused = {}
+    for name in whole:
+        whole.drop(columns=name).to_parquet(folder / kind)
+        try:
+            read(folder)
+        except ConfigurationError as error:
+            refused[name] = str(error)
+            assert len(refused[name].splitlines()) == 1
+            assert name in refused[name]
+    needed = {name: message for name, message in refused.items() if str(folder / kind) in message}
+    assert sorted(needed) == sorted(results.NEEDED[kind])
+    assert set(refused) - set(needed) <= {"settling_time_s", "rms_error_evaluated"}  # what pairs are compared by
+
+
+def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
+    folder = comparison(tmp_path / "out")
+    (folder / SUMS).unlink()
+    pd.DataFrame({"run_id": ["a"], "plant": ["kinematic"], "x": [1.0]}).to_parquet(folder / results.RUNS)
+    lack = "lacks the columns controller, task, mismatch, seed, status"
+    with pytest.raises(ConfigurationError, match=f"runs.parquet is no table of runs: it {lack}$"):
+        results.load_runs(folder)
+    assert lack in [finding.what for finding in examine(folder).findings]

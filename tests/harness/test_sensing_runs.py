@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import servobench
 from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
 from servobench.controllers.units import in_natural_units
@@ -287,6 +288,20 @@ def measure(points, optics):
 
 FROM_THE_SIDE = Eye("side", "distance from a pole", ("r", "y", "z"), "m", measure)
 """
+
+
+def test_another_text_of_a_set_up_is_refused_when_a_folder_is_resumed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "side.py"
+    file.write_text(OWN)
+    short = {"exp1": {"duration": 0.2}}
+    asked = {"plants": ["kinematic"], "sensings": ["./side.py"], "settings": short, "out": "folder"}
+    servobench.compare(["constant"], **asked)
+    assert servobench.compare(["constant"], resume=True, **asked)["sensing"].tolist() == ["./side.py"]
+    file.write_text(OWN.replace('("r", "y", "z")', '("r", "y", "depth")'))
+    assert find_sensing("./side.py").eye.features == ("r", "y", "depth")
+    with pytest.raises(ConfigurationError, match=r"folder was begun with another text of \./side\.py; name another"):
+        servobench.compare(["constant"], resume=True, **asked)
 
 
 def test_a_file_can_bring_a_set_up(tmp_path):

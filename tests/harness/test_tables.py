@@ -67,7 +67,7 @@ def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):
     better = runs["controller"] == "quick"
     curve = runs.assign(task_kind="curve", rms_error_evaluated=np.where(better, 0.002, 0.0035), status="completed")
     (row,) = compare_controllers(curve).to_dict("records")
-    assert row["difference in RMS of the evaluated part, mm"] == "-1.50 [-1.50, -1.50]"
+    assert row["difference in RMS of the judged part, mm"] == "-1.50 [-1.50, -1.50]"
 
 
 def test_a_run_without_a_value_is_worse_than_all_that_have_one(runs):
@@ -111,6 +111,19 @@ def test_no_word_of_a_table_is_cut_however_narrow_the_terminal_is(runs, monkeypa
         assert set(words) <= set(text.split())
     assert text.count("a title") == text.count("a legend") == 1
     assert text.count("rbfnn_mfac:published") == (3 if room <= 80 else 2)
+
+
+def test_a_row_says_in_each_part_of_a_wide_table_what_it_is_about(monkeypatch, capsys):
+    names = [f"a_controller_{i}" for i in range(6)]
+    conditions = [("moderate+camera_rotation=60deg", noise, latency) for noise in "014" for latency in ("0", "100")]
+    rows = [dict(zip(("mismatch", "noise", "latency"), key, strict=True)) | dict.fromkeys(names, "100.0")
+            for key in conditions]  # fmt: skip
+    monkeypatch.setattr(terminal, "console", Console(width=80))
+    terminal.print_tables([("a title", pd.DataFrame(rows))])
+    lines = [tuple(line.split()) for line in capsys.readouterr().out.splitlines() if "deg" in line]
+    parts = len(lines) // len(rows)
+    assert parts > 1
+    assert [line[:3] for line in lines] == parts * conditions
 
 
 def test_errors_are_shown_in_the_unit_of_the_feature(runs):
