@@ -36,7 +36,6 @@ CAUSES = {
     "jacobian_condition_max": "largest condition number",
     "steady_state_error": "error in the last second [m]",
 }
-SHARES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998, 0.999, 1.0)  # of runs, where bins of causes end
 
 
 FAILED = "of the failed runs settle"
@@ -60,16 +59,10 @@ def tables(folder: Path) -> dict[str, pd.DataFrame]:
 
 
 def pictures(folder: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield the three pictures."""
-    runs = judged(load_runs(folder / RUNS))
-    for name, figure in (
-        ("final_errors", exceedance(runs)),
-        ("failures_by_condition", by_cause(runs, "jacobian_condition_max")),
-        ("failures_by_target", by_target(runs)),
-    ):
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=110)
-        yield f"pictures/{name}.png", stream.getvalue()
+    """Yield the picture of the errors at the end."""
+    stream = io.BytesIO()
+    exceedance(load_runs(folder / RUNS)).savefig(stream, format="png", dpi=110)
+    yield "pictures/final_errors.png", stream.getvalue()
 
 
 def repeated(options: Words) -> Callable[[Path], Words]:
@@ -91,7 +84,7 @@ def judged(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def robots(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return what was drawn for each seed: mismatch, distance and target; all methods meet the same robots."""
+    """Return what was drawn for each seed: mismatch and distance; all methods meet the same robots."""
     requests = [
         RunRequest(row.plant, row.controller, row.task, row.mismatch, int(row.seed)) for row in runs.itertuples()
     ]
@@ -99,11 +92,9 @@ def robots(runs: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for request, text in zip(requests, runs["mismatch_values"], strict=True):
         drawn, values = draw(select(request, sections)), json.loads(text)
-        target = drawn.scenario.reference.at(0.0)
-        x, y, _ = drawn.true.to_base(target)
-        distance = np.linalg.norm(drawn.true.feature(drawn.scenario.start) - target)
-        rows.append((request.seed, np.degrees(abs(values["camera_angle"])), distance, x, y))
-    return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance", "x", "y"])
+        distance = np.linalg.norm(drawn.true.feature(drawn.scenario.start) - drawn.scenario.reference.at(0.0))
+        rows.append((request.seed, np.degrees(abs(values["camera_angle"])), distance))
+    return pd.DataFrame(rows, columns=["seed", "camera_angle", "distance"])
 
 
 def rate_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
@@ -166,47 +157,6 @@ def exceedance(runs: pd.DataFrame) -> Figure:
         axes.axvline(5.0, color="black", linewidth=0.8)
         axes.set(xlabel="error in the last second [mm]", ylabel="share of runs above", xscale="log", yscale="log")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
-        return figure
-
-
-def by_cause(runs: pd.DataFrame, cause: str) -> Figure:
-    """Draw the failure rate over a cause with its 95 % interval, in bins that get finer where few runs are."""
-    with figure_style():
-        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
-        axes = figure.subplots()
-        for method, style in method_styles(runs["controller"].unique()).items():
-            own = runs[runs["controller"] == method]
-            bins = own.groupby(pd.qcut(own[cause], SHARES, duplicates="drop"), observed=True)
-            places = [(part[cause].median(), success_rate(int(part["failed"].sum()), len(part))) for _, part in bins]
-            seen = [(place, rate) for place, rate in places if rate.value > 0.0]
-            x, y = np.array([place for place, _ in seen]), np.array([rate.value for _, rate in seen])
-            reach = [y - [rate.low for _, rate in seen], [rate.high for _, rate in seen] - y] if seen else None
-            look = {"color": style.colour, "linestyle": style.line, "marker": style.marker, "markersize": 4.5}
-            label = method if seen else f"{method}: none"
-            axes.errorbar(x, y, yerr=reach, label=label, linewidth=1.4, capsize=2.0, **look)
-        axes.set(
-            xlabel=CAUSES[cause],
-            ylabel="failure rate",
-            xscale="log",
-            yscale="log" if runs["failed"].any() else "linear",
-        )
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
-        return figure
-
-
-def by_target(runs: pd.DataFrame) -> Figure:
-    """Draw where the targets of failed runs lie, seen from above, in the base frame."""
-    methods = list(runs["controller"].unique())
-    with figure_style():
-        figure = Figure(figsize=(2.3 * len(methods), 3.3), layout="constrained")
-        panels = np.atleast_1d(figure.subplots(1, len(methods), sharex=True, sharey=True))
-        everywhere = runs.drop_duplicates("seed")
-        for axes, (method, style) in zip(panels, method_styles(methods).items(), strict=True):
-            failed = runs[(runs["controller"] == method) & runs["failed"]]
-            axes.hexbin(everywhere["x"], everywhere["y"], gridsize=24, cmap="Greys", alpha=0.5, linewidths=0.0)
-            axes.plot(failed["x"], failed["y"], ".", color=style.colour, markersize=3.0)
-            axes.set(title=f"{method}: {len(failed)}", xlabel="x [m]", aspect="equal")
-        panels[0].set_ylabel("y [m]")
         return figure
 
 
