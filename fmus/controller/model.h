@@ -2,8 +2,9 @@
 
    u(k) = [time, inputs],   x(0) = start(u(0)),   x(k+1), y(k) = step(x(k), u(k))
 
-   At a sampling instant the outputs follow the inputs as soon as one is set; until then, and between the instants, they
-   are those of the last sample. A step makes the samples of the instants from its beginning on and before its end. */
+   The first sample is taken when a feature is seen. At a sampling instant the outputs follow the inputs as soon as one is
+   set; until then, and between the instants, they are those of the last sample. A step makes the samples of the instants
+   from its beginning on and before its end. */
 #ifndef MODEL_H
 #define MODEL_H
 
