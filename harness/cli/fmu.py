@@ -85,8 +85,8 @@ def ssp(
     request = _request(controller, known_robot(robot), sensing, mismatch, seed, settings)
     try:
         chosen = parse_platforms(platforms)
-        *products, stop = loop_products(request, settings)
-        write_loop(output, *products, chosen, stop)
+        plant, regulator, stop = loop_products(request, settings)
+        write_loop(output, plant, regulator, chosen, stop)
     except (ValueError, OSError, CompilerMissing, CompilationFailed) as error:
         raise ConfigurationError(str(error)) from error
     console.print(f"{output}: SSP 1.0, {output.stat().st_size / 1024:.0f} kB, plant and controller", soft_wrap=True)

@@ -10,7 +10,7 @@ from servobench.fmus.product import Product
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.controller_fmu import controller_model
-from servobench.harness.run.experiment import draw
+from servobench.harness.run.drawn import draw
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import resolve
 
