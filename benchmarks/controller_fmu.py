@@ -71,7 +71,7 @@ def main() -> None:
         for name in methods:
             (python, fmu), worst, size = measured(name, Path(folder))
             differences.append(worst)
-            words = microseconds(python), microseconds(fmu), f"{python / fmu:.0f}", f"{worst:.1e}", size
+            words = microseconds(python), microseconds(fmu), f"{python / fmu:.1f}", f"{worst:.1e}", size
             rows.append([f"`{name}`", *words])
     header = ["controller", "original [µs]", "FMU [µs]", "original / FMU", "difference [rad/s]", "numbers remembered"]
     print(table(header, rows))

@@ -129,7 +129,6 @@ static ModelStatus take_sample(Model *model)
     memcpy(model->values + N_SETTABLE, model->answers, sizeof model->answers);
     model->begun = 1;
     model->sample += 1.0;
-    model->touched = 0;
     model->known = 0;
     return MODEL_OK;
 }
@@ -141,6 +140,7 @@ ModelStatus model_step(Model *model, double step)
         const ModelStatus status = take_sample(model);
         if (status != MODEL_OK) return status;
     }
+    model->touched = 0; /* what was set before its end is not of the instant at its end */
     return MODEL_OK;
 }
 

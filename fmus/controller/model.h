@@ -21,7 +21,7 @@ typedef struct {
     double first;               /* time of the first sample */
     double sample;              /* k, a whole number */
     int begun;                  /* there is a state */
-    int touched;                /* an input was set after the last sample */
+    int touched;                /* an input was set after the last step */
     int known;                  /* the next three are those of the present inputs */
     double fault;               /* of the step, as the generated code numbers them */
     double next[N_MEMORY];      /* x(k+1) */
