@@ -72,7 +72,7 @@ def ssp(
     config: ConfigOption = None,
     assignments: SetOption = None,
 ) -> None:
-    """Export an arm, a controller and their connections as one system (SSP 1.0).
+    """Export arm, controller and connections as one system (SSP).
 
     The reference is the target of the task `target`.
     """
