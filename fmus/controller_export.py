@@ -98,9 +98,15 @@ class ControllerModel:
         """The generated C file."""
         return generated_source(CORE, (self.recorded.start, self.recorded.step))
 
-    def product(self, fmi_version: int) -> Product:
-        """Return what goes into the FMU of a version of FMI, 2 or 3."""
+    def product(self, fmi_version: int, start: Mapping[str, FloatArray] | None = None) -> Product:
+        """Return what goes into the FMU.
+
+        Args:
+            fmi_version: 2 or 3.
+            start: values of inputs by name, (size,), at the start; zeros for others, and ones for what is seen.
+        """
         layout = Layout(self.groups)
+        starts = {SEEN: np.ones_like(self.run.inputs[SEEN][0]), **(start or {})}
         return Product(
             fmi_version=fmi_version,
             folder=MODEL,
@@ -113,7 +119,7 @@ class ControllerModel:
                 summary=f"{self.name}: {self.summary}.",
                 layout=layout,
                 sections=sampled_sections(layout),
-                start={SEEN: np.ones_like(self.run.inputs[SEEN][0])},
+                start=starts,
                 sources=c_files(fmi_version, CORE),
                 tool=tool(),
                 step=self.period,
@@ -129,6 +135,7 @@ class ControllerModel:
         return {
             "PERIOD": self.period,
             "N_MEMORY": max(self.recorded.states, 1),
+            "N_FEATURES": sum(group.size for group in layout.groups if group.name == SEEN),
             "N_ANSWERS": sum(group.size for group in layout.of_role(SAMPLED)),
             "N_POINTERS": pointers,
             "N_WORK": max(1, *(part.sz_w() for part in parts)),

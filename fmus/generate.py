@@ -66,7 +66,8 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
     arm, view = _arm(part), layout.view
     if view is None:
         ball = HandEyeGeometry(*arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
-        return feature_and_jacobian(q, ball)
+        feature, jacobian = feature_and_jacobian(q, ball)
+        return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), jacobian
     geometry = _view(part, arm, view)
     points = points_in_cameras(q, geometry, view.mount)
     feature = features(points, geometry.optics, view.eye)

@@ -69,7 +69,7 @@ def reference_run(model: SensedArm, actuation: Actuation) -> ReferenceRun:
 def _features(model: SensedArm, positions: FloatArray) -> dict[str, FloatArray]:
     """Return what is seen at joint positions (k, n), (k, size) by name."""
     if not isinstance(model, EyeModel):
-        return {"ball_position": model.feature(positions)}
+        return {"ball_position": model.feature(positions), SEEN: np.ones((len(positions), 3))}
     feature, _, seen = model.look(positions)
     return {FEATURE: feature, SEEN: seen.astype(np.float64)}
 

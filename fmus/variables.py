@@ -16,7 +16,7 @@ from math import prod
 
 import numpy as np
 
-from servobench.fmus.eye_variables import View, view_parameters
+from servobench.fmus.eye_variables import SEEN, View, view_parameters
 from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.eyes.model import EyeModel
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
@@ -119,6 +119,7 @@ def _outputs(n: int, view: View | None) -> tuple[Group, ...]:
         return tuple(Group(name, shape, OUTPUT, unit, text) for name, shape, unit, text in view.outputs(n))
     return (
         Group("ball_position", (3,), OUTPUT, "m", "Ball centre in the camera frame."),
+        Group(SEEN, (3,), OUTPUT, "1", "1: the camera sees the ball wherever it is."),
         Group("jacobian", (3, n), OUTPUT, "m/rad", "Derivative of ball_position by joint_position; for evaluation."),
     )
 

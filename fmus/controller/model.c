@@ -60,6 +60,15 @@ ModelStatus model_set(Model *model, size_t index, double value)
 
 static double instant(const Model *model) { return model->begun ? model->first + model->sample * PERIOD : model->time; }
 
+/* There is nothing to begin with before a feature is seen. */
+static int waits(const Model *model)
+{
+    for (size_t i = 0; i < N_FEATURES; i++) {
+        if (model->values[OFFSET_SEEN + i] != 0.0) return 0;
+    }
+    return !model->begun;
+}
+
 /* Computes x(k+1) and y(k) for the present inputs; `scratch` has room for all of it. */
 static void compute(Model *model, double *scratch)
 {
@@ -104,7 +113,7 @@ ModelStatus model_get(Model *model, size_t index, double *value)
 {
     if (index >= N_VALUES) return MODEL_NO_SUCH_VARIABLE;
     *value = model->values[index];
-    if (index < N_SETTABLE || !model->touched) return MODEL_OK;
+    if (index < N_SETTABLE || !model->touched || waits(model)) return MODEL_OK;
     if (model->time < instant(model) - SAMPLE_SHARE * PERIOD) return MODEL_OK;
     const ModelStatus status = ensure_known(model);
     if (status == MODEL_OK) *value = model->answers[index - N_SETTABLE];
@@ -120,7 +129,6 @@ static ModelStatus take_sample(Model *model)
     memcpy(model->values + N_SETTABLE, model->answers, sizeof model->answers);
     model->begun = 1;
     model->sample += 1.0;
-    model->touched = 0;
     model->known = 0;
     return MODEL_OK;
 }
@@ -128,10 +136,11 @@ static ModelStatus take_sample(Model *model)
 ModelStatus model_step(Model *model, double step)
 {
     const double end = model->time + step - SAMPLE_SHARE * PERIOD;
-    while (instant(model) < end) {
+    while (instant(model) < end && !waits(model)) {
         const ModelStatus status = take_sample(model);
         if (status != MODEL_OK) return status;
     }
+    model->touched = 0; /* what was set before its end is not of the instant at its end */
     return MODEL_OK;
 }
 

@@ -2,8 +2,9 @@
 
    u(k) = [time, inputs],   x(0) = start(u(0)),   x(k+1), y(k) = step(x(k), u(k))
 
-   At a sampling instant the outputs follow the inputs as soon as one is set; until then, and between the instants, they
-   are those of the last sample. A step makes the samples of the instants from its beginning on and before its end. */
+   The first sample is taken when a feature is seen. At a sampling instant the outputs follow the inputs as soon as one is
+   set; until then, and between the instants, they are those of the last sample. A step makes the samples of the instants
+   from its beginning on and before its end. */
 #ifndef MODEL_H
 #define MODEL_H
 
@@ -20,7 +21,7 @@ typedef struct {
     double first;               /* time of the first sample */
     double sample;              /* k, a whole number */
     int begun;                  /* there is a state */
-    int touched;                /* an input was set after the last sample */
+    int touched;                /* an input was set after the last step */
     int known;                  /* the next three are those of the present inputs */
     double fault;               /* of the step, as the generated code numbers them */
     double next[N_MEMORY];      /* x(k+1) */

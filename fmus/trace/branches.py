@@ -11,7 +11,7 @@ import numpy as np
 
 from servobench.fmus.trace.array import NotTraceable, Traced, as_traced
 from servobench.fmus.trace.faults import frame, note_code
-from servobench.plant.lanes import map_arrays
+from servobench.plant.lanes import map_arrays, take
 
 Tree = TypeVar("Tree")
 _NUMBERS = count()
@@ -45,6 +45,8 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
     """
     if not isinstance(chosen, Traced) or chosen.constant:
         return function(tree, *arguments) if chosen else tree
+    if chosen.ndim:
+        return _side_by_side(chosen, function, tree, *arguments)
     given = leaves_of((tree, arguments))
     places = [k for k, leaf in enumerate(given) if isinstance(leaf, Traced) and not leaf.constant]
     symbols = symbols_like([given[k] for k in places])
@@ -74,6 +76,16 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
         kind = max(as_traced(after[k]).kind, as_traced(before[k]).kind, key="bif".index)
         merged[k] = Traced.of(expression, np.shape(before[k]), kind)
     return with_leaves(tree, merged)
+
+
+def _side_by_side(chosen: Traced, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
+    """Return what `branch` does for each lane by itself."""
+    results = [
+        branch(chosen[lane], function, take(tree, lane), *(take(each, lane) for each in arguments))
+        for lane in np.ndindex(chosen.shape)
+    ]
+    stacked: Tree = map_arrays(lambda *lanes: np.stack(lanes).reshape((*chosen.shape, *lanes[0].shape)), *results)
+    return stacked
 
 
 def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int) -> Tree:

@@ -65,6 +65,9 @@ def record(
             advance = _recorded_step(own, step, inputs, first)
     except NotTraceable as error:
         raise NotTraceable(f"{_place(error)}: {error}") from error
+    except RuntimeError as error:  # of CasADi
+        said = str(error).partition("\n")[0]
+        raise NotTraceable(f"{_place(error)}: CasADi cannot express it ({said})") from error
     return Recorded(begin, advance)
 
 

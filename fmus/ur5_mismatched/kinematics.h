@@ -2,7 +2,7 @@
 #ifndef KINEMATICS_H
 #define KINEMATICS_H
 
-/* q, p -> the ball in the camera frame (3), or m features and which of them are seen (2 m) */
+/* q, p -> the ball in the camera frame or other features, and which of them are seen (2 m) */
 int arm_feature(const double **arg, double **res, int *iw, double *w, int mem);
 /* q, p -> Jacobian of the features, row-major (m x N_JOINTS) */
 int arm_jacobian(const double **arg, double **res, int *iw, double *w, int mem);

@@ -1,4 +1,4 @@
-"""The commands `servobench fmu export | validate | info`."""
+"""The commands `servobench fmu export | ssp | validate | info`."""
 
 from __future__ import annotations
 
@@ -15,9 +15,14 @@ from servobench.harness.cli.terminal import console
 if TYPE_CHECKING:
     from servobench.fmus.product import Product
     from servobench.harness.config.settings import Settings
+    from servobench.harness.run.request import RunRequest
 
 fmu_app = typer.Typer(help="Export an arm or a controller as an FMU; check and show FMUs.", no_args_is_help=True)
 
+PlatformsOption = Annotated[
+    str | None,
+    typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
+]
 FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 
 
@@ -33,10 +38,7 @@ def export(
     robot: RobotOption = "ur5",
     sensing: SensingOption = "position",
     seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
-    platforms: Annotated[
-        str | None,
-        typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
-    ] = None,
+    platforms: PlatformsOption = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
 ) -> None:
@@ -58,6 +60,38 @@ def export(
     console.print(f"{output}: FMI {fmi}, {output.stat().st_size / 1024:.0f} kB, for {names}", soft_wrap=True)
 
 
+@fmu_app.command()
+def ssp(
+    output: Annotated[Path, typer.Option("--output", "-o", help="The .ssp file to write.")],
+    controller: Annotated[str, typer.Option(help="The controller.", autocompletion=completion.controllers)],
+    mismatch: Annotated[str, typer.Option(help="Of the arm: none, factory, moderate, severe, or axes.")] = "none",
+    robot: RobotOption = "ur5",
+    sensing: SensingOption = "position",
+    seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
+    platforms: PlatformsOption = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+) -> None:
+    """Export arm, controller and connections as one system (SSP).
+
+    The reference is the target of the task `target`.
+    """
+    from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
+    from servobench.fmus.ssp import write_loop
+    from servobench.harness.config.settings import ConfigurationError, read_settings
+    from servobench.harness.run.loop_ssp import loop_products
+
+    settings = read_settings(config, assignments or ())
+    request = _request(controller, known_robot(robot), sensing, mismatch, seed, settings)
+    try:
+        chosen = parse_platforms(platforms)
+        plant, regulator, stop = loop_products(request, settings)
+        write_loop(output, plant, regulator, chosen, stop)
+    except (ValueError, OSError, CompilerMissing, CompilationFailed) as error:
+        raise ConfigurationError(str(error)) from error
+    console.print(f"{output}: SSP 1.0, {output.stat().st_size / 1024:.0f} kB, plant and controller", soft_wrap=True)
+
+
 def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Product:
     from servobench.fmus.export import ExportOptions, default_actuation, product
     from servobench.harness.config.robots import find_robot
@@ -74,16 +108,20 @@ def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Produc
 
 def _controller(fmi: int, name: str, robot: str, sensing: str, mismatch: str, seed: int, settings: Settings) -> Product:
     from servobench.fmus.product import check_version
-    from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.controller_fmu import controller_model
-    from servobench.harness.run.request import RunRequest, read_mismatch
 
     check_version(fmi)
-    run = RunRequest(
-        "kinematic", choose_controller(name), "target", read_mismatch(mismatch), seed, robot=robot, sensing=sensing
-    )
-    settings.check_sections([run.controller, "kinematic", "target", "run"])
-    return controller_model(run, settings).product(fmi)
+    return controller_model(_request(name, robot, sensing, mismatch, seed, settings), settings).product(fmi)
+
+
+def _request(controller: str, robot: str, sensing: str, mismatch: str, seed: int, settings: Settings) -> RunRequest:
+    """Return the run of a controller that an FMU is made for, and refuse settings that it does not read."""
+    from servobench.harness.config.registry import choose_controller
+    from servobench.harness.run.request import RunRequest, read_mismatch
+
+    names = "kinematic", choose_controller(controller), "target"
+    settings.check_sections([*names, "run"])
+    return RunRequest(*names, read_mismatch(mismatch), seed, robot=robot, sensing=sensing)
 
 
 @fmu_app.command()

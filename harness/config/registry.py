@@ -86,12 +86,16 @@ def offered(names: Iterable[str]) -> tuple[Offer, ...]:
 
 
 def choose_controller(text: str) -> str:
-    """Return the name of the controller that a user names, or whose place is given, such as ./mine.py:Mine.
+    """Return the name of the controller that a user names, or whose place is given: ./mine.py:Mine, ./mine.fmu.
+
+    An FMU, or a mapping of its names (TOML), is called `fmu:PATH`.
 
     Raises:
         ConfigurationError: there is no such controller, or it cannot be used; one line with file and line number.
     """
-    if text not in (*_OFFERED, *controller_names()) and is_place(text):
+    if text.endswith((".fmu", ".toml")) and not text.startswith(MAPPED):
+        text = f"{MAPPED}{text}"
+    if text not in (*_OFFERED, *controller_names()) and not text.startswith(MAPPED) and is_place(text):
         return offer(read_own(CONTROLLER, text))
     find_controller(text)
     return text
@@ -176,11 +180,19 @@ def installed_plant(name: str) -> PlantEntry:
 
 
 def find_controller(name: str) -> ControllerEntry:
-    """Return the controller called `name`, or the one composed for a name like `mfac+rls` (law + estimator).
+    """Return the controller called `name`, the one composed for a name like `mfac+rls`, or the FMU of `fmu:PATH`.
 
     Raises:
-        ConfigurationError: no such controller, or a third party's that cannot be loaded.
+        ConfigurationError: no such controller, an FMU or mapping that cannot be used, or a third party's that cannot be
+            loaded.
     """
+    if name.startswith(MAPPED):
+        from servobench.harness.config.fmu_controller import mapped_controller  # noqa: PLC0415 - as of plants
+
+        try:
+            return mapped_controller(user_path(name.removeprefix(MAPPED)), name)
+        except ValueError as error:
+            raise ConfigurationError(str(error)) from error
     name = FORMER_NAMES.get(name, name)
     law, plus, estimator = name.partition("+")
     if plus:

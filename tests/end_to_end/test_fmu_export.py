@@ -194,7 +194,7 @@ def test_information_tells_version_platform_and_variables(version):
     for capabilities in information.interfaces.values():
         assert {"cangetandsetfmustate", "canserializefmustate"} < {name.lower() for name in capabilities}
         assert any(name.startswith("providesDirectionalDerivative") for name in capabilities)
-    assert len(information.variables) == (168 if version == 2 else 29)
+    assert len(information.variables) == (171 if version == 2 else 30)
     assert all(variable.unit and variable.description for variable in information.variables) or version == 2
 
 

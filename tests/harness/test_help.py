@@ -41,7 +41,12 @@ def test_commands_come_in_the_order_of_first_use_and_each_takes_one_line_of_80_c
 
 def test_a_group_lists_each_command_in_one_line(monkeypatch, capsys):
     text = shown(monkeypatch, capsys, "fmu", "--help").partition("Commands")[2]
-    assert [line.split()[1] for line in text.splitlines() if line.startswith("│")] == ["export", "validate", "info"]
+    assert [line.split()[1] for line in text.splitlines() if line.startswith("│")] == [
+        "export",
+        "ssp",
+        "validate",
+        "info",
+    ]
 
 
 @pytest.mark.parametrize("option", ["-h", "--help"])

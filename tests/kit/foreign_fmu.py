@@ -110,10 +110,10 @@ def describe_with(version: int, old: str, new: str) -> str:
 
 
 @cache
-def library(version: int) -> bytes:
+def library(version: int, name: str = "crane") -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        target = Path(folder) / "crane.so"
-        arguments = ["-shared", "-fPIC", "-O1", str(SOURCES / f"crane{version}.c"), "-o", str(target), "-lm"]
+        target = Path(folder) / f"{name}.so"
+        arguments = ["-shared", "-fPIC", "-O1", str(SOURCES / f"{name}{version}.c"), "-o", str(target), "-lm"]
         subprocess.run([shutil.which("cc") or "gcc", *arguments], check=True)
         return target.read_bytes()
 
@@ -125,6 +125,34 @@ def build_crane(path: Path, version: int, *, folder: str | None = None, descript
         # Without the time: equal content is unpacked once.
         archive.writestr(zipfile.ZipInfo("modelDescription.xml"), description or describe(version))
         archive.writestr(zipfile.ZipInfo(f"binaries/{place}/crane{this_platform().suffix}"), library(version))
+    return path
+
+
+def build_pilot(path: Path) -> Path:
+    """Write a foreign controller of the crane, of FMI 2, with names of its own, to `path`."""
+    reals = [(f"{name}.{part}", causality) for name, causality in
+             (("goal", "input"), ("hook", "input"), ("angle", "input"), ("rate", "output"))
+             for part in ("slew", "luff")]  # fmt: skip
+    rows = [
+        f'<ScalarVariable name="{name}" valueReference="{k}" causality="{causality}"><Real/></ScalarVariable>'
+        for k, (name, causality) in enumerate(reals)
+    ]
+    common = 'causality="parameter" variability="tunable"'
+    rows.append(f'<ScalarVariable name="gain" valueReference="8" {common}><Real start="2"/></ScalarVariable>')
+    rows += [
+        f'<ScalarVariable name="clear.{part}" valueReference="{20 + k}" causality="input" variability="discrete">'
+        "<Boolean/></ScalarVariable>"
+        for k, part in enumerate(("slew", "luff"))
+    ]
+    description = (
+        '<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="Pilot" guid="y">'
+        f'<CoSimulation modelIdentifier="pilot"/><ModelVariables>{"".join(rows)}</ModelVariables>'
+        "<ModelStructure/></fmiModelDescription>"
+    )
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(zipfile.ZipInfo("modelDescription.xml"), description)
+        file = f"binaries/{this_platform().folder(2)}/pilot{this_platform().suffix}"
+        archive.writestr(zipfile.ZipInfo(file), library(2, "pilot"))
     return path
 
 

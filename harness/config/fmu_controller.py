@@ -1,0 +1,255 @@
+"""Any FMI 2 or FMI 3 co-simulation FMU as a controller, by a mapping of names; no code is needed.
+
+    file = "mine.fmu"                       # beside the TOML file
+    outputs = ["qd_cmd[1]", "qd_cmd[2]"]
+    joints = ["q"]
+    features = ["image_point"]
+    reference = ["target"]
+
+Without a mapping, variables are looked for under the names that exported controllers have. In each period the inputs
+are written, a step of one period is taken, and the outputs are read.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple, final
+
+import numpy as np
+from annotated_types import MinLen
+
+from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
+from servobench.harness.config.builds import NoSettings
+from servobench.plant.checks import FloatArray
+from servobench.plant.faults import FmuError
+from servobench.plant.files import read_toml
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.description import FmuDescription, Variable, read_description, total_size
+from servobench.plant.fmu.instances import open_instance
+from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
+from servobench.plant.fmu.port import Port
+from servobench.plant.settings import File, Names, Values, nested, override, settings
+from servobench.plant.signals import Command, Observation
+
+CONVENTION: Final[Mapping[str, str]] = {
+    "outputs": "joint_velocity_command",
+    "joints": "joint_position",
+    "features": "feature",
+    "reference": "reference",
+    "seen": "seen",
+    "jacobian": "jacobian",
+}
+NUMERIC: Final = ("Real", "Float64", "Float32", "Integer", "Boolean", "Int32")
+
+
+@settings
+class ControllerMapping:
+    """The roles of an FMU's variables; a name is that of a scalar, an array, or the scalars `name[1]`, `name[2]`."""
+
+    file: File
+    """The .fmu file."""
+    outputs: Annotated[Names, MinLen(1)]
+    """Joint velocity commands, rad/s."""
+    features: Annotated[Names, MinLen(1)]
+    """Inputs for what is measured, in the unit of the plant."""
+    reference: Annotated[Names, MinLen(1)]
+    """Inputs for the desired feature: now, and if there are more at the next instants, row by row."""
+    joints: Names = ()
+    """Inputs for joint positions, rad."""
+    seen: Names = ()
+    """Inputs for which features were measured for this instant: 1 or true, else 0 or false."""
+    jacobian: Names = ()
+    """Outputs with the estimated Jacobian, row-major (m, n), for the log."""
+    parameters: Mapping[str, Values] = nested(dict)
+    """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
+
+
+class FmuControllerState(NamedTuple):
+    """A saved state of an FMU, as bytes."""
+
+    content: bytes
+
+
+@final
+class FmuController(Controller):
+    """u ← fmi…GetReal after fmi…DoStep with what is seen as inputs."""
+
+    def __init__(self, mapping: ControllerMapping, knowledge: RobotKnowledge) -> None:
+        """Extract and load the FMU and look all names up.
+
+        Raises:
+            ValueError: an FMU that cannot be used, or a name or size that does not fit.
+            FmuError: the FMU refused its parameters.
+        """
+        root = extract_fmu(mapping.file)
+        description = read_description(mapping.file, root)
+        self._description = description.resized(structural_sizes(description, mapping.parameters))
+        self._period, self._shape = knowledge.spec.period, (knowledge.spec.m, knowledge.spec.n)
+        self._rows = self._check(mapping, knowledge.preview)
+        values = ((self._description.find(name, "parameters", None), name, each)
+                  for name, each in mapping.parameters.items())  # fmt: skip
+        setters = ((variables[0], setter(variables, name, each, ())) for variables, name, each in values)
+        self._setters = [act for _, act in sorted(setters, key=lambda pair: pair[0].causality != STRUCTURAL)]
+        self._instance = open_instance(self._description, root)
+        weakref.finalize(self, self._instance.close)
+        roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
+        self._given = tuple(bool(names) for names in roles)
+        self._inputs = Port(self._select("inputs", [name for names in roles for name in names]))
+        self._outputs = Port(self._select("outputs", (*mapping.outputs, *mapping.jacobian)))
+        self._write, self._read = self._instance.writer(self._inputs), self._instance.reader(self._outputs)
+        self._advance = self._instance.stepper(self._period)
+        self._fresh = True
+
+    def _check(self, mapping: ControllerMapping, preview: int) -> int:
+        """Return how many rows of the reference it takes, and refuse sizes that do not fit."""
+        (m, n), file = self._shape, self._description.path.name
+        for role, size in (("outputs", n), ("features", m), ("joints", n), ("seen", m), ("jacobian", m * n)):
+            names: Names = getattr(mapping, role)
+            came = total_size(self._select(role, names))
+            if names and came != size:
+                raise ValueError(f"{file}: {role} must name {size} numbers for {n} joints and {m} features, got {came}")
+        for role in ("joints", "features", "seen", "reference"):
+            for variable in self._select(role, getattr(mapping, role)):
+                if variable.causality != "input":
+                    raise ValueError(f"{role} names {variable.name!r}, which is of causality {variable.causality}")
+        came = total_size(self._select("reference", mapping.reference))
+        rows, rest = divmod(came, m)
+        if rest or rows > 1 + preview:
+            raise ValueError(
+                f"{file}: reference must name {m} numbers a row for at most {1 + preview} rows, got {came}; "
+                "run.preview_time says how far it reaches"
+            )
+        return rows
+
+    def _select(self, role: str, names: Sequence[str]) -> tuple[Variable, ...]:
+        return tuple(variable for name in names for variable in self._description.find(name, role, NUMERIC))
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Go through initialisation again; nothing here is random.
+
+        Raises:
+            FmuError: the FMU refused.
+        """
+        del seed
+        if not self._fresh:
+            self._instance.reset()
+        for act in self._setters:
+            act(self._instance, 0)
+        self._instance.start(observation.time)
+        self._fresh = False
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """Return what the FMU answers to this instant.
+
+        Raises:
+            FmuError: the FMU failed, or its answer is not finite.
+        """
+        parts = observation.joint_position, observation.feature, observation.valid, reference[: self._rows]
+        given = [np.ravel(part) for part, wanted in zip(parts, self._given, strict=True) if wanted]
+        self._inputs.values[:] = np.concatenate(given)
+        self._write()
+        self._advance(observation.time)
+        self._read()
+        velocity = self._outputs.values[: self._shape[1]].copy()
+        if not np.isfinite(velocity).all():
+            name = self._description.path.name
+            raise FmuError(f"{name} returned a command that is not finite at {observation.time:g} s")
+        return Command(velocity)
+
+    def estimated_jacobian(self) -> FloatArray | None:
+        """Return the Jacobian that the FMU tells, or None where it tells none, or zeros."""
+        told = self._outputs.values[self._shape[1] :]
+        return told.reshape(self._shape).copy() if told.any() else None
+
+    def save(self) -> FmuControllerState:
+        """Return the state of the FMU.
+
+        Raises:
+            ValueError: it cannot save or serialise its state.
+        """
+        if not self._description.can_serialise:
+            raise ValueError(
+                f"{self._description.path.name} cannot serialise its state (canSerializeFMUstate is false)"
+            )
+        state = self._instance.save()
+        try:
+            return FmuControllerState(self._instance.to_bytes(state))
+        finally:
+            self._instance.free(state)
+
+    def restore(self, state: object) -> None:
+        """Go back to a state that `save` returned.
+
+        Raises:
+            TypeError: not such a state.
+            FmuError: the FMU does not take it.
+        """
+        if not isinstance(state, FmuControllerState):
+            raise TypeError(f"state must come from save, got {type(state).__name__}")
+        handle = self._instance.from_bytes(state.content)
+        try:
+            self._instance.restore(handle)
+        finally:
+            self._instance.free(handle)
+
+
+def mapped_controller(path: Path, name: str) -> ControllerEntry:
+    """Return the entry of the controller called `name`: an FMU, or the one that a mapping (TOML) describes.
+
+    Raises:
+        ValueError: the mapping cannot be used.
+    """
+    mapping = _conventional(path) if path.suffix == ".fmu" else read_controller_mapping(path)
+
+    def build(config: NoSettings, knowledge: RobotKnowledge) -> FmuController:
+        del config
+        try:
+            return FmuController(mapping, knowledge)
+        except FmuError as error:
+            raise ValueError(str(error)) from error
+
+    how = "by the names of exported controllers" if path.suffix == ".fmu" else f"as mapped by {path.name}"
+    return ControllerEntry(name, f"the FMU {mapping.file.name}, {how}", NoSettings, build)
+
+
+def read_controller_mapping(path: Path) -> ControllerMapping:
+    """Read a mapping from a TOML file.
+
+    Raises:
+        ValueError: an unreadable or malformed file, an unknown key, or a value of the wrong kind.
+    """
+    table = read_toml("mapping", path)
+    for key in ("file", "outputs", "features", "reference"):
+        if key not in table:
+            raise ValueError(f"mapping {path}: the key {key!r} is missing")
+    given = ("to be given",)
+    mapping = override(f"mapping {path}", ControllerMapping(path, given, given, given), table)
+    return replace(mapping, file=path.parent / mapping.file)
+
+
+def _conventional(path: Path) -> ControllerMapping:
+    """Return the mapping of an FMU with the names of exported controllers; `seen` and `jacobian` may be missing.
+
+    Raises:
+        ValueError: not an FMU, or without such names.
+    """
+    description = read_description(path, extract_fmu(path))
+    names = {role: (name,) for role, name in CONVENTION.items() if _has(description, name)}
+    lacking = [CONVENTION[role] for role in ("outputs", "features", "reference") if role not in names]
+    if lacking:
+        raise ValueError(
+            f"{path.name} has no {', '.join(lacking)}, as exported controllers have; write a mapping of its names, "
+            f"such as {path.stem}.toml"
+        )
+    return override(f"mapping {path}", ControllerMapping(path, (" ",), (" ",), (" ",)), names)
+
+
+def _has(description: FmuDescription, name: str) -> bool:
+    try:
+        description.find(name, "convention", NUMERIC)
+    except ValueError:
+        return False
+    return True
