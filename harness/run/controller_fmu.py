@@ -22,7 +22,7 @@ from servobench.fmus.controller_export import (
     controller_groups,
 )
 from servobench.fmus.trace.array import NotTraceable
-from servobench.fmus.trace.record import record
+from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten
 from servobench.harness.run.experiment import Experiment, build
@@ -33,6 +33,7 @@ from servobench.plant.faults import RunFault
 from servobench.plant.signals import Observation, trusted_observation
 
 REFERENCE_PERIODS: Final = 200  # of the run inside the FMU, at most
+TOLERANCE: Final = 1e-9
 
 
 def controller_model(request: RunRequest, settings: Settings) -> ControllerModel:
@@ -74,15 +75,34 @@ def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment
         recorded = record(controller.servo, _start, _step, shapes)
     except NotTraceable as error:
         raise ConfigurationError(f"controller {entry.name!r} has no exported form: {error}") from error
+    run = _run(experiment)
+    difference = _difference(recorded, run)
+    if not difference <= TOLERANCE:
+        raise ConfigurationError(
+            f"controller {entry.name!r} has no exported form for this robot and sensing: over a run it would "
+            f"differ from the original by {difference:.1g}, allowed is {TOLERANCE:g}"
+        )
     return ControllerModel(
         name=entry.name,
         summary=entry.summary,
         recorded=recorded,
         groups=controller_groups(spec.n, spec.m, rows, spec.feature_unit),
         period=spec.period,
-        run=_run(experiment),
+        run=run,
         settings="\n".join(f"{key} = {value}" for key, value in flatten(resolved.controller).items()),
     )
+
+
+def _difference(recorded: Recorded, run: ControllerRun) -> float:
+    """Return the largest difference of the recorded outputs from those of a run, as `fmu validate` counts it."""
+    inputs = np.column_stack([run.time, *run.inputs.values()])
+    wanted = np.column_stack(list(run.outputs.values()))
+    state, _ = recorded.start(inputs[0])
+    came = np.empty_like(wanted)
+    for k, row in enumerate(inputs):
+        state, output, _ = recorded.step(state, row)
+        came[k] = np.ravel(output)
+    return float((np.abs(came - wanted) / np.maximum(1.0, np.abs(wanted))).max())
 
 
 def _observation(inputs: Mapping[str, Any]) -> Observation:

@@ -16,7 +16,9 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods, recorded
 from servobench.fmus.validate import validate_fmu
-from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run import controller_fmu
+from servobench.harness.run.request import RunRequest
 
 PERIOD, N, M = 0.05, 6, 3
 METHODS = ["ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac", "ukf_mfac", "rbfnn_mfac"]
@@ -183,3 +185,9 @@ def test_a_controller_without_an_exported_form_is_refused_by_a_line(name, messag
     with pytest.raises(ConfigurationError, match=message) as refused:
         recorded(name)
     assert "\n" not in str(refused.value)
+
+
+def test_an_export_that_would_not_equal_its_original_is_refused(monkeypatch):
+    monkeypatch.setattr(controller_fmu, "TOLERANCE", 0.0)
+    with pytest.raises(ConfigurationError, match="over a run it would differ from the original by .*, allowed is 0"):
+        controller_fmu.controller_model(RunRequest("kinematic", "cfdl_mfac:published", "target", "none", 0), Settings())
