@@ -101,7 +101,7 @@ def _difference(recorded: Recorded, run: ControllerRun) -> float:
     came = np.empty_like(wanted)
     for k, row in enumerate(inputs):
         state, output, _ = recorded.step(state, row)
-        came[k] = np.ravel(output)
+        came[k] = np.asarray(output).reshape(-1)
     return float((np.abs(came - wanted) / np.maximum(1.0, np.abs(wanted))).max())
 
 
