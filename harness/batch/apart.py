@@ -124,14 +124,21 @@ def _choose(choose: Choose, entry: type[ControllerEntry | PlantEntry], word: str
 
 
 def _folder(entry: type[ControllerEntry | PlantEntry], word: str, known: bool) -> Path | None:
-    """Return the folder of the code that a word names; None for what is of this package, and for what is nothing."""
+    """Return the folder of the code that a word names; None for what is of this package, and for what is nothing.
+
+    Raises:
+        ConfigurationError: a path in a home folder that is not known.
+    """
     point = published(entry, word)
     if point is not None:
         return folder_of_module(point.module)
     found = None if known else PLACE.fullmatch(word)
     if found is None:
         return None
-    return user_path(found["file"]).resolve().parent if found["file"] else folder_of_module(found["module"])
+    try:
+        return user_path(found["file"]).resolve().parent if found["file"] else folder_of_module(found["module"])
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
 
 
 def _carry_out(task: Task, bounds: Bounds, hear: Callable[[Any], None]) -> End | None:

@@ -98,7 +98,7 @@ def files(*, parts: bool = False) -> dict[str, bytes]:
     """Return the files of a results folder by name; those of a batch under way, or at its end."""
     keys = {"plant": "kinematic", "controller": "rls", "task": "random", "task_kind": "point_to_point"}
     row = {"run_id": "a", **keys, "mismatch": "moderate", "seed": 0, "status": "completed", "settling_time_s": 0.5}
-    steps = pd.DataFrame({"run_id": ["a", "a"], "time_s": [0.0, 0.05]})
+    steps = pd.DataFrame({"run_id": ["a", "a"], "time_s": [0.0, 0.05], "error_norm": [0.2, 0.1]})
     lost = {"run_id": "b", "seed": 1, "status": "feature_lost", "settling_time_s": None, "reason": "é\n"}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "out"
