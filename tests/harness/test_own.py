@@ -325,6 +325,7 @@ def test_an_import_that_ends_or_hangs_its_process_is_one_line(tmp_path, monkeypa
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_outlives_an_import_that_ends_its_process(tmp_path, monkeypatch, capfd, name):
     monkeypatch.delitem(sys.modules, "mine", raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path))  # before folders of other tests
     write(tmp_path, f"import os\nos._exit(3)\n{WHOLE}")
     assert command(monkeypatch, *COMMANDS[name]) == (1 if name == "check" else 2)
     told = "".join(capfd.readouterr())
