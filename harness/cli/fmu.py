@@ -23,6 +23,7 @@ PlatformsOption = Annotated[
     str | None,
     typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
 ]
+SeedOption = Annotated[int, typer.Option(help="Seed of the run whose robot this is.")]
 FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
 
 
@@ -37,7 +38,7 @@ def export(
     mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
     robot: RobotOption = "ur5",
     sensing: SensingOption = "position",
-    seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
+    seed: SeedOption = 0,
     platforms: PlatformsOption = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
@@ -67,7 +68,7 @@ def ssp(
     mismatch: Annotated[str, typer.Option(help="Of the arm: none, factory, moderate, severe, or axes.")] = "none",
     robot: RobotOption = "ur5",
     sensing: SensingOption = "position",
-    seed: Annotated[int, typer.Option(help="Seed of the run whose robot this is.")] = 0,
+    seed: SeedOption = 0,
     platforms: PlatformsOption = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
