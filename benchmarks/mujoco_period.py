@@ -23,6 +23,7 @@ from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.window import whole
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.catalogue import find_robot
@@ -66,7 +67,7 @@ class BareCalls:
                 mujoco.mj_kinematics(shapes, placed)
                 mujoco.mj_comPos(shapes, placed)
                 mujoco.mj_collision(shapes, placed)
-        self._scene.draw(self._camera, self._model.X_BC)
+        self._scene.draw(self._camera, self._model.X_BC, whole(self._camera))
 
     def close(self) -> None:
         """Free scene and simulation."""

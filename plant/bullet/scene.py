@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from servobench.plant.checks import FloatArray
     from servobench.plant.rendered.detection import ByteArray
     from servobench.plant.rendered.room import Room
+    from servobench.plant.rendered.window import Window
 
 
 def describe_renderer() -> str:
@@ -94,8 +95,10 @@ class BulletScene(Scene):
         )
         return np.array(state[4])
 
-    def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
-        """See `Scene.render`."""
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> tuple[ByteArray, FloatArray]:
+        """See `Scene.render`; TinyRenderer knows no window, so that all is rendered."""
         _, _, rgba, depth, _ = pybullet.getCameraImage(
             camera.width,
             camera.height,
@@ -107,7 +110,8 @@ class BulletScene(Scene):
         )
         # A PyBullet built without numpy returns tuples.
         shape = (camera.height, camera.width)
-        return np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4), np.asarray(depth).reshape(shape)
+        rgba, depth = np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4), np.asarray(depth).reshape(shape)
+        return (rgba, depth) if window is None else (window.cut(rgba), window.cut(depth))
 
     def close(self) -> None:
         """See `Scene.close`."""

@@ -11,6 +11,8 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
@@ -63,6 +65,19 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
         raise ValueError(f"MuJoCo cannot render through {name} ({type(error).__name__}: {why}): {INSTALL}") from error
 
 
+@contextmanager
+def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
+    """Let OpenGL fill no pixel of the current context outside of a rectangle, counted from the lower left corner."""
+    from OpenGL import GL  # noqa: PLC0415 - chooses its platform by what `open_context` has loaded
+
+    GL.glEnable(GL.GL_SCISSOR_TEST)
+    GL.glScissor(left, bottom, width, height)
+    try:
+        yield
+    finally:
+        GL.glDisable(GL.GL_SCISSOR_TEST)
+
+
 @cache
 def missing_renderer() -> str:
     """Return a line about what this machine lacks for images; empty if nothing."""
@@ -76,7 +91,7 @@ def missing_renderer() -> str:
 @cache
 def describe_renderer() -> str:
     """Return which engine computes, and what renders its images."""
-    from OpenGL import GL  # noqa: PLC0415 - chooses its platform by what `open_context` has loaded
+    from OpenGL import GL  # noqa: PLC0415 - as above
 
     if missing_renderer():
         return f"MuJoCo {version('mujoco')}, nothing to render with"
@@ -87,4 +102,4 @@ def describe_renderer() -> str:
     return f"MuJoCo {version('mujoco')}, rendered by {renderer} through {renderer_name().upper()}"
 
 
-__all__ = ["describe_renderer", "missing_renderer", "mujoco", "open_context", "renderer_name"]
+__all__ = ["describe_renderer", "missing_renderer", "mujoco", "open_context", "renderer_name", "scissors"]

@@ -1,7 +1,8 @@
 """What a camera sees of the arm on its table, rendered by MuJoCo through OpenGL.
 
 The bodies are those of the URDF that PyBullet loads. One pass gives colours and depths, without shadows, reflections
-and smoothing, which would cost many times as much on a processor. OpenGL samples pixels in their middle and
+and smoothing, which would cost many times as much on a processor. A window of an image costs less than all of it: parts
+that cannot be seen in it are left out, and no other pixel is filled. OpenGL samples pixels in their middle and
 `servobench.plant.robot.camera` elsewhere, so the camera's frustum is shifted by the difference.
 """
 
@@ -13,10 +14,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.mujoco.engine import mujoco, open_context
+from servobench.plant.mujoco.engine import mujoco, open_context, scissors
 from servobench.plant.mujoco.model import read_urdf
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.urdf import BALL_LINK
+from servobench.plant.rendered.window import Window, whole
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
 LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
 MAX_PARTS = 1000  # that are drawn
+SHOWN, HIDDEN = 0, 5  # groups of parts, of which MuJoCo draws the first three
 COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
 
 
@@ -65,33 +68,48 @@ class MujocoScene(Scene):
         """See `Scene.ball_position`."""
         return np.array(self._data.xpos[self._ball])
 
-    def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> tuple[ByteArray, FloatArray]:
         """See `Scene.render`."""
-        rgb, depth = self.draw(camera, X_BC)
+        rgb, depth = self.draw(camera, X_BC, window or whole(camera))
         # Beyond the floor is black, to be white. A sky of MuJoCo's would stand in front of far things.
         cv2.bitwise_not(rgb, dst=rgb, mask=cv2.inRange(depth, np.zeros(1), np.zeros(1)))
         return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
 
-    def draw(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, npt.NDArray[np.float32]]:
-        """Return colours (h, w, 3) and depths (h, w) as OpenGL has them, with the lowest row first.
+    def draw(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window
+    ) -> tuple[ByteArray, npt.NDArray[np.float32]]:
+        """Return colours (h, w, 3) and depths (h, w) of a window as OpenGL has them, with the lowest row first.
 
         Depths fall from 1 at the near plane to 0 at the far one, where float32 is finest.
         """
+        self._leave_out(camera, X_BC, window)
         mujoco.mjv_updateScene(
             self._model, self._data, self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
         )
         for eye in self._drawn.camera:
             _aim(eye, camera, X_BC)
-        shape, area = (camera.height, camera.width), mujoco.MjrRect(0, 0, camera.width, camera.height)
+        shape, context = (window.bottom - window.top, window.right - window.left), self._context
+        part = (window.left, camera.height - window.bottom, *shape[::-1])
         rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
-        context = self._context
-        with self._gl.as_current():
+        with self._gl.as_current(), scissors(*part):
             if camera.width > context.offWidth or camera.height > context.offHeight:
                 size = max(camera.width, context.offWidth), max(camera.height, context.offHeight)
                 mujoco.mjr_resizeOffscreen(*size, context)
-            mujoco.mjr_render(area, self._drawn, context)
-            mujoco.mjr_readPixels(rgb, depth, area, context)
+            mujoco.mjr_render(mujoco.MjrRect(0, 0, camera.width, camera.height), self._drawn, context)
+            mujoco.mjr_readPixels(rgb, depth, mujoco.MjrRect(*part), context)
         return rgb, depth
+
+    def _leave_out(self, camera: PinholeCamera, X_BC: FloatArray, window: Window) -> None:
+        """Let the parts be drawn whose bounding sphere reaches into the pyramid of rays through a window."""
+        columns, rows = (window.left, window.right), (window.top, window.bottom)
+        (left, top, _), (right, bottom, _) = camera.rays(columns, rows).tolist()
+        inwards = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+        inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
+        centres = (self._data.geom_xpos - X_BC[:3, 3]) @ (X_BC[:3, :3] @ inwards.T)
+        seen = (centres >= -self._model.geom_rbound[:, None]).all(axis=1)
+        self._model.geom_group[:] = np.where(seen, SHOWN, HIDDEN)
 
     def close(self) -> None:
         """See `Scene.close`."""

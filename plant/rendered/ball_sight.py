@@ -12,6 +12,7 @@ from servobench.plant.rendered.detection import ByteArray, Detection, Patch, add
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.sight import Sight
+from servobench.plant.rendered.window import window_around
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.seeds import named_generator
@@ -46,12 +47,20 @@ class DepthCamera:
         """Return to a state of the noise."""
         self._noise, self._colour_noise = copy.deepcopy(state)
 
-    def find(self, X_BC: FloatArray) -> Detection | None:
-        """Return the ball as a camera at X_BC (4, 4) sees it, or None."""
-        rgba, buffer = self._scene.render(self.camera, X_BC)
+    def find(self, X_BC: FloatArray, ball: FloatArray) -> Detection | None:
+        """Return the ball as a camera sees it, or None.
+
+        Args:
+            X_BC: (4, 4), the camera.
+            ball: (3,) [m], where it is in the base frame: no more of the image is rendered than what can show it.
+        """
+        window = window_around(X_BC[:3, :3].T @ (ball - X_BC[:3, 3]), self.radius, self.camera)
+        if window is None:
+            return None
+        rgba, buffer = self._scene.render(self.camera, X_BC, window)
         if self._deviation > 0.0:
             rgba = add_colour_noise(rgba, self._deviation, self._colour_noise)
-        return find_ball(rgba, buffer, self.camera, self.radius, self._sense)
+        return find_ball(rgba, buffer, self.camera, self.radius, self._sense, (window.top, window.left))
 
     def picture(self, X_BC: FloatArray) -> ByteArray:
         """Return what a camera at X_BC (4, 4) sees without noise, with the detected ball marked, (h, w, 3)."""
@@ -77,7 +86,7 @@ class BallSight(Sight[HandEyeModel]):
 
     def see(self, model: HandEyeModel, q: FloatArray) -> FloatArray | None:
         """Return the ball's centre as the sensor sees it, (3,) m, or None."""
-        found = self._eye.find(model.X_BC)
+        found = self._eye.find(model.X_BC, self._scene.ball_position())
         if found is None:
             return None
         found.centre.setflags(write=False)

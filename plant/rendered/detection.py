@@ -60,6 +60,10 @@ class Patch:
     rows: IntArray
     columns: IntArray
 
+    def shifted(self, rows: int, columns: int) -> Patch:
+        """Return the patch so many pixels further down and to the right."""
+        return Patch(self.rows + rows, self.columns + columns)
+
 
 @dataclass(frozen=True, eq=False)
 class Detection:
@@ -174,8 +178,9 @@ def find_ball(
     camera: PinholeCamera,
     radius: float,
     sense: Callable[[FloatArray, Patch], FloatArray] | None = None,
+    corner: tuple[int, int] = (0, 0),
 ) -> Detection | None:
-    """Return the ball in a rendered image, or None where none is seen.
+    """Return the ball in a rendered image, or in a part of one around it, or None where none is seen.
 
     Args:
         rgb: (h, w, 3 or 4).
@@ -183,11 +188,13 @@ def find_ball(
         camera: its intrinsics.
         radius: m, of the ball.
         sense: true to measured depths of a patch, (k,) m each; None for a perfect sensor.
+        corner: row and column [px] of the first pixel; a part touches the ball only where the image ends, too.
     """
     patch = find_patch(rgb)
     if patch is None:
         return None
     depth = camera.metric_depth(buffer[patch.rows, patch.columns])
+    patch = patch.shifted(*corner)
     return locate_ball(patch, depth if sense is None else sense(depth, patch), camera, radius)
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from servobench.plant.rendered.detection import ByteArray
     from servobench.plant.rendered.drives import DriveConfig
     from servobench.plant.rendered.room import Room
+    from servobench.plant.rendered.window import Window
 
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
@@ -36,8 +37,13 @@ class Scene(ABC):
         """Return the ball's centre in the base frame, (3,) m, from the engine's own kinematics."""
 
     @abstractmethod
-    def render(self, camera: PinholeCamera, X_BC: FloatArray) -> tuple[ByteArray, FloatArray]:
-        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1]."""
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> tuple[ByteArray, FloatArray]:
+        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
+
+        With a window only this part of the image, the same pixels as in all of it.
+        """
 
     @abstractmethod
     def close(self) -> None:

@@ -189,7 +189,8 @@ class DepthSight(EyeSight):
 
     def see(self, model: EyeModel, q: FloatArray) -> FloatArray:
         """Return the features as seen now, (m,); `visible` says which are measured."""
-        balls = [self._eye.find(pose) for pose in camera_poses(model, q)]
+        ball = model.target[0] if model.mount == "hand" else model.points(q)[0]
+        balls = [self._eye.find(pose, ball) for pose in camera_poses(model, q)]
         found = np.array([[ball is not None] for ball in balls])
         points = np.array([[NOWHERE if ball is None else ball.centre] for ball in balls])
         return self._measured(points, found, model)

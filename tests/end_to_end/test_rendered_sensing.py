@@ -1,16 +1,21 @@
 """What the camera of the rendered plant sees: the ball, noise, what hides it, table and floor."""
 
+import cv2
 import numpy as np
 import pytest
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
 from servobench.plant.faults import FeatureLost
-from servobench.plant.rendered.detection import find_patch, locate_ball
+from servobench.plant.rendered import ball_sight
+from servobench.plant.rendered.ball_sight import DepthCamera
+from servobench.plant.rendered.detection import RED_RANGE, find_patch, locate_ball
 from servobench.plant.rendered.settings import RenderedConfig
+from servobench.plant.rendered.window import MARGIN, whole, window_around
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
 from servobench.plant.signals import Command
 
+BOXED = RenderedConfig(obstacles=((0.45, 0.05, 0.5, 0.1, 0.1, 0.1),))
 FLANGE_DOWN = np.array([np.pi, -1.6, 1.9, -1.87, -np.pi / 2, 0.0])
 
 
@@ -77,6 +82,63 @@ def test_a_ball_that_is_hidden_at_the_start_is_reported_with_evidence(open_plant
     plant = open_plant(start=FLANGE_DOWN)
     with pytest.raises(FeatureLost, match=r"not visible at the start .* in the camera frame, column and row"):
         plant.reset(0)
+
+
+def looks(scene, eye, count):
+    """Draw poses of arm and camera, half of them with the ball hidden, cut by the border or outside."""
+    rng = np.random.default_rng(5)
+    for _ in range(count):
+        X_BC = MODEL.X_BC.copy()
+        X_BC[:3, 3] += rng.uniform(-0.4, 0.4, 3)
+        scene.place(HOME + rng.uniform(-1.2, 1.2, 6))
+        yield X_BC, window_around(X_BC[:3, :3].T @ (scene.ball_position() - X_BC[:3, 3]), eye.radius, eye.camera)
+
+
+def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_ball(open_scene):
+    scene, seen = open_scene(scenery=True, boxes=BOXED.boxes()), 0
+    eye = DepthCamera(scene, BARE, PinholeCamera(), ur5.BALL_RADIUS)
+    for X_BC, window in looks(scene, eye, 30):
+        images = scene.render(eye.camera, X_BC)
+        patch = find_patch(images[0])
+        if window is None:
+            assert patch is None
+            continue
+        for image, part in zip(images, scene.render(eye.camera, X_BC, window), strict=True):
+            np.testing.assert_array_equal(window.cut(image), part)
+        if patch is not None:
+            seen += 1
+            margins = patch.rows.min() - window.top, patch.columns.min() - window.left
+            margins += window.bottom - 1 - patch.rows.max(), window.right - 1 - patch.columns.max()
+            assert all(MARGIN <= margin <= MARGIN + 3 for margin in margins) or len(patch.rows) < 50
+    assert 5 < seen < 30
+
+
+def test_a_ball_is_found_in_its_window_as_in_the_whole_image(open_scene, monkeypatch):
+    scene, camera, found = open_scene(scenery=False), PinholeCamera(), 0
+    eyes = [DepthCamera(scene, BARE, camera, ur5.BALL_RADIUS) for _ in range(2)]
+    for eye in eyes:
+        eye.reset(3)
+    for X_BC, _ in looks(scene, eyes[0], 30):
+        one = eyes[0].find(X_BC, scene.ball_position())
+        with monkeypatch.context() as patched:
+            patched.setattr(ball_sight, "window_around", lambda *_: whole(camera))
+            other = eyes[1].find(X_BC, scene.ball_position())
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            found += 1
+            np.testing.assert_array_equal(one.centre, other.centre)
+        states = [[part.bit_generator.state for part in eye.save()] for eye in eyes]
+        assert states[0] == states[1]
+    assert 5 < found < 30
+
+
+def test_nothing_in_a_room_but_the_ball_has_its_colour(open_scene):
+    scene, camera = open_scene(scenery=True, boxes=BOXED.boxes()), PinholeCamera()
+    for X_BC, window in looks(scene, DepthCamera(scene, BARE, camera, ur5.BALL_RADIUS), 20):
+        image = np.ascontiguousarray(scene.render(camera, X_BC)[0][..., :3])
+        if window is not None:
+            window.cut(image)[:] = 255
+        assert not cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2HSV), *RED_RANGE).any()
 
 
 def test_table_and_floor_are_in_view(open_scene):

@@ -126,7 +126,7 @@ class Wall(Scene):
     def __init__(self, centre, radius) -> None:
         self.centre, self.radius = np.array(centre), radius
 
-    def render(self, camera, X_BC):
+    def render(self, camera, X_BC, window=None):
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.rays(columns.ravel(), rows.ravel()).reshape(camera.height, camera.width, 3)
         image = np.full((camera.height, camera.width, 3), 200, dtype=np.uint8)
