@@ -182,8 +182,8 @@ class Servo:
         if pairing is None:
             raise ValueError("a predictor needs the pair stage, which looks back")
         exposed, before = pairing.exposed(pair)
-        span = observation.joint_position - pair.past[..., predictor.span, : self.knowledge.spec.n]
-        return Past(pairing.delay(pair), exposed, before, span)
+        window = observation.joint_position - pair.past[..., predictor.window, : self.knowledge.spec.n]
+        return Past(pairing.delay(pair), exposed, before, window)
 
     def _command(
         self, state: ServoState, estimation: EstimationState, ahead: Observation, reference: FloatArray

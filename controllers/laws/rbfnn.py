@@ -72,9 +72,9 @@ class RbfnnLaw(Law[RbfnnState]):
         α = k' Σ ‖e(k+t)‖² / (ε + ‖Σ_t …‖²_F),   0 < k' < 2                    (eq. 23)
 
     All of it counts in steps of s seconds, the step for which the network was trained, and not in control periods of dt
-    seconds: k ± 1 is s later or earlier. The update is an Euler step of an integration, which in continuous time is
-    dW/dt = (k / s) Σ ‖e‖² / (ε + ‖…‖²_F) Σ_t …; in each control period k' = k dt / s of it are made (`update_share`).
-    Command and learning per second therefore do not depend on the control rate. The paper has s = dt.
+    seconds: k ± 1 is s later or earlier. An update of a control period has k' = 1 − (1 − k)^(dt / s), so that those of s
+    seconds remove the share k together (`update_share`). Command and learning per second therefore do not depend on the
+    control rate. The paper has s = dt.
 
     e(k+t) come from `roll_out`; the command uses the new weights. Symbols: e = y_ref − y (..., m) m; q joint position
     (..., n) rad; Ĵ (..., m, n) m/rad; W_j (..., n, N_h); T horizon; α step size;
@@ -204,9 +204,11 @@ def update_share(k: float, period: float, step: float) -> float:
         step: [s].
 
     Returns:
-        k period / step; where a period takes several steps, not more than all of the error, or k.
+        1 − (1 − k)^(period / step): as many updates as a step has periods remove k together. For k of 1 and more, which
+        removes more than all of the error, k period / step, and no more than k.
     """
-    return min(k * in_periods(period, step), max(k, 1.0))
+    steps = in_periods(period, step)
+    return -math.expm1(steps * math.log1p(-k)) if k < 1.0 else min(k * steps, k)
 
 
 def _places(count: int, rate: float) -> FloatArray:

@@ -11,13 +11,12 @@ The motion that is still to come of the commands so far, and the time that it ta
 
     flight = Σ_i (g_{i+1} + … + g_N) dq(k−i),   lead = Σ_i (g_{i+1} + … + g_N) / Σ_i g_i periods
 
-At fast rates an entry of g spans several periods, about `SPAN` in all: dq(k−i) is then the sum over a span, and what is
-left of a command is interpolated within it. A response can also be given: a delay and a first-order lag.
+At fast rates Δq and dq are taken over a window of several periods, about `WINDOW` in all, and each period anew: what a
+joint moves in one period is lost in the steps of its encoder. A response can also be given: a delay and a first-order lag.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +24,8 @@ import numpy as np
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, transposed
 
-SPAN = 0.01  # [s] of an entry of g, and no shorter than a period; steps of encoders spoil shorter ones
-PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of spans of a second; one step of some milliradians outweighs it
+WINDOW = 0.05  # [s] over which motions are compared, and no shorter than a period; steps of encoders spoil shorter ones
+PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some milliradians outweighs it
 PRIOR_GROWTH = 8.1  # [1/s] growth rate of ρ_i, because later responses are less likely
 MAX_EXCITATION = 20.0  # [rad²/s] that is remembered; older excitation is forgotten in proportion
 PREDICTION_TOLERANCE = 0.01  # [rad/s] nothing is learned from smaller errors (0.3 mm at the ball in 0.05 s)
@@ -39,11 +38,12 @@ class JointResponse(NamedTuple):
     Attributes:
         A: (..., N, N), rad², the normal matrix.
         b: (..., N), rad².
-        commands: the commanded joint steps of the last periods, (..., N r, n), rad, the newest first; r periods a span.
+        commands: the commanded joint steps of the last periods, (..., N + w − 1, n), rad, the newest first.
         response: g, (..., N).
-        left: the part of each of these commands that is still to come, (..., N r).
+        left: the part of each of the last N commands that is still to come, (..., N).
         lead: (...) [periods].
-        span: s, of an entry of g.
+        window: w, periods.
+        period: s.
     """
 
     A: FloatArray
@@ -52,25 +52,25 @@ class JointResponse(NamedTuple):
     response: FloatArray
     left: FloatArray
     lead: FloatArray
-    span: float
+    window: int
+    period: float
 
     @classmethod
-    def immediate(cls, length: int, joint_position: FloatArray, period: float, span: int = 1) -> JointResponse:
+    def immediate(cls, length: int, joint_position: FloatArray, period: float, window: int = 1) -> JointResponse:
         """Return the response g₀ of an arm that follows at once and rests.
 
         Args:
-            length: N, spans.
+            length: N, periods.
             joint_position: (..., n), of which only the shape counts.
             period: s.
-            span: r, periods.
+            window: w, periods.
         """
         *lead, n = joint_position.shape
-        time = span * period
-        weights = PRIOR_WEIGHT * time * np.exp(PRIOR_GROWTH * time * np.arange(length))
+        weights = PRIOR_WEIGHT * window**2 * period * np.exp(PRIOR_GROWTH * period * np.arange(length))
         first = np.broadcast_to(np.eye(length)[0], (*lead, length))
-        A, commands = np.broadcast_to(np.diag(weights), (*lead, length, length)), np.zeros((*lead, length * span, n))
-        left = np.zeros((*lead, length * span))
-        state = cls(A, weights[0] * first, commands, first, left, np.zeros(lead), time)
+        A = np.broadcast_to(np.diag(weights), (*lead, length, length))
+        commands = np.zeros((*lead, length + window - 1, n))
+        state = cls(A, weights[0] * first, commands, first, first, np.zeros(lead), window, period)
         return with_response(state, first)
 
     @classmethod
@@ -84,71 +84,59 @@ class JointResponse(NamedTuple):
             length: periods after which nothing is left.
             joint_position: (..., n), of which only the shape counts.
         """
-        lead = joint_position.shape[:-1]
+        *lead, n = joint_position.shape
         left = np.broadcast_to(remaining_share(delay, lag, period, length), (*lead, length))
-        state = cls.immediate(1, joint_position, period, length)
-        return state._replace(left=left, lead=np.full(lead, np.add.reduce(left, axis=-1))[()])
+        arrival = np.full(tuple(lead), np.add.reduce(left, axis=-1))[()]
+        nothing, commands = np.zeros((*lead, 0)), np.zeros((*lead, length, n))
+        return cls(nothing[..., None], nothing, commands, nothing, left, arrival, 1, period)
 
     def command(self, joint_step: FloatArray) -> JointResponse:
         """Return the state after the joint step (..., n), rad, was commanded."""
         return self._replace(commands=pushed(self.commands, joint_step))
 
     def learn(self, joint_step: FloatArray) -> JointResponse:
-        """Return the state after the joint step of the last span, (..., n), rad, unless it was predicted well."""
-        spans = self._spans()
-        error = joint_step - np.vecmat(self.response, spans)
-        return branch(
-            np.vecdot(error, error) >= (PREDICTION_TOLERANCE * self.span) ** 2, _learned, self, joint_step, spans
-        )
+        """Return the state after the joint step of the last window, (..., n), rad, unless it was predicted well."""
+        steps = self._steps()
+        error = joint_step - np.vecmat(self.response, steps)
+        least = PREDICTION_TOLERANCE * self.window * self.period
+        return branch(np.vecdot(error, error) >= least**2, _learned, self, joint_step, steps)
 
     def flight(self) -> FloatArray:
         """Return the joint motion (..., n), rad, that is still to come of the commands so far."""
-        return np.asarray(np.vecmat(self.left, self.commands))
+        return np.asarray(np.vecmat(self.left, self.commands[..., : self.left.shape[-1], :]))
 
-    def _spans(self) -> FloatArray:
-        """Return the commanded steps of each span, (..., N, n), rad."""
-        *lead, count, n = self.commands.shape
-        length = self.response.shape[-1]
-        if count == length:
+    def _steps(self) -> FloatArray:
+        """Return the commanded steps of the windows that end 1 … N periods ago, (..., N, n), rad."""
+        if self.window == 1:
             return self.commands
-        spans: FloatArray = np.add.reduce(self.commands.reshape(*lead, length, count // length, n), axis=-2)
-        return spans
+        sums = np.cumsum(self.commands, axis=-2)
+        first = sums[..., self.window - 1 : self.window, :]
+        later = sums[..., self.window :, :] - sums[..., : -self.window, :]
+        return np.concatenate([first, later], axis=-2)
 
 
-def _learned(state: JointResponse, joint_step: FloatArray, spans: FloatArray) -> JointResponse:
-    weight = spans.shape[-2] / state.commands.shape[-2]  # motions of one span overlap at fast rates
-    A = state.A + weight * (spans @ transposed(spans))
-    b = state.b + weight * np.matvec(spans, joint_step)
-    kept = np.minimum(1.0, MAX_EXCITATION * state.span / A.trace(axis1=-2, axis2=-1))[..., None]
+def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) -> JointResponse:
+    weight = 1.0 / state.window  # windows overlap
+    A = state.A + weight * (steps @ transposed(steps))
+    b = state.b + weight * np.matvec(steps, joint_step)
+    most = MAX_EXCITATION * state.window**2 * state.period
+    kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]
     A, b = kept[..., None] * A, kept * b
     response = np.linalg.solve(A, b[..., None])[..., 0]
-    return with_response(state._replace(A=A, b=b), np.minimum(np.maximum(response, 0.0), MAX_RESPONSE))
+    if state.window == 1:  # in a longer one entries are not found one by one, and limits would move their sum
+        response = np.minimum(np.maximum(response, 0.0), MAX_RESPONSE)
+    return with_response(state._replace(A=A, b=b), response)
 
 
 def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
     """Return the state with another response g, (..., N), and with what follows from it."""
-    length, count = response.shape[-1], state.commands.shape[-2]
-    ahead = np.zeros((*response.shape[:-1], length + 1))  # g_{i+1} + … + g_N for i = 0 … N
-    ahead[..., :-1] = response[..., ::-1].cumsum(axis=-1)[..., ::-1]
-    left = ahead[..., 1:] if count == length else np.vecmat(ahead, _within_spans(length, count // length))
+    length = response.shape[-1]
+    ahead = response[..., ::-1].cumsum(axis=-1)[..., ::-1]  # g_i + … + g_N
+    left = np.zeros_like(ahead)
+    left[..., :-1] = ahead[..., 1:]
     total = ahead[..., 0]
     lead = np.add.reduce(left, axis=-1) / np.maximum(total, 0.5)
-    return state._replace(response=response, left=left, lead=np.minimum(lead, count) * (total > 0.5))
-
-
-@cache
-def _within_spans(length: int, span: int) -> FloatArray:
-    """Return the weights (N + 1, N r) by which what is left is interpolated between spans.
-
-    An entry of g is fitted to all commands of its span, so that the sum up to it is the mean of what is left of them.
-    It is interpolated between the middles of the spans, and moved within each span so that this mean holds.
-    """
-    middles = np.concatenate([[0.0], span * np.arange(length) + (span + 1) / 2])
-    ages = 1.0 + np.arange(length * span)
-    between = np.stack([np.interp(ages, middles, row) for row in np.eye(length + 1)])
-    mean = between.reshape(length + 1, length, span).mean(axis=-1)
-    weights: FloatArray = between + np.repeat(np.eye(length + 1)[:, 1:] - mean, span, axis=-1)
-    return weights
+    return state._replace(response=response, left=left, lead=np.minimum(lead, length) * (total > 0.5))
 
 
 def remaining_share(delay: float, lag: float, period: float, length: int) -> FloatArray:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.stages.feature_filter import FeatureFilter
-from servobench.controllers.stages.joint_response import SPAN, JointResponse
+from servobench.controllers.stages.joint_response import WINDOW, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.pairing import whole_periods
 from servobench.plant.checks import FloatArray
@@ -53,13 +53,13 @@ class Past(NamedTuple):
         delay: d, (...), periods.
         exposed: q(k−d), (..., n), rad.
         before: q(k−d) − q(k−d−1), (..., n), rad.
-        span: q(k) − q(k−r), (..., n), rad, over the r periods of a span of the response.
+        window: q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
     """
 
     delay: IntArray
     exposed: FloatArray
     before: FloatArray
-    span: FloatArray
+    window: FloatArray
 
 
 class PredictorState(NamedTuple):
@@ -81,7 +81,7 @@ class Predictor:
     """ŷ, q̂ and lead as above, as far as the aids ask for it.
 
     Attributes:
-        span: r, periods.
+        window: w, periods, of the response.
     """
 
     def __init__(self, aids: AidsConfig, period: float, delays: Delays) -> None:
@@ -93,8 +93,8 @@ class Predictor:
             delays: of a given response.
         """
         self._aids, self._period, self._delays = aids, period, delays
-        self.span = max(1, whole_periods(SPAN, period))
-        self._length = max(1, whole_periods(aids.response_length, period * self.span))
+        self.window = max(1, whole_periods(WINDOW, period))
+        self._length = max(1, whole_periods(aids.response_length, period))
 
     def frozen(self) -> Predictor:
         """Return a stage that goes on from a state of this one and identifies nothing more."""
@@ -110,7 +110,7 @@ class Predictor:
             count = 1 + math.ceil((delays.command_delay + SETTLED_LAGS * delays.lag) / self._period)
             response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
         else:
-            response = JointResponse.immediate(self._length, q, self._period, self.span)
+            response = JointResponse.immediate(self._length, q, self._period, self.window)
         return PredictorState(response, FeatureFilter(y, noise.variance, noise), np.full(y.shape[:-1], -1))
 
     def predict(
@@ -121,7 +121,7 @@ class Predictor:
         bound = q
         if self._aids.response != "ignored":
             if self._aids.response == "identified":
-                response = response.learn(past.span)
+                response = response.learn(past.window)
             bound, lead = q + response.flight(), response.lead
         found = state.filter._replace(feature=observation.feature)
         if self._aids.filter:

@@ -70,40 +70,68 @@ def test_the_response_is_the_regularised_least_squares_of_all_that_was_not_fores
     np.testing.assert_allclose(made.response, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("period", "span"), [(0.05, 1), (0.02, 1), (0.008, 1), (0.004, 1), (0.008, 2), (0.004, 5)])
-def test_the_flight_that_is_found_is_that_of_the_delayed_lag_at_every_rate(period, span):
-    """The arm answers by the closed form of a delay of 0.05 s and a lag of 0.05 s."""
-    rng, count = np.random.default_rng(1), round(0.6 / (span * period))
+def test_motions_of_overlapping_windows_are_fitted_together():
+    """Windows of two periods: Δq and dq are sums over two periods, and each row counts half."""
+    rng, prior, q, commands = np.random.default_rng(4), np.array([1.0, 0.0, 0.0]), [0.0, 0.0], [0.0] * 5
+    made, rows, answers = JointResponse.immediate(3, np.zeros(1), PERIOD, window=2), [], []
+    for _ in range(15):
+        q.append(q[-1] + float(np.array([0.2, 0.5, 0.3]) @ commands[-1:-4:-1]) + 0.003 * rng.choice([-1.0, 1.0]))
+        row = np.array([commands[-i] + commands[-i - 1] for i in (1, 2, 3)])
+        if abs(q[-1] - q[-3] - made.response @ row) >= 0.01 * 2 * PERIOD:
+            rows.append(row)
+            answers.append(q[-1] - q[-3])
+        made = made.learn(np.array([q[-1] - q[-3]]))
+        commands.append(0.05 * rng.normal())
+        made = made.command(np.array([commands[-1]]))
+    U = np.array(rows)
+    rho = 2e-4 * 4 * PERIOD * np.diag(np.exp(8.1 * PERIOD * np.arange(3)))
+    expected = np.linalg.solve(U.T @ U / 2 + rho, U.T @ np.array(answers) / 2 + rho @ prior)
+    np.testing.assert_allclose(made.response, expected, rtol=1e-9)
+
+
+def identified(period, window, encoder_step=0.0):
+    """Return true and found flight, (..., 3), and the found lead [s], at a delay and a lag of 0.05 s in closed form."""
+    rng, count = np.random.default_rng(1), round(0.6 / period)
     true = JointResponse.given(0.05, 0.05, period, round(1.0 / period), np.zeros(3))
-    made, q, past, errors = JointResponse.immediate(count, np.zeros(3), period, span), np.zeros(3), [], []
+    made, q, past, flights = JointResponse.immediate(count, np.zeros(3), period, window), np.zeros(3), [], []
     goal = np.zeros(3)
     for k in range(round(6.0 / period)):
-        past.append(goal - true.flight())  # what is done of the commands up to now
-        if k >= span:
-            made = made.learn(past[-1] - past[-1 - span])
+        reached = goal - true.flight()  # what is done of the commands up to now
+        past.append(encoder_step * np.rint(reached / encoder_step) if encoder_step else reached)
+        if k >= window:
+            made = made.learn(past[-1] - past[-1 - window])
         if k * period > 3.0:
-            errors.append([made.flight() - true.flight(), true.flight()])
+            flights.append([true.flight(), made.flight()])
         if k % round(0.2 / period) == 0:
             speed = rng.uniform(-1.0, 1.0, 3)
         q = q + 0.2 * (speed - q)
         goal, made, true = goal + q * period, made.command(q * period), true.command(q * period)
-    wrong, size = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
-    assert wrong < 0.1 * size
-    assert made.lead * period == pytest.approx(0.1, abs=0.012)
+    wanted, found = np.moveaxis(flights, 1, 0)
+    return wanted, found, made.lead * period
+
+
+@pytest.mark.parametrize(
+    ("period", "window"), [(0.05, 1), (0.02, 1), (0.02, 2), (0.008, 1), (0.008, 6), (0.004, 1), (0.004, 12)]
+)
+def test_the_flight_that_is_found_is_that_of_the_delayed_lag_at_every_rate(period, window):
+    wanted, found, lead = identified(period, window)
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.1 * np.sqrt(np.mean(wanted**2))
+    assert lead == pytest.approx(0.1, abs=0.012)
+
+
+def test_a_window_sees_through_the_steps_of_encoders():
+    """At 250 Hz and steps of 12 bits: a window of 0.05 s finds what exact positions tell; of single periods it is lost."""
+    wanted, found, lead = identified(0.004, 12, 2 * np.pi / 2**12)
+    _, lost, _ = identified(0.004, 1, 2 * np.pi / 2**12)
+    errors = [np.sqrt(np.mean((each - wanted) ** 2)) for each in (found, lost)]
+    assert errors[0] < 0.15 * np.sqrt(np.mean(wanted**2)) < 0.5 * errors[1]
+    assert lead == pytest.approx(0.1, abs=0.012)
 
 
 def filter_at(feature, noise=0.001):
     """Return a filter that starts at a feature."""
     level = NoiseLevel.guess(noise)
     return FeatureFilter(np.asarray(feature, dtype=float), level.variance, level)
-
-
-@pytest.mark.parametrize("span", [1, 2, 5])
-def test_what_is_left_of_the_commands_of_a_span_has_the_mean_that_the_fit_means(span):
-    response = np.random.default_rng(2).uniform(0.0, 0.3, 8)
-    made = with_response(JointResponse.immediate(8, np.zeros(3), 0.004, span), response)
-    left = made.left.reshape(8, span).mean(axis=1)
-    assert left == pytest.approx([response[i + 1 :].sum() for i in range(8)], abs=1e-12)
 
 
 def test_the_filter_is_a_kalman_filter_by_hand():
@@ -178,8 +206,8 @@ class Seeing:
     def predict(self):
         self.estimation = self.stages.update(self.estimation, self.look, np.zeros(M))
         pair, pairing = self.estimation.learned.pair, self.stages.pairing
-        span = self.look.joint_position - pair.past[self.predictor.span, :N]
-        past = Past(pairing.delay(pair), *pairing.exposed(pair), span)
+        window = self.look.joint_position - pair.past[self.predictor.window, :N]
+        past = Past(pairing.delay(pair), *pairing.exposed(pair), window)
         self.state, bound = self.predictor.predict(self.state, A, past, self.look)
         return bound
 

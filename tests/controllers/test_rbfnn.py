@@ -265,9 +265,9 @@ def at_rate(rate, net, **config):
 
 def test_every_update_removes_its_part_of_what_the_updates_of_one_step_remove():
     assert update_share(0.1, 0.05, 0.05) == 0.1
-    assert update_share(0.1, 0.004, 0.05) == pytest.approx(0.008)
-    assert update_share(0.4, 0.1, 0.05) == pytest.approx(0.8)
-    assert update_share(0.4, 1.0, 0.05) == 1.0
+    assert (1.0 - update_share(0.4, 0.01, 0.05)) ** 5 == pytest.approx(1.0 - 0.4)
+    assert update_share(0.4, 0.1, 0.05) == pytest.approx(1.0 - 0.6 * 0.6)
+    assert update_share(1.7, 0.01, 0.05) == pytest.approx(0.34)
     assert update_share(1.7, 1.0, 0.05) == 1.7
 
 

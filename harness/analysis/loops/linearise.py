@@ -66,8 +66,8 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     other.predictor = None if servo.predictor is None else servo.predictor.frozen()
     if pairing is not None:
         pair = estimation.learned.pair
-        span = 0 if servo.predictor is None else servo.predictor.span
-        rows = max(int(pairing.delay(pair)) + 2, span + 1)
+        window = 0 if servo.predictor is None else servo.predictor.window
+        rows = max(int(pairing.delay(pair)) + 2, window + 1)
         learned = estimation.learned._replace(pair=pair._replace(past=pair.past[:rows]))
         estimation = estimation._replace(learned=learned)
     return other, state._replace(estimation=estimation)
