@@ -43,13 +43,14 @@ class BulletSimulation(Simulation):
 
     def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
         """See `Simulation.advance`."""
+        drives = self._drives
+        drives.take(joints, speed)
         for _ in range(steps):
-            joints = self._drives.follow(joints, speed)
             if self._dynamics:
-                joints = self._drives.drive(joints, self._mechanics.body(joints.angle, joints.speed))
+                drives.drive(self._mechanics.body(drives.angle, drives.speed))
             else:
-                joints = self._drives.track(joints)
-        return joints
+                drives.track()
+        return drives.give()
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
         """See `Simulation.overlaps`."""

@@ -60,13 +60,14 @@ class MujocoSimulation(Simulation):
         self._model = _moving(machine)
         self._data = mujoco.MjData(self._model)
         self._shapes, self._boxes = _solid(machine)
-        self._placed = mujoco.MjData(self._shapes)
-        self._drives = Drives(drives, machine.lag, _assumed_inertia(machine), machine.stops)
+        self._placed, self._bodies = mujoco.MjData(self._shapes), self._shapes.geom_bodyid.tolist()
+        body = self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp
+        self._drives = Drives(drives, machine.lag, _assumed_inertia(machine), machine.stops, body)
 
     def start(self, angle: FloatArray) -> MujocoState:
         """See `Simulation.start`."""
         data, rest = self._data, np.zeros(self._n)
-        self._set(angle, rest, rest)
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = angle, rest, rest
         data.qfrc_applied[:] = 0.0
         mujoco.mj_step1(self._model, data)
         missing = data.qfrc_bias - data.qfrc_gravcomp
@@ -74,31 +75,30 @@ class MujocoSimulation(Simulation):
 
     def advance(self, joints: MujocoState, speed: FloatArray, steps: int) -> MujocoState:
         """See `Simulation.advance`."""
-        loops, drives = joints.loops, self._drives
+        drives, model, data = self._drives, self._model, self._data
+        drives.take(joints.loops, speed)
         if not self._dynamics:
             for _ in range(steps):
-                loops = drives.track(drives.follow(loops, speed))
-            return MujocoState(loops, joints.acceleration)
-        model, data = self._model, self._data
-        self._set(loops.angle, loops.speed, joints.acceleration)
-        angle, turning, compensation, applied = data.qpos, data.qvel, data.qfrc_gravcomp, data.qfrc_applied
+                drives.track()
+            return MujocoState(drives.give(), joints.acceleration)
+        data.qacc_warmstart[:] = joints.acceleration
+        torque, compensation, applied = drives.torque, data.qfrc_gravcomp, data.qfrc_applied
         for _ in range(steps):
             mujoco.mj_step1(model, data)
-            torque, loops = drives.torque(drives.follow(loops, speed), compensation)
+            drives.step()
             np.subtract(torque, compensation, out=applied)  # MuJoCo adds the compensation itself
             mujoco.mj_step2(model, data)
-            loops = DriveState(angle.copy(), turning.copy(), *loops[2:])
-        return MujocoState(loops, data.qacc_warmstart.copy())
+        return MujocoState(drives.give(), data.qacc_warmstart.copy())
 
     def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
         """See `Simulation.overlaps`."""
-        model, data = self._shapes, self._placed
+        model, data, bodies = self._shapes, self._placed, self._bodies
         data.qpos[:] = angle
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         for pair in data.contact.geom[data.contact.dist <= -MIN_OVERLAP].tolist():
-            first, second = sorted(model.geom_bodyid[pair].tolist())
+            first, second = sorted(bodies[part] for part in pair)
             link = min(second - 1, self._n)  # MuJoCo counts the world as 0, the base as 1
             if first == 0:
                 yield Overlap(link, self._boxes[min(pair)])
@@ -107,11 +107,6 @@ class MujocoSimulation(Simulation):
 
     def close(self) -> None:
         """See `Simulation.close`; MuJoCo frees its memory with the object."""
-
-    def _set(self, angle: FloatArray, speed: FloatArray, acceleration: FloatArray) -> None:
-        """Put the joints into a state."""
-        data = self._data
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = angle, speed, acceleration
 
 
 def _moving(machine: Machine) -> Any:  # noqa: ANN401

@@ -18,8 +18,10 @@ K_p = ω_v/4, ω_i = ω_v/10. Friction is taken implicitly, so that a joint stic
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
 
+import casadi
 import numpy as np
 from scipy.linalg.lapack import dposv
 
@@ -28,6 +30,7 @@ from servobench.plant.robot import ur5
 from servobench.plant.robot.robot import Robot
 from servobench.plant.settings import NonNegative, Positive, Share, settings
 
+SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
 POSITION_SHARE, INTEGRAL_SHARE = (
     0.25,
@@ -125,11 +128,49 @@ class RigidBody(NamedTuple):
     assumed_gravity: FloatArray
 
 
-class Drives:
-    """The cascade of one arm, tuned to its inertia at the start of a run."""
+class InPlace:
+    """A function of CasADi on arrays, which it reads and writes where they are."""
 
     def __init__(
-        self, config: DriveConfig, lag: float, assumed_inertia: FloatArray, stops: tuple[FloatArray, FloatArray]
+        self, function: casadi.Function, arguments: Sequence[FloatArray], results: Sequence[FloatArray]
+    ) -> None:
+        """Take arrays without gaps; no result shares memory with an argument."""
+        self._arrays = *arguments, *results  # that the function points to
+        self._buffer: Any
+        self._buffer, self._evaluate = function.buffer()
+        for i, array in enumerate(arguments):
+            self._buffer.set_arg(i, array.data)
+        for i, array in enumerate(results):
+            self._buffer.set_res(i, array.data)
+
+    def __call__(self) -> None:
+        """Evaluate the function."""
+        self._evaluate()
+
+
+class Drives:
+    """The cascade of one arm, tuned to its inertia at the start of a run.
+
+    The equations are one function of CasADi, which works in arrays: a step of all loops takes a few microseconds, where
+    numpy takes twenty, most of them for calls. Attributes are those arrays, (n,): whoever steps the loops writes the
+    first four and reads the others.
+
+    Attributes:
+        command: [rad/s], commanded speed of the true angles.
+        angle: θ [rad].
+        speed: ω [rad/s].
+        assumed_gravity: ĝ [Nm].
+        torque: T [Nm].
+        drag: friction over speed, times the physics step, h (B + F/max(|ω|, ω_s)) [kg m²].
+    """
+
+    def __init__(
+        self,
+        config: DriveConfig,
+        lag: float,
+        assumed_inertia: FloatArray,
+        stops: tuple[FloatArray, FloatArray],
+        body: tuple[FloatArray, FloatArray, FloatArray] | None = None,
     ) -> None:
         """Compute the gains.
 
@@ -138,11 +179,12 @@ class Drives:
             lag: τ [s], 0 for none.
             assumed_inertia: (n, n) [kg m²] of the links and the assumed load at the start.
             stops: (n,) and (n,) [rad], lower and upper stop of the true angles.
+            body: arrays of the engine to be taken as `angle`, `speed` and `assumed_gravity`; None for own ones.
         """
         n, h = len(assumed_inertia), PHYSICS_STEP
         config.check(n)
         self._lower, self._upper = stops
-        self._blend = -math.expm1(-h / lag) if lag > 0.0 else 1.0
+        blend = np.array([-math.expm1(-h / lag) if lag > 0.0 else 1.0])
         rotor = np.broadcast_to(config.rotor_inertia, n)
         pole = 2 * np.pi * np.broadcast_to(config.velocity_bandwidth, n)
         self._velocity_gain = pole * (np.diagonal(assumed_inertia) + rotor)
@@ -150,66 +192,94 @@ class Drives:
         self._integral_gain = h * INTEGRAL_SHARE * pole * self._velocity_gain
         self._diagonal = np.diag_indices(n)
         self._rotor, self._limit = np.diag(rotor), np.broadcast_to(config.torque_limit, n)
-        self._least = -self._limit
         self._compensation = config.friction_compensation / h
         self._viscous = h * np.broadcast_to(config.viscous_friction, n)
         self._coulomb = h * np.broadcast_to(config.coulomb_friction, n)
+        self.angle, self.speed, self.assumed_gravity = body or (np.zeros(n), np.zeros(n), np.zeros(n))
+        self.command, self.torque, self.drag = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._loops, self._next = np.zeros((3, n)), np.zeros((3, n))
+        moved = blend, self.command, self._loops.ravel()
+        self._follow = InPlace(self._reference_law(n), moved, (self._next.ravel(),))
+        arguments = *moved, self.angle, self.speed, self.assumed_gravity
+        self._step = InPlace(self._law(n), arguments, (self._next.ravel(), self.torque, self.drag))
 
     def start(self, angle: FloatArray, body: RigidBody) -> DriveState:
         """Return joints at rest at `angle` (n,) [rad] whose integrals carry what gravity compensation lacks."""
         rest = np.zeros(len(angle))
         return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity)
 
-    def follow(self, state: DriveState, speed: FloatArray) -> DriveState:
-        """Return the state with the reference one physics step further.
+    def take(self, state: DriveState, command: FloatArray) -> None:
+        """Go on from a state of joints and loops under a command (n,) [rad/s]."""
+        self.command[:], self.angle[:], self.speed[:] = command, state.angle, state.speed
+        self._loops[:] = state[2:]
+
+    def give(self) -> DriveState:
+        """Return the present state, as arrays that never change."""
+        return DriveState(self.angle.copy(), self.speed.copy(), *self._loops.copy())
+
+    def step(self) -> None:
+        """Advance the loops by a physics step: joints stay where they are; `torque` and `drag` are for this step."""
+        self._step()
+        self._loops[:] = self._next
+
+    def track(self) -> None:
+        """Advance by a physics step joints that are exactly where their reference is."""
+        self._follow()
+        self._loops[:] = self._next
+        self.angle[:], self.speed[:] = self._loops[:2]
+
+    def drive(self, body: RigidBody) -> None:
+        """Advance joints and loops by a physics step under the loops' torques.
 
         Args:
-            state: the present state.
-            speed: (n,) [rad/s], commanded, of the true angles.
+            body: what the links and the load ask in the present state.
         """
-        c = state.reference_speed + self._blend * (speed - state.reference_speed)
-        wanted = state.reference + PHYSICS_STEP * c
-        r = np.minimum(np.maximum(wanted, self._lower), self._upper)
-        return DriveState(state.angle, state.speed, r, np.where(r == wanted, c, 0.0), state.integral)
-
-    def track(self, state: DriveState) -> DriveState:
-        """Return the state of joints that are exactly where their reference is."""
-        return state._replace(angle=state.reference, speed=state.reference_speed)
-
-    def torque(self, state: DriveState, assumed_gravity: FloatArray) -> tuple[FloatArray, DriveState]:
-        """Return the torque for one physics step, (n,) [Nm], and the loops after it: joints where they were.
-
-        Args:
-            state: the state whose reference has just been advanced by `follow`.
-            assumed_gravity: ĝ in the state, (n,) [Nm].
-        """
-        behind = np.minimum(np.maximum(state.reference - state.angle, -MAX_FOLLOWING_ERROR), MAX_FOLLOWING_ERROR)
-        error = state.reference_speed + self._position_gain * behind - state.speed
-        friction = self._compensation * self._drag(state.reference_speed) * state.reference_speed
-        asked = self._velocity_gain * error + state.integral + assumed_gravity + friction
-        torque = np.minimum(np.maximum(asked, self._least), self._limit)
-        integral = state.integral + self._integral_gain * error * (asked == torque)
-        return torque, DriveState(state.angle, state.speed, state.angle + behind, state.reference_speed, integral)
-
-    def drive(self, state: DriveState, body: RigidBody) -> DriveState:
-        """Return the state one physics step later under the loops' torques.
-
-        Args:
-            state: the state whose reference has just been advanced by `follow`.
-            body: what the links and the load ask in the state.
-        """
-        torque, after = self.torque(state, body.assumed_gravity)
-        angle, speed, h = state.angle, state.speed, PHYSICS_STEP
-        inertia = body.inertia + self._rotor
-        momentum = inertia @ speed + h * (torque - body.bias)
-        inertia[self._diagonal] += self._drag(speed)
+        self.assumed_gravity[:] = body.assumed_gravity
+        self.step()
+        h, inertia = PHYSICS_STEP, body.inertia + self._rotor
+        momentum = inertia @ self.speed + h * (self.torque - body.bias)
+        inertia[self._diagonal] += self.drag
         speed = dposv(inertia, momentum)[1]
-        moved = angle + h * speed
-        angle_after = np.minimum(np.maximum(moved, self._lower), self._upper)
-        speed = np.where(angle_after == moved, speed, 0.0)
-        return DriveState(angle_after, speed, *after[2:])
+        moved = self.angle + h * speed
+        self.angle[:] = np.minimum(np.maximum(moved, self._lower), self._upper)
+        self.speed[:] = np.where(self.angle == moved, speed, 0.0)
 
-    def _drag(self, speed: FloatArray) -> FloatArray:
-        """Return friction over speed, times the physics step, at speeds (n,) [rad/s], (n,) [kg m²]."""
-        drag: FloatArray = self._viscous + self._coulomb / np.maximum(np.abs(speed), STICKING_SPEED)
-        return drag
+    def _reference_law(self, n: int) -> casadi.Function:
+        """Return (blend, u, loops) -> loops with the reference one physics step further."""
+        arguments = blend, u, loops = _symbols(blend=1, u=n, loops=3 * n)
+        r, c, z = casadi.vertsplit(loops, n)
+        return casadi.Function("reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)])
+
+    def _law(self, n: int) -> casadi.Function:
+        """Return (blend, u, loops, θ, ω, ĝ) -> loops a physics step later, torque and drag for this step."""
+        arguments = _symbols(blend=1, u=n, loops=3 * n, theta=n, omega=n, gravity=n)
+        blend, u, loops, theta, omega, gravity = arguments
+        r, c, z = casadi.vertsplit(loops, n)
+        r, c = self._followed(blend, u, r, c)
+        behind = casadi.fmin(casadi.fmax(r - theta, -MAX_FOLLOWING_ERROR), MAX_FOLLOWING_ERROR)
+        e = c + self._position_gain * behind - omega
+        friction = self._compensation * self._drag(c) * c
+        asked = self._velocity_gain * e + z + gravity + friction
+        torque = casadi.fmin(casadi.fmax(asked, -self._limit), self._limit)
+        z = z + self._integral_gain * e * (asked == torque)
+        after = casadi.vertcat(theta + behind, c, z)
+        return casadi.Function("step", arguments, [after, torque, self._drag(omega)])
+
+    def _followed(self, blend: SX, u: SX, r: SX, c: SX) -> tuple[SX, SX]:
+        """Return the reference r and its speed c one physics step further; it stops at the stops.
+
+        `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would cancel what then cancels.
+        """
+        c = c + blend * (u - c)
+        wanted = r + PHYSICS_STEP * c
+        r = casadi.fmin(casadi.fmax(wanted, self._lower), self._upper)
+        return r, casadi.if_else(r == wanted, c, 0.0)
+
+    def _drag(self, speed: SX) -> SX:
+        """Return friction over speed, times the physics step."""
+        return self._viscous + self._coulomb / casadi.fmax(casadi.fabs(speed), STICKING_SPEED)
+
+
+def _symbols(**sizes: int) -> list[SX]:
+    """Return symbols of CasADi by name with their sizes."""
+    return [casadi.SX.sym(name, size) for name, size in sizes.items()]

@@ -27,14 +27,15 @@ def drives(config=FREE, lag=0.0, stops=WIDE) -> Drives:
 
 
 def run(joints: Drives, state: DriveState, command, steps, load=body) -> DriveState:
+    joints.take(state, np.asarray(command))
     for _ in range(steps):
-        state = joints.drive(joints.follow(state, np.asarray(command)), load())
-    return state
+        joints.drive(load())
+    return joints.give()
 
 
 def test_the_first_step_is_that_of_the_equations():
     joints, command = drives(), np.array([0.3, 0.0])
-    state = joints.drive(joints.follow(joints.start(np.zeros(2), body()), command), body())
+    state = run(joints, joints.start(np.zeros(2), body()), command, 1)
     h, pole = PHYSICS_STEP, 2 * np.pi * 2.0
     reference = h * command
     error = command + pole / 4 * reference
@@ -45,12 +46,12 @@ def test_the_first_step_is_that_of_the_equations():
 
 
 def test_the_reference_is_the_first_order_lag_of_the_command():
-    joints, state = drives(lag=0.08), drives().start(np.zeros(2), body())
-    decay, command = np.exp(-PHYSICS_STEP / 0.08), np.array([0.4, -0.2])
+    joints, decay, command = drives(lag=0.08), np.exp(-PHYSICS_STEP / 0.08), np.array([0.4, -0.2])
+    joints.take(joints.start(np.zeros(2), body()), command)
     for k in range(1, 40):
-        state = joints.track(joints.follow(state, command))
+        joints.track()
         moved = PHYSICS_STEP * (k - decay * (1 - decay**k) / (1 - decay))
-        np.testing.assert_allclose(state.angle, command * moved, atol=1e-14)
+        np.testing.assert_allclose(joints.angle, command * moved, atol=1e-14)
 
 
 def test_joints_at_rest_stay_where_gravity_is_misjudged_at_the_start():
@@ -103,6 +104,15 @@ def test_friction_takes_more_torque_in_proportion_unless_it_is_compensated():
 
     assert lost(0.0) == pytest.approx(0.8, rel=1e-6)
     assert lost(0.75) == pytest.approx(0.2, rel=1e-6)
+
+
+def test_a_state_that_was_given_is_a_value_that_drives_go_on_from():
+    joints = drives(lag=0.03)
+    early = run(joints, joints.start(np.zeros(2), body()), (0.5, -0.1), 20)
+    kept = [part.copy() for part in early]
+    late = run(joints, early, (0.2, 0.4), 30)
+    np.testing.assert_array_equal(kept, early)
+    np.testing.assert_array_equal(run(drives(lag=0.03), early, (0.2, 0.4), 30), late)
 
 
 def test_joints_stop_at_their_stops_and_come_back():
