@@ -1,8 +1,9 @@
 """What a period of the `mujoco` plant costs over the render and physics calls it needs, and beside one of `bullet`.
 
 All are measured in the same run, in turns: a whole `Bench.step` of `mujoco`; the calls of MuJoCo in it, which are the
-physics steps, contact, and one image with its depths from the same camera; the two largest parts of a step; and, where
-PyBullet is installed, a whole `Bench.step` of `bullet`, whose bare calls are in `bullet_period.py`.
+physics steps, contact, and one image with its depths from the same camera, once whole, as whoever calls MuJoCo takes
+it, and once the ball's window alone, as the plant takes it; the two largest parts of a step; and, where PyBullet is
+installed, a whole `Bench.step` of `bullet`, whose bare calls are in `bullet_period.py`.
 """
 
 from __future__ import annotations
@@ -23,17 +24,18 @@ from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.rendered.window import whole
+from servobench.plant.rendered.window import Window, whole, window_around
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.plant.robot.ur5 import BALL_RADIUS, nominal_ur5
 from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]
 KINDS = (
     "bare calls",
+    "bare calls with the ball's window alone",
     "`Bench.step`",
     "of it: drives and physics",
     "of it: image, its noise and detection",
@@ -54,8 +56,8 @@ class BareCalls:
         self._simulation.start(HOME)
         self._scene.place(HOME)
 
-    def period(self) -> None:
-        """Carry out a period."""
+    def period(self, window: Window) -> None:
+        """Carry out a period with a window of the image."""
         model, data = self._simulation._model, self._simulation._data
         shapes, placed = self._simulation._shapes, self._simulation._placed
         data.qpos[:], data.qvel[:] = HOME, 0.0
@@ -67,7 +69,15 @@ class BareCalls:
                 mujoco.mj_kinematics(shapes, placed)
                 mujoco.mj_comPos(shapes, placed)
                 mujoco.mj_collision(shapes, placed)
-        self._scene.draw(self._camera, self._model.X_BC, whole(self._camera))
+        self._scene.draw(self._camera, self._model.X_BC, window)
+
+    def windows(self) -> tuple[Window, Window]:
+        """Return the window of the whole image, and that around the ball."""
+        ball = self._model.to_camera(self._scene.ball_position())
+        around = window_around(ball, BALL_RADIUS, self._camera)
+        if around is None:
+            raise RuntimeError("the ball is not in the image")
+        return whole(self._camera), around
 
     def close(self) -> None:
         """Free scene and simulation."""
@@ -76,7 +86,7 @@ class BareCalls:
 
 
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
-    """Return the times of `KINDS`, (4 or 5, repeats) ms; without PyBullet the last one is missing."""
+    """Return the times of `KINDS`, (5 or 6, repeats) ms; without PyBullet the last one is missing."""
     setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
     plants = [build_mujoco(config, setup)]
     if find_spec("pybullet") is not None:
@@ -86,12 +96,13 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     for plant in plants:
         plant.reset(0)
     world, steps = plants[0].world, whole_steps(PERIOD, PHYSICS_STEP)
-    times = np.empty((3 + len(plants), repeats))
+    times, windows = np.empty((4 + len(plants), repeats)), bare.windows()
     for k in range(repeats):
         speed = 0.2 * np.sin(0.3 * k) * np.ones(6)
-        whole = [partial(plant.step, Command(speed)) for plant in plants]
+        whole_periods = [partial(plant.step, Command(speed)) for plant in plants]
         motion = partial(world._simulation.advance, world._joints, speed, steps)
-        for row, call in enumerate((bare.period, whole[0], motion, world.see, *whole[1:])):
+        bares = [partial(bare.period, window) for window in windows]
+        for row, call in enumerate((*bares, whole_periods[0], motion, world.see, *whole_periods[1:])):
             times[row, k] = milliseconds(call)
     for plant in plants:
         plant.close()
