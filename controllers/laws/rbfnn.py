@@ -72,9 +72,9 @@ class RbfnnLaw(Law[RbfnnState]):
         α = k' Σ ‖e(k+t)‖² / (ε + ‖Σ_t …‖²_F),   0 < k' < 2                    (eq. 23)
 
     All of it counts in steps of s seconds, the step for which the network was trained, and not in control periods of dt
-    seconds: k ± 1 is s later or earlier. An update of a control period has k' = 1 − (1 − k)^(dt / s), so that those of s
-    seconds remove the share k together (`update_share`). Command and learning per second therefore do not depend on the
-    control rate. The paper has s = dt.
+    seconds: k ± 1 is s later or earlier. An update of a control period has k' = 1 − (1 − k)^(dt / s), so that those of
+    s seconds remove the share k together (`update_share`). Command and learning per second therefore do not depend on
+    the control rate. The paper has s = dt.
 
     e(k+t) come from `roll_out`; the command uses the new weights. Symbols: e = y_ref − y (..., m) m; q joint position
     (..., n) rad; Ĵ (..., m, n) m/rad; W_j (..., n, N_h); T horizon; α step size;

@@ -12,7 +12,8 @@ The motion that is still to come of the commands so far, and the time that it ta
     flight = Σ_i (g_{i+1} + … + g_N) dq(k−i),   lead = Σ_i (g_{i+1} + … + g_N) / Σ_i g_i periods
 
 At fast rates Δq and dq are taken over a window of several periods, about `WINDOW` in all, and each period anew: what a
-joint moves in one period is lost in the steps of its encoder. A response can also be given: a delay and a first-order lag.
+joint moves in one period is lost in the steps of its encoder. A response can also be given: a delay and a lag of first
+order.
 """
 
 from __future__ import annotations

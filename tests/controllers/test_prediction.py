@@ -120,7 +120,7 @@ def test_the_flight_that_is_found_is_that_of_the_delayed_lag_at_every_rate(perio
 
 
 def test_a_window_sees_through_the_steps_of_encoders():
-    """At 250 Hz and steps of 12 bits: a window of 0.05 s finds what exact positions tell; of single periods it is lost."""
+    """At 250 Hz and steps of 12 bits, a window of 0.05 s finds what is lost in windows of single periods."""
     wanted, found, lead = identified(0.004, 12, 2 * np.pi / 2**12)
     _, lost, _ = identified(0.004, 1, 2 * np.pi / 2**12)
     errors = [np.sqrt(np.mean((each - wanted) ** 2)) for each in (found, lost)]
