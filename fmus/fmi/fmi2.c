@@ -7,7 +7,7 @@
 static void tell(const Instance *instance, fmi2Status status, unsigned category, const char *text)
 {
     const fmi2CallbackFunctions *callbacks = instance->callbacks;
-    if (callbacks->logger == NULL || (status < fmi2Error && (instance->logged & (1u << category)) == 0)) return;
+    if (callbacks->logger == NULL || (status < fmi2Error && (instance->logged & (1U << category)) == 0)) return;
     callbacks->logger(callbacks->componentEnvironment, instance->name, status, log_categories[category], text);
 }
 
@@ -50,13 +50,14 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
     (void)visible;
     if (callbacks == NULL || name == NULL || guid == NULL) return NULL;
     Instance *instance = calloc(1, sizeof *instance);
-    char *copy = malloc(strlen(name) + 1);
+    const size_t size = strlen(name) + 1;
+    char *copy = malloc(size);
     if (instance == NULL || copy == NULL) {
         free(instance);
         free(copy);
         return NULL;
     }
-    instance->name = strcpy(copy, name);
+    instance->name = memcpy(copy, name, size);
     instance->callbacks = callbacks;
     instance->logged = logging ? LOG_ALL : 0;
     if (strcmp(guid, TOKEN) != 0) {

@@ -122,7 +122,7 @@ const char *core_restore(Core *core, const Snapshot *snapshot)
 
 void compose(char text[MESSAGE_SIZE], const char *function, const char *message)
 {
-    snprintf(text, MESSAGE_SIZE, "%s: %s", function, message);
+    (void)snprintf(text, MESSAGE_SIZE, "%s: %s", function, message);
 }
 
 unsigned category_bits(size_t count, const char *const categories[])
@@ -131,7 +131,7 @@ unsigned category_bits(size_t count, const char *const categories[])
     for (size_t i = 0; i < count; i++) {
         unsigned bit = 0;
         for (unsigned k = 0; k < N_CATEGORIES; k++) {
-            if (categories[i] != NULL && strcmp(categories[i], log_categories[k]) == 0) bit = 1u << k;
+            if (categories[i] != NULL && strcmp(categories[i], log_categories[k]) == 0) bit = 1U << k;
         }
         if (bit == 0) return 0;
         bits |= bit;

@@ -143,7 +143,7 @@ int model_next_event(Model *model, char text[MESSAGE_SIZE])
         const int held = model->held[i];
         if (held == model->reported[i]) continue;
         const char *what = held > 0 ? "is held by its upper stop" : held < 0 ? "is held by its lower stop" : "is free";
-        snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, what, model->time);
+        (void)snprintf(text, MESSAGE_SIZE, "joint %d %s at %.9g s", i + 1, what, model->time);
         model->reported[i] = held;
         return 1;
     }
@@ -224,7 +224,7 @@ ModelStatus model_get(Model *model, size_t index, double *value)
 
 void model_set_states(Model *model, const double *states)
 {
-    memcpy(model->values + OFFSET_JOINT_POSITION, states, 2 * N_JOINTS * sizeof(double));
+    memcpy(model->values + OFFSET_JOINT_POSITION, states, sizeof(double) * 2 * N_JOINTS);
     model->stale = STALE_ALL;
 }
 
