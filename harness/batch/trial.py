@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
-from servobench.harness.batch.guard import End, Task, Tell
+from servobench.harness.batch.apart import explain
+from servobench.harness.batch.guard import Task, Tell
 from servobench.harness.batch.pool import Answer, Pool
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.own import folder_of_module
@@ -30,8 +31,8 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.config.source import is_below, place_in_trace
-from servobench.harness.run.ending import TIMED_OUT, Ending
+from servobench.harness.config.source import is_below
+from servobench.harness.run.ending import Ending
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolved import resolve
@@ -134,16 +135,11 @@ def _outcome(word: str, point: EntryPoint, task: Task, future: Future[Answer], p
     if answer.items:
         tried: Tried = answer.items[0]
         return tried
-    why = _why(answer.end, point.module) if answer.end is not None else "it gave no answer"
+    folder = folder_of_module(point.module)
+    why = "it gave no answer"
+    if answer.end is not None:
+        why = explain(answer.end, lambda path: is_below(path, folder), ANSWER_LIMIT)
     return Tried(point.name, fault=f"{word} {point.name!r} ({point.value}) cannot be used: {why}")
-
-
-def _why(end: End, module: str) -> str:
-    folder = folder_of_module(module)
-    place = place_in_trace(end.ending.trace, lambda path: is_below(path, folder))
-    if end.ending.status == TIMED_OUT:
-        return f"{place}no answer after {ANSWER_LIMIT:g} s"
-    return place + end.ending.reason.replace("the run", "it", 1)
 
 
 def _build_controller(name: str, robot: str) -> None:

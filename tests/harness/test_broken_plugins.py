@@ -141,19 +141,20 @@ CONTROLLERS = {
     "got 'a/b'",
     "circle": "a task is called 'circle', too; give the controller another name",
 }
-ENDED = "cannot be used: it killed the process that carried it out: exit code"
+REMEDY = "raise an error instead, so that the other runs go on"
+WAITS = "no answer after 4 s; is there a loop without an end, or something that waits?"
 HARMFUL = {  # what only a process of its own survives
-    "hang": "controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:62: no answer after 4 s",
-    "ends": f"controller 'ends' (some_law:Ends) {ENDED} 3",
-    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:73: it killed the process that "
-    "carried it out: SIGSEGV",
-    "import-ends": f"controller 'import-ends' (some_end:Mine) {ENDED} 0",
-    "import-hangs": "controller 'import-hangs' (some_wait:Mine) cannot be used: site/some_wait.py:3: no answer after "
-    "4 s",
+    "hang": f"controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:62: {WAITS}",
+    "ends": f"controller 'ends' (some_law:Ends) cannot be used: it ended the process with exit code 3; {REMEDY}",
+    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:73: it killed the process by "
+    "SIGSEGV; compiled code wrote or read outside of its memory",
+    "import-ends": "controller 'import-ends' (some_end:Mine) cannot be used: it ended the process with exit code 0; "
+    f"{REMEDY}",
+    "import-hangs": f"controller 'import-hangs' (some_wait:Mine) cannot be used: site/some_wait.py:3: {WAITS}",
 }
 PLANTS = {
     "crashing": "plant crashing: site/some_cell.py:37: ZeroDivisionError: division by zero",
-    "ending": f"plant 'ending' (some_cell:Ends) {ENDED} 5",
+    "ending": f"plant 'ending' (some_cell:Ends) cannot be used: it ended the process with exit code 5; {REMEDY}",
     "needy": "plant 'needy' (some_cell:NEEDY) cannot be used: ",
 }
 UNUSED = {
@@ -258,11 +259,8 @@ def test_a_run_of_it_is_refused_with_the_same_line(told, name):
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("import-ends", "it ended the process with exit code 0; raise an error instead, so that the other runs go on"),
-        (
-            "import-hangs",
-            "site/some_wait.py:3: no answer after 4 s; is there a loop without an end, or something that waits?",
-        ),
+        ("import-ends", f"it ended the process with exit code 0; {REMEDY}"),
+        ("import-hangs", f"site/some_wait.py:3: {WAITS}"),
     ],
 )
 def test_a_run_of_one_whose_import_harms_the_process_is_refused(told, name, why):
