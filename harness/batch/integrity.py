@@ -20,6 +20,7 @@ from servobench.harness.batch.checksums import (
     write_vouched,
     writing,
 )
+from servobench.harness.batch.columns import lacking
 from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
 from servobench.harness.config.settings import ConfigurationError
@@ -225,7 +226,7 @@ def _fault(folder: Path, name: str, sums: Sums | None) -> str | None:
             columns = parquet.common_schema(folder, [name]).names
             for _ in parquet.row_groups(folder, name, columns):
                 pass
-            what = results.lacking(RUNS if name.endswith(RUNS) else STEPS, columns) or None
+            what = lacking("runs" if name.endswith(RUNS) else "steps", columns) or None
         except DamagedFile as error:
             return error.what
     return what

@@ -8,6 +8,7 @@ is not what was written is refused by name: `SHA256SUMS` vouches for all of them
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -31,6 +32,7 @@ from servobench.harness.batch.checksums import (
     write_vouched,
     writing,
 )
+from servobench.harness.batch.columns import refuse_lacking
 from servobench.harness.batch.lock import PARTS, check_empty
 from servobench.harness.batch.manifest_text import decode, encode
 from servobench.harness.config.settings import ConfigurationError
@@ -46,10 +48,6 @@ RUNS = "runs.parquet"
 STEPS = "steps.parquet"
 FAILURES = "failures.log"
 MANIFEST = "manifest.json"
-NEEDED: Final = {
-    RUNS: ("run_id", "plant", "controller", "task", "mismatch", "seed", "status"),
-    STEPS: ("run_id", "time_s", "error_norm"),
-}  # columns of every table
 PART: Final = re.compile(rf"(\d{{8}})\.({re.escape(RUNS)}|{re.escape(STEPS)}|{re.escape(FAILURES)})")
 
 
@@ -150,8 +148,7 @@ def part_names(folder: Path, kind: str, sums: Sums | None) -> list[str]:
 
 def finished_runs(folder: Path) -> list[range]:
     """Return the indices of the runs whose part is there, in order."""
-    indices = part_indices(folder)
-    return [range(begin, begin + parquet.row_count(folder, part_name(begin, RUNS))) for begin in indices]
+    return [range(own, own + parquet.row_count(folder, part_name(own, RUNS))) for own in part_indices(folder)]
 
 
 def is_whole(folder: Path, wanted: int) -> bool:
@@ -159,10 +156,9 @@ def is_whole(folder: Path, wanted: int) -> bool:
     sums = read_sums(folder)
     if any(fault(folder, name, sums) for name in (RUNS, STEPS) if name == RUNS or _expected(folder, name, sums)):
         return False
-    try:
+    with contextlib.suppress(DamagedFile):
         return parquet.row_count(folder, RUNS) >= wanted
-    except DamagedFile:
-        return False
+    return False
 
 
 def collect(folder: Path) -> int:
@@ -212,24 +208,8 @@ def load_runs(folder: Path) -> pd.DataFrame:
     check_folder(folder)
     names = _intact(folder, RUNS)
     runs = parquet.read_tables(folder, names)
-    _refuse_lacking(folder, names[0], RUNS, runs.columns)
+    refuse_lacking(folder / names[0], "runs", runs.columns)
     return runs
-
-
-def lacking(kind: str, columns: Collection[str]) -> str:
-    """Return which columns a table of runs or steps lacks that it needs, as a predicate; empty where it has all."""
-    missing = [name for name in NEEDED[kind] if name not in columns]
-    return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}" if missing else ""
-
-
-def _refuse_lacking(folder: Path, name: str, kind: str, columns: Collection[str]) -> None:
-    """Refuse a table that is none of runs or steps.
-
-    Raises:
-        ConfigurationError: names the table and what it lacks.
-    """
-    if lack := lacking(kind, columns):
-        raise ConfigurationError(f"{folder / name} is no table of {kind.partition('.')[0]}: it {lack}")
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:
@@ -252,9 +232,8 @@ def load_steps(folder: Path, run_ids: list[str] | None = None, columns: Collecti
     check_folder(folder)
     names = _intact(folder, STEPS)
     for name in names:
-        _refuse_lacking(folder, name, STEPS, parquet.common_schema(folder, [name]).names)
-    only = None if run_ids is None else ds.field("run_id").isin(run_ids)
-    steps = parquet.read_tables(folder, names, only, columns)
+        refuse_lacking(folder / name, "steps", parquet.common_schema(folder, [name]).names)
+    steps = parquet.read_tables(folder, names, None if run_ids is None else ds.field("run_id").isin(run_ids), columns)
     if steps.empty:
         raise ConfigurationError(f"{folder} holds no steps: every run ended before its first period")
     return steps
@@ -312,8 +291,7 @@ def _refuse_damaged(folder: Path, names: Sequence[str]) -> None:
     """
     sums = read_sums(folder)
     for name in names:
-        what = fault(folder, name, sums)
-        if what is not None:
+        if (what := fault(folder, name, sums)) is not None:
             raise DamagedFile(folder, name, what)
 
 

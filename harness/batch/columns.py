@@ -1,0 +1,30 @@
+"""The columns without which a table is none of runs or steps, whoever made it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+from servobench.harness.config.settings import ConfigurationError
+
+NEEDED: Final = {
+    "runs": ("run_id", "plant", "controller", "task", "mismatch", "seed", "status"),
+    "steps": ("run_id", "time_s", "error_norm"),
+}
+
+
+def lacking(kind: str, columns: Collection[str]) -> str:
+    """Return which columns a table of runs or steps lacks that it needs, as a predicate; empty where it has all."""
+    missing = [name for name in NEEDED[kind] if name not in columns]
+    return f"lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)}" if missing else ""
+
+
+def refuse_lacking(path: Path, kind: str, columns: Collection[str]) -> None:
+    """Refuse a table that is none of runs or steps.
+
+    Raises:
+        ConfigurationError: names the table and what it lacks.
+    """
+    if lack := lacking(kind, columns):
+        raise ConfigurationError(f"{path} is no table of {kind}: it {lack}")
