@@ -63,31 +63,20 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 
 
 def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """Return what of the code and the files of users is no longer what two batches have in common; empty if nothing.
+    """Return which file of users is no longer what two batches have in common; empty if none.
 
     Args:
         there: manifest of the folder; what it does not tell counts as unchanged.
         here: manifest of what is asked for.
     """
+    for name, digest in here["files"].items():
+        if there.get("files", {}).get(name, digest) != digest:
+            return str(name)
     for key in SOURCES:
         for name, record in here[key].items():
             if record.get("sha256") != there.get(key, {}).get(name, record).get("sha256"):
-                return f"text of {record['place']}"
-    known = {each["name"]: each for each in there.get("sensings", [])}
-    for each in here["sensings"]:
-        if each.get("sha256") != known.get(each["name"], each).get("sha256"):
-            return f"text of {each['name']}"
-    arms = {each["name"]: _numbers(each) for each in there.get("robots", [])}
-    for each in here["robots"]:
-        if _numbers(each) != arms.get(each["name"], _numbers(each)):
-            return f"arm in {each['name']}"
+                return str(record["place"])
     return ""
-
-
-def _numbers(robot: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the numbers of a robot, as JSON has them."""
-    own = {key: value for key, value in robot.items() if isinstance(value, list)}
-    return dict(json.loads(json.dumps(own)))
 
 
 def _flat(configuration: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -200,7 +200,10 @@ def check_same_campaign(folder: Path, manifest: Mapping[str, Any], observer: Obs
             "name another folder with --out"
         )
     if changed := changed_source(there, manifest):
-        raise ConfigurationError(f"{folder} was begun with another {changed}; name another folder with --out")
+        raise ConfigurationError(
+            f"{folder} was begun with another version of {changed}; name another folder with --out, or bring "
+            "the former one back"
+        )
     for key, what in (("git_commit", "commit"), ("packages", "packages"), ("engines", "engines")):
         if there.get(key) != manifest[key]:
             observer.note(f"note: {folder} was begun with other {what}; later runs may differ")

@@ -10,11 +10,12 @@ from datetime import UTC, datetime
 from typing import Any
 
 from servobench.controllers.controller import ControllerEntry
+from servobench.harness.batch.named_files import named_files
 from servobench.harness.batch.survey import Survey
 from servobench.harness.config.own import digest_of_module
 from servobench.harness.config.registry import Offer, find_plant, published
 from servobench.harness.config.robots import find_robot
-from servobench.harness.config.sensing import find_sensing, sensing_file
+from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
 from servobench.plant.plant import PlantEntry
@@ -65,6 +66,7 @@ def describe_batch(
         "controllers": list(runs.controllers),
         **{key: {each.name: each.record() for each in own if each.word == word} for word, key in OWN.items()},
         "plugins": dict(_plugins(runs)),
+        "files": named_files(runs, configuration, own),
         "tasks": list(runs.tasks),
         "mismatches": list(runs.mismatches),
         "robots": [describe_robot(name) for name in runs.robots],
@@ -97,11 +99,9 @@ def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def describe_sensing(word: str) -> dict[str, Any]:
-    """Return what a manifest says about a sensing set-up: its features, and of a user's file the place and the hash."""
-    found, own = find_sensing(word), sensing_file(word)
-    eye = found.eye
-    source = {} if own is None else {"file": str(own.path), "sha256": own.digest}
-    return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras} | source
+    """Return what a manifest says about a sensing set-up: its features."""
+    eye = find_sensing(word).eye
+    return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras}
 
 
 def describe_robot(name: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ ENTRIES: Final[dict[str, tuple[type, ...]]] = {  # of a manifest: its type, and 
     "created": (str,), "python": (str,), "platform": (str,), "campaign": (str,), "seeds": (str,), "run_count": (int,),
     "plants": (list, str), "controllers": (list, str), "tasks": (list, str), "mismatches": (list, str),
     "robots": (list, dict), "configuration": (dict, dict), "own_controllers": (dict, dict), "packages": (dict,),
-    "engines": (dict,), "side_by_side": (dict, list),
+    "engines": (dict,), "files": (dict, str), "side_by_side": (dict, list),
 }  # fmt: skip
 WORDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "an object"}
 SHOWN: Final = 60  # letters of a wrong value that a message holds

@@ -42,10 +42,15 @@ def sensing_file(word: str) -> SourceFile | None:
     return SourceFile.read(found["file"]) if found is not None and found["file"] else None
 
 
+def sensing_place(word: str) -> str:
+    """Return a word without its mount."""
+    place, _, mount = word.rpartition(":")
+    return place if mount in (FIXED, HAND) else word
+
+
 def _place(word: str) -> tuple[str, re.Match[str] | None]:
     """Return a word without its mount, and the file and the name in it where it is those of a user."""
-    place, _, mount = word.rpartition(":")
-    place = place if mount in (FIXED, HAND) else word
+    place = sensing_place(word)
     return place, PLACE.fullmatch(place)
 
 

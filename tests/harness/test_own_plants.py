@@ -116,22 +116,20 @@ def test_another_text_of_a_plant_is_refused_when_a_folder_is_resumed(tmp_path):
     asked = {"plants": ["./cell.py"], "settings": SHORT, "out": "folder"}
     servobench.compare(["constant"], **asked)
     path.write_text(CELL + "\n# changed\n")
-    with offering(), pytest.raises(ConfigurationError, match=r"begun with another text of \./cell\.py"):
+    with offering(), pytest.raises(ConfigurationError, match=r"begun with another version of cell\.py; name another"):
         servobench.compare(["constant"], resume=True, **asked)
 
 
 def test_what_changed_since_a_batch_began_is_named():
-    def manifest(text="1", arm=0.1, **others):
+    def manifest(text="1", arm="1"):
         plugin = {"place": "some.law:Mine", "distribution": "some 1.0", "sha256": text}
-        robot = {"name": "./arm.toml", "title": text, "tool_m": [arm]}
-        return {"own_controllers": {}, "own_plants": {}, "sensings": [{"name": "pixel"}], "robots": [robot],
-                "plugins": {"mine": plugin}} | others  # fmt: skip
+        return {"own_controllers": {}, "own_plants": {}, "plugins": {"mine": plugin}, "files": {"arm.toml": arm}}
 
     there = json.loads(json.dumps(manifest()))
     assert changed_source(there, manifest()) == ""
     assert changed_source({}, manifest()) == ""
-    assert changed_source(there, manifest(text="2")) == "text of some.law:Mine"
-    assert changed_source(there, manifest(arm=0.2)) == "arm in ./arm.toml"
+    assert changed_source(there, manifest(text="2")) == "some.law:Mine"
+    assert changed_source(there, manifest(arm="2")) == "arm.toml"
 
 
 def test_a_plant_and_a_controller_cannot_share_a_name(tmp_path):

@@ -14,6 +14,8 @@ from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
 from servobench.controllers.units import in_natural_units
 from servobench.harness.batch.manifest import describe_sensing
+from servobench.harness.batch.named_files import named_files
+from servobench.harness.batch.survey import Survey
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.sensing import find_sensing, sensing_names
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -300,7 +302,7 @@ def test_another_text_of_a_set_up_is_refused_when_a_folder_is_resumed(tmp_path, 
     assert servobench.compare(["constant"], resume=True, **asked)["sensing"].tolist() == ["./side.py"]
     file.write_text(OWN.replace('("r", "y", "z")', '("r", "y", "depth")'))
     assert find_sensing("./side.py").eye.features == ("r", "y", "depth")
-    with pytest.raises(ConfigurationError, match=r"folder was begun with another text of \./side\.py; name another"):
+    with pytest.raises(ConfigurationError, match=r"folder was begun with another version of side\.py; name another"):
         servobench.compare(["constant"], resume=True, **asked)
 
 
@@ -310,16 +312,10 @@ def test_a_file_can_bring_a_set_up(tmp_path):
     row = run_experiment(request(f"{file}:hand"), Settings({})).row
     assert row["outcome"] == "settled"
     assert row["sensing"] == f"{file}:hand"
-    told = describe_sensing(f"{file}:hand")
-    assert told == {
-        "name": f"{file}:hand",
-        "features": ["r", "y", "z"],
-        "unit": "m",
-        "cameras": 1,
-        "file": str(file),
-        "sha256": hashlib.sha256(OWN.encode()).hexdigest(),
-    }
-    assert "sha256" not in describe_sensing("stereo:hand")
+    word = f"{file}:hand"
+    assert describe_sensing(word) == {"name": word, "features": ["r", "y", "z"], "unit": "m", "cameras": 1}
+    files = named_files(Survey(sensings={word: None, "stereo:hand": None}), {})
+    assert files == {str(file): hashlib.sha256(OWN.encode()).hexdigest()}
     with pytest.raises(ConfigurationError, match="has no sensing set-up 'OTHER': it defines FROM_THE_SIDE"):
         find_sensing(f"{file}:OTHER")
     (tmp_path / "none.py").write_text("x = 1\n")

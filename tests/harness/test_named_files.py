@@ -1,0 +1,122 @@
+"""The files that a batch reads because a user named them: found, and looked at again when a folder is resumed."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+import servobench
+from servobench.harness.batch.named_files import named_files
+from servobench.harness.batch.survey import Survey
+from servobench.harness.config.neighbours import neighbours
+from servobench.harness.config.registry import offering
+from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.robot import ur5
+
+MINE = """
+import helper
+from laws import gain
+from servobench import Command, Controller
+
+
+class Mine(Controller):
+    def __init__(self, knowledge):
+        self.n = knowledge.spec.n
+
+    def reset(self, observation, seed):
+        pass
+
+    def step(self, observation, reference):
+        return Command([gain.VALUE * helper.SPEED] * self.n)
+
+    def diagnostics(self):
+        return {}
+"""
+CODE = {"mine.py": MINE, "helper.py": "SPEED = 0.01\n", "laws/__init__.py": "", "laws/gain.py": "VALUE = 1.0\n"}
+WAYPOINTS = "time_s,x_m,y_m,z_m\n0,0.4,0.1,1.2\n1,0.4,0.0,1.2\n"
+SHORT = {"exp1": {"duration": 0.2}}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with offering():
+        yield tmp_path
+
+
+def write(files):
+    for name, text in files.items():
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text(text)
+
+
+def copied(name, source):
+    Path(name).write_bytes(Path(source).read_bytes())
+
+
+def robot():
+    copied("arm.yaml", ur5.shipped_calibration())
+    return {"robot": "./arm.yaml", "tasks": ["random"], "settings": {"random": {"duration": 0.2}}}
+
+
+def mismatch():
+    copied("factory.yaml", ur5.shipped_calibration())
+    return {"mismatches": ["factory=./factory.yaml"]}
+
+
+def task():
+    write({"path.csv": WAYPOINTS})
+    return {"tasks": ["waypoints"], "settings": {"waypoints": {"file": "path.csv", "settle": 0.1}}}
+
+
+CASES = {  # what is asked for, and which file changes
+    "robot": (robot, "arm.yaml"),
+    "mismatch": (mismatch, "factory.yaml"),
+    "task": (task, "path.csv"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_folder_is_not_resumed_with_another_version_of_a_file(case):
+    ask, name = CASES[case]
+    refused(["constant"], name, **({"settings": SHORT} | ask()))
+
+
+def test_nor_with_another_version_of_a_module_beside_a_file():
+    write(CODE)
+    refused(["./mine.py"], "helper.py", settings=SHORT)
+    write(CODE)
+    refused(["./mine.py"], "laws/gain.py", resume=True, settings=SHORT)
+
+
+def refused(controllers, name, *, resume=False, **asked):
+    """Begin a folder, or go on with it, and resume it; then change the file `name`."""
+    asked |= {"out": "folder"}
+    begun = servobench.compare(controllers, resume=resume, **asked)
+    resumed = servobench.compare(controllers, resume=True, **asked)
+    assert resumed["run_id"].tolist() == begun["run_id"].tolist()
+    with Path(name).open("a") as file:
+        file.write("\n")
+    line = f"^folder was begun with another version of (\\./)?{name}; name another folder with --out, or bring"
+    with pytest.raises(ConfigurationError, match=line):
+        servobench.compare(controllers, resume=True, **asked)
+
+
+def test_an_fmu_is_looked_at_also_where_a_mapping_names_it():
+    write({"cell/crane.toml": 'file = "../lib/crane.fmu"\n', "lib/crane.fmu": "1", "pilot.fmu": "2"})
+    names = {"fmu:cell/crane.toml": None}, {"fmu:pilot.fmu": None, "constant": None}
+    found = named_files(Survey(plants=names[0], controllers=names[1]), {})
+    assert list(found) == ["cell/crane.toml", "cell/../lib/crane.fmu", "pilot.fmu"]
+    assert found["pilot.fmu"] == hashlib.sha256(b"2").hexdigest()
+
+
+def test_neighbours_are_found_through_packages_and_relative_imports(here):
+    write({
+        "mine.py": "import numpy\nimport a.b\nfrom c import thing\n", "a/__init__.py": "", "a/b.py": "from . import d",
+        "a/d.py": "import mine\n", "a/unused.py": "", "c.py": "if False:\n    import e\n", "e.py": "def broken(:\n",
+        "f.py": "",
+    })  # fmt: skip
+    names = [str(path.relative_to(here)) for path in neighbours(here / "mine.py", here)]
+    assert names == ["a/__init__.py", "a/b.py", "a/d.py", "c.py", "e.py"]
