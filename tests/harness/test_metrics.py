@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -21,6 +22,16 @@ PERIOD = 0.1
 def test_settling_is_the_first_time_after_which_the_error_stays():
     error = np.array([1.0, 0.001, 0.1, *[0.001] * 10])
     assert settling_time(error, 0.005, PERIOD) == pytest.approx(0.3)
+
+
+def test_a_run_within_the_band_from_the_start_on_its_edge_settles_at_once():
+    assert settling_time(np.full(20, 0.005), 0.005, PERIOD) == 0.0
+
+
+def test_the_steady_state_of_periods_of_a_second_is_the_last_one():
+    got = judge_run(straight_move(periods=3).steps(), "point_to_point", evaluate_from=0.0)
+    assert got["steady_state_error"] == 0.0
+    assert got["rms_error"] > 0.0
 
 
 def test_an_error_that_came_in_too_late_or_left_again_has_not_settled():
@@ -119,3 +130,10 @@ def test_a_run_of_one_period_has_no_acceleration_and_no_switch():
 def test_steps_of_a_controller_longer_than_the_period_are_counted():
     got = judge_run(straight_move(milliseconds=(999, 1001, 3000, 1000)).steps(), "curve", evaluate_from=0.0)
     assert got["controller_time_overruns"] == 2
+
+
+def test_where_one_time_is_unknown_no_overruns_are_counted():
+    steps = straight_move().steps()
+    times = np.array([np.nan, 1e9, 1e9, 1e9])
+    got = judge_run(dataclasses.replace(steps, controller_time=times), "curve", evaluate_from=0.0)
+    assert np.isnan(got["controller_time_overruns"])

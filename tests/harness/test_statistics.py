@@ -115,6 +115,18 @@ def test_degenerate_samples_have_no_interval_or_one_of_no_width():
         median_with_interval([1.0, -np.inf])
 
 
+def test_one_value_is_a_sample_of_one_and_no_estimate_is_a_sample_of_none():
+    assert median_with_interval([2.5]).count == 1
+    assert NO_ESTIMATE.count == 0
+    assert f"{Estimate(1.0, 0.5, 1.5, 0):.1f}" == "–"
+
+
+def test_the_interval_of_a_mirrored_sample_is_the_mirrored_interval():
+    sample = np.random.default_rng(4).normal(size=31)
+    drawn, mirrored = median_with_interval(sample), median_with_interval(-sample)
+    assert (mirrored.low, mirrored.value, mirrored.high) == (-drawn.high, -drawn.value, -drawn.low)
+
+
 def test_the_same_seed_gives_the_same_interval_and_another_one_another():
     sample = np.random.default_rng(0).normal(size=30)
     assert median_with_interval(sample, seed=1) == median_with_interval(sample, seed=1)
@@ -172,6 +184,7 @@ def test_equal_pairs_are_no_evidence_and_rounding_makes_no_ranks():
     exact = np.array([1, 1, 1, 0, 0, -1, 1, 1, 2, 1]) / 20
     blurred = exact + 1e-15 * np.arange(10)
     assert signed_rank_p_value(blurred) == signed_rank_p_value(exact)
+    assert signed_rank_p_value(1e-12 * exact) == signed_rank_p_value(exact)
 
 
 def three_controllers():
