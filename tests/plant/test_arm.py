@@ -9,6 +9,7 @@ from servobench.plant.robot.arm import (
     arm_from_dh,
     arm_from_modified_dh,
     rotation_from_rpy,
+    rpy_from_rotation,
 )
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
 from servobench.plant.robot.ur5 import (
@@ -87,6 +88,39 @@ def test_rotations_are_rotations_in_the_urdf_order():
         about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
         expected = elementary("z", yaw)[:3, :3] @ about_y @ elementary("x", roll)[:3, :3]
         np.testing.assert_allclose(R, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize("pitch", [None, np.pi / 2, -np.pi / 2])
+def test_roll_pitch_and_yaw_are_found_again_also_where_the_pitch_is_upright(pitch):
+    rpy = np.random.default_rng(1).uniform(-np.pi, np.pi, (20, 3)) * [1.0, 0.5, 1.0]
+    if pitch is not None:
+        rpy[:, 1] = pitch
+    R = rotation_from_rpy(rpy)
+    found = rpy_from_rotation(R)
+    np.testing.assert_allclose(rotation_from_rpy(found), R, atol=1e-12)
+    if pitch is None:
+        np.testing.assert_allclose(found, rpy, atol=1e-12)
+
+
+def test_arms_with_leading_axes_are_arms_side_by_side():
+    arms = ur5_arm(), odd_arm()
+    names = "translation", "rpy", "joint_offset", "gear_ratio", "tool"
+    both = SerialArm(JOINT_NAMES, *(np.stack([getattr(arm, name) for arm in arms]) for name in names))
+    q = poses(2)
+    for lane, arm in enumerate(arms):
+        np.testing.assert_allclose(both.frames(q)[lane], arm.frames(q[lane]), atol=1e-15)
+        np.testing.assert_allclose(both.ball_jacobian(q)[lane], arm.ball_jacobian(q[lane]), atol=1e-15)
+    cameras = np.stack([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])])
+    with pytest.raises(ValueError, match="X_BC must hold a rotation matrix"):
+        HandEyeModel(both, cameras)
+
+
+def test_what_a_model_hands_out_cannot_be_changed():
+    pose = np.eye(4)
+    model = HandEyeModel(ur5_arm(), pose)
+    pose[0, 3] = 1.0
+    assert model.X_BC[0, 3] == 0.0
+    assert not any(array.flags.writeable for array in (model.X_BC, *model.feature_and_jacobian(np.zeros(6))))
 
 
 def test_offsets_and_gear_ratios_act_on_the_reported_position():
