@@ -24,7 +24,7 @@ from servobench.harness.batch.guard import ALIVE, DONE, ENDED, LOST, START_TIME,
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import CRASHED, TIMED_OUT, Ending
 
-GUARD_START: Final = 120.0  # [s] until a guard has imported servobench
+GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
 GRACE: Final = 30.0  # [s] more than the time limit, after which a guard that says nothing is ended, too
 STOP_TIME: Final = 4.0  # [s] that guards have to end what is below them
 
@@ -149,11 +149,7 @@ class Guarded:
 
     def _give_up(self, status: str, reason: str) -> End:
         """End a guard that is gone or that says nothing any more."""
-        with self._lock:
-            if self._process is not None:
-                self._process.kill()
-                self._process.join()
-            self._process = self._link = None
+        self._drop()
         return End(Ending(status, reason), certain=False, alone=True)
 
     def _start(self) -> Connection:
@@ -175,20 +171,33 @@ class Guarded:
                 process.start()
             self._process = process
         theirs.close()
-        if not _has_started(ours):
-            raise ConfigurationError(
-                "the worker processes cannot be started; a script that starts some must keep its calls below "
-                "`if __name__ == '__main__':`"
-            )
+        if fault := _start_fault(ours):
+            ours.close()
+            self._drop()
+            raise ConfigurationError(fault)
         self._link = ours
         return ours
 
+    def _drop(self) -> None:
+        """End a guard that is gone or of no use, so that nothing waits for it when this process ends."""
+        with self._lock:
+            if self._process is not None:
+                self._process.kill()
+                self._process.join()
+            self._process = self._link = None
 
-def _has_started(link: Connection) -> bool:
-    try:
-        return link.poll(GUARD_START) and link.recv_bytes() == ALIVE
-    except (EOFError, OSError):
-        return False
+
+def _start_fault(link: Connection) -> str:
+    """Wait until a guard has started and return why it has not; empty if it has."""
+    with contextlib.suppress(EOFError, OSError):
+        if not link.poll(GUARD_START):
+            return f"a worker process has not started within {GUARD_START:g} s"
+        if link.recv_bytes() == ALIVE:
+            return ""
+    return (
+        "the worker processes cannot be started; a script that starts some must keep its calls below "
+        "`if __name__ == '__main__':`"
+    )
 
 
 @contextlib.contextmanager
