@@ -325,6 +325,26 @@ def test_diagnostics_tell_the_predicted_error_of_the_plan():
     assert diagnostics["active_limits"] == 0
 
 
+def test_the_predicted_error_is_from_the_reference_at_the_end_of_the_horizon():
+    spec = make_spec(1, 1, speed=100.0)
+    law = make_law(spec, **blocks(4), decay=0.4 / PERIOD)
+    ramp = 0.3 + 0.1 * np.arange(21.0)[:, None]
+    law.command(Estimate(np.array([[1.0]])), observe(spec, feature=[0.2]), ramp)
+    missed = ramp[4, 0] - 0.2 - law.state.plan.moves.sum()
+    assert law.diagnostics()["predicted_terminal_error"] == pytest.approx(abs(missed), rel=1e-12)
+
+
+def test_the_objective_of_a_constant_move_is_that_of_the_least_of_a_parabola():
+    spec = make_spec(4, 3, speed=100.0)
+    law = make_law(spec, mode="constant", **blocks(5))
+    J = random_jacobian(2, 3, 4)
+    law.command(Estimate(J), observe(spec), hold([0.01, 0.02, -0.01]))
+    moved = (law.state.targets * (law.state.plan.moves @ J.T)).sum()
+    assert law.diagnostics()["active_limits"] == 0
+    assert moved > 0.0
+    assert law.diagnostics()["objective"] == pytest.approx(-0.5 * moved, rel=1e-9)
+
+
 def test_settings_that_do_not_fit_the_plant_are_named():
     config = MpcConfig()
     with pytest.raises(ValueError, match=r"preview must reach horizon_time \+ delay = 0.5 s, got 9 rows of 0.05 s"):

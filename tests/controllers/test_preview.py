@@ -31,6 +31,11 @@ def test_periods_that_are_whole_but_for_rounding_are_whole():
     assert in_periods(0.0, 0.02) == 0.0
 
 
+def test_the_rounding_of_many_periods_is_a_share_of_them_and_that_of_one_a_share_of_one():
+    assert in_periods(0.05 * (1e4 + 1e-6), 0.05) == 1e4
+    assert in_periods(0.05 * (1.0 + 1.5e-9), 0.05) != 1.0
+
+
 def test_a_preview_that_does_not_reach_far_enough_is_refused():
     check_preview(0.15, 3, 0.05, "what")
     check_preview(0.05, 3, 0.02, "what")
