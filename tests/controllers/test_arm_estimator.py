@@ -10,6 +10,7 @@ import numpy as np
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmState
 from servobench.controllers.estimators.estimator import Motion
+from servobench.controllers.sight import Sight
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import stack, take
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
@@ -64,6 +65,22 @@ def test_the_jacobian_elsewhere_is_that_of_the_bent_arm() -> None:
     error = np.linalg.norm(estimated - true) / np.linalg.norm(true)
     nominal = np.linalg.norm(nominal_ur5().jacobian(elsewhere) - true) / np.linalg.norm(true)
     assert error < 0.1 * nominal
+
+
+def test_points_move_as_the_bent_arm_moves_them() -> None:
+    def look(q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        y, J = nominal_ur5().feature_and_jacobian(q)
+        return y[..., None, None, :], J[..., None, None, :, :]
+
+    model, q = nominal_ur5(), walk(4, 20)[3]
+    sight = Sight(1, 1, look, lambda _, depth: np.eye(3) * depth[..., None, None])
+    spec = hand_eye_spec(model, 0.05, 1.0, 6.0)
+    arm = ArmEstimator(ArmConfig(), RobotKnowledge(spec, 10, nominal_jacobian=model.jacobian, nominal_sight=sight))
+    state = arm.start(model.jacobian(q))._replace(x=np.concatenate([GEARS, OFFSETS]))
+    np.testing.assert_allclose(arm.motions(state, q), bent_arm().jacobian(q), atol=1e-12)
+    told = arm.diagnostics(state)
+    assert told["largest_offset"] == 0.1
+    assert abs(told["largest_gear_error"] - 0.1) < 1e-12
 
 
 def test_it_starts_as_the_nominal_arm_and_learns_nothing_from_short_ways() -> None:

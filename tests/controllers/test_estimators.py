@@ -146,6 +146,29 @@ def test_sigma_points_have_the_mean_and_covariance_of_the_state():
     np.testing.assert_allclose(points.T @ np.diag(weights.covariance) @ points, np.eye(4), atol=1e-14)
 
 
+def test_the_weights_of_sigma_points_are_those_computed_by_hand():
+    weights = sigma_weights(3, 0.5, 2.0, 1.0)  # spread 0.25 · (3 + 1) = 1
+    assert weights.reach == 1.0
+    assert weights.mean.tolist() == [-2.0, *[0.5] * 6]
+    assert weights.covariance.tolist() == [-2.0 + 1.0 - 0.25 + 2.0, *[0.5] * 6]
+
+
+def test_least_squares_forgets_by_the_time_of_a_motion():
+    dq, dy = np.array([0.1, -0.2]), np.array([0.3])
+    estimator = RlsEstimator(RlsConfig(memory=2.0))
+    begun = estimator.start(np.zeros((1, 2)))
+    for duration in (0.1, 0.5):
+        J, _ = rls_update(begun.J, begun.P, dq, dy, forgetting=np.exp(np.array(-duration / 2.0)))
+        np.testing.assert_array_equal(estimator.update(begun, motion(dq, dy, duration=duration)).J, J)
+
+
+@pytest.mark.parametrize("estimator", LEARNING[:2])
+def test_a_motion_that_is_just_large_enough_is_used(estimator):
+    run = Learning(estimator, np.ones((1, 2)))
+    run.update(motion([0.01, 0.0], [0.5]))
+    assert run.diagnostics()["estimator_updated"] == 1.0
+
+
 @pytest.mark.parametrize("P", [np.diag([1.0, -1.0]), np.diag([1.0, np.nan])])
 def test_a_covariance_that_is_not_positive_definite_is_a_named_fault(P):
     with pytest.raises(FilterDiverged, match="covariance is not"):
@@ -226,6 +249,7 @@ def test_the_true_estimator_answers_with_the_truth_where_the_arm_is():
     estimator = TrueEstimator(TrueConfig(), knowledge)
     run = Learning(estimator, np.zeros((1, 2)))
     np.testing.assert_array_equal(run.jacobian(np.array([2.0, 3.0])), [[4.0, 9.0]])
+    assert estimator.brings_model
 
 
 def test_an_estimator_that_lacks_what_it_needs_is_refused():

@@ -8,6 +8,7 @@ from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimat
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
 from servobench.controllers.estimators.robust import (
     BISQUARE,
+    MEMORY,
     RobustConfig,
     RobustEstimator,
     bisquare_weight,
@@ -96,6 +97,12 @@ def test_an_outlier_in_the_first_frame_is_a_delay_only():
         run.update(motion(dq[k], y[k] - y[k - 1]))
     assert np.linalg.norm(run.jacobian() - J) < 0.03 * np.linalg.norm(J)
     assert np.abs(run.state.deviation).max() < 0.01
+
+
+def test_a_rejected_frame_counts_by_its_time():
+    run = Learning(RobustEstimator(RobustConfig()), np.ones((M, N)))
+    run.update(motion(np.zeros(N), np.full(M, 9.0)))
+    np.testing.assert_allclose(run.state.rejected, 1.0 - np.exp(-0.05 / MEMORY), rtol=1e-12)
 
 
 def test_the_scale_follows_noise_that_is_larger_than_configured():
