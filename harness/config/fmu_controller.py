@@ -27,11 +27,12 @@ from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
 from servobench.plant.files import read_toml
 from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description, total_size
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.fmu.port import Port
-from servobench.plant.settings import File, Names, Values, nested, override, settings
+from servobench.plant.settings import File, Names, Positive, Values, nested, override, settings
 from servobench.plant.signals import Command, Observation
 
 CONVENTION: Final[Mapping[str, str]] = {
@@ -65,6 +66,10 @@ class ControllerMapping:
     """Outputs with the estimated Jacobian, row-major (m, n), for the log."""
     parameters: Mapping[str, Values] = nested(dict)
     """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
+    tolerance: Positive | None = None
+    """[1] relative one of the FMU's own solver; None for what it takes by itself."""
+    debug_log: File | None = None
+    """A file to which all messages of the FMU are appended, with its debug log turned on; None: it is off."""
 
 
 class FmuControllerState(NamedTuple):
@@ -93,7 +98,8 @@ class FmuController(Controller):
                   for name, each in mapping.parameters.items())  # fmt: skip
         setters = ((variables[0], setter(variables, name, each, ())) for variables, name, each in values)
         self._setters = [act for _, act in sorted(setters, key=lambda pair: pair[0].causality != STRUCTURAL)]
-        self._instance = open_instance(self._description, root)
+        asked = Asked(mapping.tolerance, mapping.debug_log)
+        self._instance = open_instance(self._description, root, asked=asked)
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
         self._given = tuple(bool(names) for names in roles)
@@ -174,11 +180,7 @@ class FmuController(Controller):
             raise ValueError(
                 f"{self._description.path.name} cannot serialise its state (canSerializeFMUstate is false)"
             )
-        state = self._instance.save()
-        try:
-            return FmuControllerState(self._instance.to_bytes(state))
-        finally:
-            self._instance.free(state)
+        return FmuControllerState(self._instance.states.save_bytes())
 
     def restore(self, state: object) -> None:
         """Go back to a state that `save` returned.
@@ -189,11 +191,7 @@ class FmuController(Controller):
         """
         if not isinstance(state, FmuControllerState):
             raise TypeError(f"state must come from save, got {type(state).__name__}")
-        handle = self._instance.from_bytes(state.content)
-        try:
-            self._instance.restore(handle)
-        finally:
-            self._instance.free(handle)
+        self._instance.states.restore_bytes(state.content)
 
 
 def mapped_controller(path: Path, name: str) -> ControllerEntry:

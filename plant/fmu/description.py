@@ -71,6 +71,7 @@ class FmuDescription:
         n_states: number of continuous states.
         n_indicators: number of event indicators.
         internal_step: its own fixed step size, s, of which steps must be multiples; None for none.
+        usual_step: that of its default experiment, s; None for none.
     """
 
     path: Path
@@ -87,6 +88,7 @@ class FmuDescription:
     n_states: int = 0
     n_indicators: int = 0
     internal_step: float | None = None
+    usual_step: float | None = None
 
     @cached_property
     def _by_name(self) -> dict[str, Variable]:
@@ -172,15 +174,16 @@ def read_description(path: Path, root: Path) -> FmuDescription:
         exchange=description.coSimulation is None,
         n_states=int(description.numberOfContinuousStates or 0),
         n_indicators=int(description.numberOfEventIndicators or 0),
-        internal_step=_internal_step(root),
+        internal_step=_step(root, "CoSimulation", "fixedInternalStepSize"),
+        usual_step=_step(root, "DefaultExperiment", "stepSize"),
     )
 
 
-def _internal_step(root: Path) -> float | None:
-    """Return the fixed step size of the FMU's own solver, which fmpy does not read."""
-    element = ET.parse(root / DESCRIPTION).getroot().find("CoSimulation")
+def _step(root: Path, tag: str, name: str) -> float | None:
+    """Return a step size, s, that the FMU names, as fmpy does not read all of them."""
+    element = ET.parse(root / DESCRIPTION).getroot().find(tag)
     try:
-        step = float("nan" if element is None else element.get("fixedInternalStepSize", "nan"))
+        step = float("nan" if element is None else element.get(name, "nan"))
     except ValueError:
         return None
     return step if 0.0 < step < math.inf else None

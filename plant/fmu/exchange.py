@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 from servobench.plant.faults import FmuError
+from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import FmuDescription
 
 RELATIVE_TOLERANCE: Final = 1e-8
@@ -23,6 +24,7 @@ class Exchanging(Protocol):
     """The part of an instance of model exchange that is used here."""
 
     description: FmuDescription
+    asked: Asked
 
     def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
         """Call a function of the library and check its status; raises FmuError."""
@@ -129,7 +131,7 @@ class Integrator:
             set_time=self._guarded(lambda now: self._instance.call("SetTime", ctypes.c_double(now))),
             input=_Held(),
             startTime=time,
-            relativeTolerance=RELATIVE_TOLERANCE,
+            relativeTolerance=self._instance.asked.tolerance or RELATIVE_TOLERANCE,
             maxNumSteps=MAX_SOLVER_STEPS,
         )
 

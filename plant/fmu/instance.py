@@ -19,11 +19,13 @@ import numpy.typing as npt
 
 from servobench.plant.checks import FloatArray
 from servobench.plant.faults import FmuError
+from servobench.plant.fmu.asked import NOTHING, Asked
 from servobench.plant.fmu.description import FmuDescription, Variable
 from servobench.plant.fmu.exchange import Integrator
 from servobench.plant.fmu.library import condemn, is_condemned, load_library, unload_library
 from servobench.plant.fmu.messages import MessageLog
 from servobench.plant.fmu.port import Port
+from servobench.plant.fmu.states import States
 
 Call: TypeAlias = Callable[[], None]
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # of numbers: the word in the names of functions, the type in memory
@@ -33,7 +35,7 @@ MIN_PROGRESS = 1e-9  # share of a step that a partial step must cover
 
 
 class Instance(ABC):
-    """One instance of a co-simulation FMU.
+    """One instance of a co-simulation FMU; `states` saves and restores it.
 
     Attributes:
         prefix: of the names of all functions in the library.
@@ -53,13 +55,20 @@ class Instance(ABC):
     early: ClassVar[str]
     derivatives: ClassVar[str]
 
-    def __init__(self, description: FmuDescription, root: Path, library: Any = None) -> None:  # noqa: ANN401 - ctypes
+    def __init__(
+        self,
+        description: FmuDescription,
+        root: Path,
+        library: Any = None,  # noqa: ANN401 - ctypes
+        asked: Asked = NOTHING,
+    ) -> None:
         """Make an instance.
 
         Args:
             description: of the FMU.
             root: folder to which it is extracted.
             library: from `load_library`, which the caller unloads; None: the instance loads one of its own.
+            asked: what the user asks of it.
 
         Raises:
             ValueError: no library for this machine, or one that cannot be loaded.
@@ -67,7 +76,9 @@ class Instance(ABC):
         """
         self.description = description
         self.root = root
-        self.log = MessageLog(description.path.name)
+        self.asked = asked
+        self.states = States(self)
+        self.log = MessageLog(description.path.name, asked.debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
         self._owns_library = library is None
         self._library = load_library(description, root) if library is None else library
@@ -241,34 +252,6 @@ class Instance(ABC):
         """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
         buffers = (*self._row(knowns, 0), *self._row(unknowns, 0))
         self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
-
-    def save(self) -> ctypes.c_void_p:
-        """Return the present state; it has to be given to `free`."""
-        state = ctypes.c_void_p()
-        self.call(f"Get{self.state}", ctypes.byref(state))
-        return state
-
-    def restore(self, state: ctypes.c_void_p) -> None:
-        """Return to a saved state."""
-        self.call(f"Set{self.state}", state)
-
-    def free(self, state: ctypes.c_void_p) -> None:
-        """Free a saved state."""
-        self.call(f"Free{self.state}", ctypes.byref(state))
-
-    def to_bytes(self, state: ctypes.c_void_p) -> bytes:
-        """Return a saved state as bytes that another process understands."""
-        size = ctypes.c_size_t()
-        self.call(f"Serialized{self.state}Size", state, ctypes.byref(size))
-        content = (ctypes.c_char * size.value)()
-        self.call(f"Serialize{self.state}", state, content, size)
-        return bytes(content)
-
-    def from_bytes(self, content: bytes) -> ctypes.c_void_p:
-        """Return a state from bytes; it has to be given to `free`."""
-        state = ctypes.c_void_p()
-        self.call(f"{self.deserialise}{self.state}", content, ctypes.c_size_t(len(content)), ctypes.byref(state))
-        return state
 
     def close(self) -> None:
         """End and free the instance and unload a library of its own; calling it twice is allowed."""

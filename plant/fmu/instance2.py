@@ -77,14 +77,14 @@ class Instance2(Instance):
             (self.root / "resources").as_uri().encode(),
             ctypes.byref(self._callbacks),
             ctypes.c_int(0),
-            ctypes.c_int(0),
+            ctypes.c_int(self.asked.debug_log is not None),
         )
         return address
 
     def _initialise(self, time: float) -> None:
-        nothing = ctypes.c_double(0.0)
-        no = ctypes.c_int(0)
-        self.call("SetupExperiment", no, nothing, ctypes.c_double(time), no, nothing)
+        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.asked.tolerance
+        wanted = ctypes.c_int(tolerance is not None), ctypes.c_double(tolerance or 0.0)
+        self.call("SetupExperiment", *wanted, ctypes.c_double(time), no, nothing)
         self.call("EnterInitializationMode")
         self.call("ExitInitializationMode")
 

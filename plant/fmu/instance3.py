@@ -47,15 +47,16 @@ class Instance3(Instance):
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
         names = self.description.model_name, self.description.token, str(self.root / "resources") + os.sep
-        common = [*(name.encode() for name in names), no, no]  # neither visible nor with a debug log
+        common = [*(name.encode() for name in names), no, ctypes.c_bool(self.asked.debug_log is not None)]
         early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
         end = [null, self._on_message]
         address: int | None = create(*common, *end) if exchange else create(*common, *early_return, *end, null)
         return address
 
     def _initialise(self, time: float) -> None:
-        nothing, no = ctypes.c_double(0.0), ctypes.c_bool(False)
-        self.call("EnterInitializationMode", no, nothing, ctypes.c_double(time), no, nothing)
+        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.asked.tolerance
+        wanted = ctypes.c_bool(tolerance is not None), ctypes.c_double(tolerance or 0.0)
+        self.call("EnterInitializationMode", *wanted, ctypes.c_double(time), no, nothing)
         self.call("ExitInitializationMode")
 
     def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from servobench.plant.faults import FmuError
+from servobench.plant.fmu.asked import NOTHING, Asked
 from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.instance import OK, Instance, RawCall
 from servobench.plant.fmu.instance2 import Instance2
@@ -49,30 +50,22 @@ class Lane:
 
     def save(self, *, as_bytes: bool) -> bytes | ctypes.c_void_p:
         """Return the state as bytes, or as a handle of this instance for an FMU that cannot serialise."""
-        state = self.instance.save()
-        if not as_bytes:
-            self.states.append(state)
-            return state
-        try:
-            return self.instance.to_bytes(state)
-        finally:
-            self.instance.free(state)
+        if as_bytes:
+            return self.instance.states.save_bytes()
+        self.states.append(self.instance.states.save())
+        return self.states[-1]
 
     def restore(self, saved: bytes | ctypes.c_void_p) -> None:
         """Return to a state from `save`."""
-        if not isinstance(saved, bytes):
-            self.instance.restore(saved)
-            return
-        handle = self.instance.from_bytes(saved)
-        try:
-            self.instance.restore(handle)
-        finally:
-            self.instance.free(handle)
+        if isinstance(saved, bytes):
+            self.instance.states.restore_bytes(saved)
+        else:
+            self.instance.states.restore(saved)
 
     def close(self) -> None:
         """Free the instance and its states."""
         while self.states and not self.instance.fatal:
-            self.instance.free(self.states.pop())
+            self.instance.states.free(self.states.pop())
         self.instance.close()
 
 
@@ -84,18 +77,21 @@ class Instances:
         live: the same for the inner loop, where those that failed rest; empty after `close`.
     """
 
-    def __init__(self, description: FmuDescription, root: Path, fail: Callable[[int, FmuError], None]) -> None:
+    def __init__(
+        self, description: FmuDescription, root: Path, fail: Callable[[int, FmuError], None], asked: Asked = NOTHING
+    ) -> None:
         """Load the library; `open` makes the instances.
 
         Args:
             description: of the FMU.
             root: folder to which it is extracted.
             fail: takes the fault of a lane, or raises it.
+            asked: what the user asks of each.
 
         Raises:
             ValueError: see `load_library`.
         """
-        self._description, self._root, self._fail = description, root, fail
+        self._description, self._root, self._fail, self._asked = description, root, fail, asked
         self._library = None if description.once_per_process else load_library(description, root)
         self.lanes: list[Lane] = []
         self.live: list[Lane] = []
@@ -103,7 +99,7 @@ class Instances:
     def open(self, count: int, connect: Callable[[Instance, int], Lane]) -> None:
         """Make `count` instances; `connect` makes the lane of an instance with the row of its buffers."""
         for row in range(count):
-            instance = open_instance(self._description, self._root, self._library)
+            instance = open_instance(self._description, self._root, self._library, self._asked)
             try:
                 self.lanes.append(connect(instance, row))
             except BaseException:
@@ -165,10 +161,15 @@ class Instances:
             self._library = None
 
 
-def open_instance(description: FmuDescription, root: Path, library: Any = None) -> Instance:  # noqa: ANN401 - ctypes
+def open_instance(
+    description: FmuDescription,
+    root: Path,
+    library: Any = None,  # noqa: ANN401 - ctypes
+    asked: Asked = NOTHING,
+) -> Instance:
     """Return an instance of the FMU that is extracted to `root`, which the caller closes; see `Instance`."""
-    kind: Callable[[FmuDescription, Path, Any], Instance] = Instance2 if description.version == 2 else Instance3
-    return kind(description, root, library)
+    kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
+    return kind(description, root, library, asked)
 
 
 def _nothing() -> int:

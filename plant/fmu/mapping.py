@@ -108,6 +108,10 @@ class FmuMapping:
     """What controllers believe where it differs; needs directional derivatives. None: there is no nominal model."""
     period: Positive | None = None
     """[s] the FMU's step; None for the control period."""
+    tolerance: Positive | None = None
+    """[1] relative one of the FMU's own solver, or of CVode in model exchange; None for what it takes by itself."""
+    debug_log: File | None = None
+    """A file to which all messages of the FMU are appended, with its debug log turned on; None: it is off."""
     limits: JointLimits = nested(JointLimits)
     """Limits of the joints."""
     names: LogNames = nested(LogNames)
@@ -130,7 +134,8 @@ def read_mapping(path: Path) -> FmuMapping:
         if key not in table:
             raise ValueError(f"mapping {path}: the key {key!r} is missing")
     mapping = override(f"mapping {path}", FmuMapping(path, ("to be given",), ("to be given",)), table)
-    return replace(mapping, file=path.parent / mapping.file)
+    log = None if mapping.debug_log is None else path.parent / mapping.debug_log
+    return replace(mapping, file=path.parent / mapping.file, debug_log=log)
 
 
 def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float) -> PlantSpec:
@@ -169,6 +174,20 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
         mapping.limits.of("joint_upper", n),
         period,
         mapping.names.feature_unit,
+    )
+
+
+def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float) -> str:
+    """Return a remark where an FMU takes longer steps than it is meant to; empty where it does not.
+
+    One of model exchange is integrated with steps of its solver's.
+    """
+    usual = description.usual_step
+    if mapping.period is not None or usual is None or description.exchange or usual >= period * (1.0 - STEP_TOLERANCE):
+        return ""
+    return (
+        f"{description.path.name} is meant to take steps of {usual:g} s and takes those of the control period, "
+        f"{period:g} s; period = {usual:g} in the mapping changes that"
     )
 
 

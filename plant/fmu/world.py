@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import prod
 from typing import Any
 
@@ -18,14 +18,16 @@ import numpy.typing as npt
 from servobench.plant.checks import FloatArray, as_array, is_finite, whole_steps
 from servobench.plant.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import Variable, read_description
 from servobench.plant.fmu.instance import Instance
 from servobench.plant.fmu.instances import Instances, Lane
-from servobench.plant.fmu.mapping import FmuMapping, mapping_spec
+from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, unusual_step
 from servobench.plant.fmu.messages import logger
 from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.fmu.port import Port
+from servobench.plant.fmu.states import FmuState
 from servobench.plant.plant import TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.sensed import SensedArm
@@ -35,22 +37,6 @@ from servobench.plant.signals import BoolArray, Truth
 from servobench.plant.world import World
 
 SEEN_ABOVE = 0.5  # a number that says whether a feature is seen
-
-
-@dataclass(frozen=True, eq=False)
-class FmuState:
-    """A saved state of an FMU's world.
-
-    Attributes:
-        fmu: of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
-            world that saved it.
-        period: number of periods since the start.
-        integrated: (..., n), rad, joint positions of an FMU that has none itself.
-    """
-
-    fmu: tuple[bytes | ctypes.c_void_p, ...]
-    period: int
-    integrated: FloatArray
 
 
 class FmuWorld(World):
@@ -88,6 +74,8 @@ class FmuWorld(World):
         self.description = description.resized(structural_sizes(description, mapping.parameters))
         if description.needs_tool:
             logger.warning("%s calls the tool that made it, which has to be installed here", mapping.file.name)
+        if model is None and (remark := unusual_step(mapping, self.description, period)):
+            logger.warning(remark)
         self.spec = mapping_spec(mapping, self.description, period)
         if model is not None:
             self.spec, self.noise_unit = replace(self.spec, feature=model.channel), model.noise_unit
@@ -96,7 +84,8 @@ class FmuWorld(World):
         self.lead = np.shape(start)[:-1]
         self._start = as_array("start", start, (*self.lead, self.spec.n))
         self._rows: Any = np.arange(*self.lead) if self.lead else ()
-        self._instances = Instances(self.description, root, self.fail)
+        asked = Asked(mapping.tolerance, mapping.debug_log)
+        self._instances = Instances(self.description, root, self.fail, asked)
         try:
             self._connect(mapping)
             self._instances.open(prod(self.lead), self._lane)

@@ -122,3 +122,36 @@ def test_an_fmu_that_needs_its_tool_says_so(tmp_path, caplog):
     path = build_crane(tmp_path / "crane.fmu", 2, description=tool)
     moved(path, 2)
     assert "crane.fmu calls the tool that made it" in caplog.text
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_debug_log_of_an_fmu_is_on_where_a_file_is_named_and_it_gets_a_tolerance(version, tmp_path):
+    path, log = build_crane(tmp_path / "crane.fmu", version), tmp_path / "crane.log"
+    moved(path, version)
+    moved(path, version, debug_log=log)
+    assert log.read_text().splitlines() == ["an instance of crane.fmu", "ok: crane number 7"]
+    moved(path, version, debug_log=log, tolerance=1e-3)
+    assert log.read_text().splitlines()[2:] == [
+        "an instance of crane.fmu", "ok: crane number 7", *["ok: tolerance 0.001"] * 2,
+    ]  # fmt: skip
+
+
+def test_a_debug_log_stands_beside_the_mapping_and_one_that_cannot_be_written_is_refused(tmp_path):
+    build_crane(tmp_path / "crane.fmu", 3)
+    file = tmp_path / "crane.toml"
+    file.write_text('file = "crane.fmu"\ninputs = ["push"]\nfeatures = ["place"]\ndebug_log = "no/such/folder.log"\n')
+    mapping = read_mapping(file)
+    assert mapping.debug_log == tmp_path / "no/such/folder.log"
+    with pytest.raises(ValueError, match="debug_log .*folder.log cannot be written: No such file"):
+        FmuWorld(mapping, START, 0.05)
+
+
+def test_an_fmu_that_is_meant_to_take_shorter_steps_gets_a_remark(tmp_path, caplog):
+    text = describe_with(2, "<ModelVariables>", '<DefaultExperiment stepSize="0.002"/><ModelVariables>')
+    path = build_crane(tmp_path / "crane.fmu", 2, description=text)
+    moved(path, 2, period=0.002)
+    assert caplog.text == ""
+    moved(path, 2)
+    assert (
+        "is meant to take steps of 0.002 s and takes those of the control period, 0.05 s; period = 0.002" in caplog.text
+    )

@@ -330,12 +330,9 @@ def test_memory_stays_flat_over_two_thousand_instances(version):
                 instance.start(0.0)
                 advance = instance.stepper(0.05)
                 advance(0.0)
-                state = instance.save()
-                again = instance.from_bytes(instance.to_bytes(state))
+                state = instance.states.save_bytes()
                 advance(0.05)
-                instance.restore(again)
-                instance.free(again)
-                instance.free(state)
+                instance.states.restore_bytes(state)
                 instance.close()
 
         live(1000)  # until the allocator has what it needs

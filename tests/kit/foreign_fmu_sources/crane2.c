@@ -13,6 +13,7 @@ void *fmi2Instantiate(const char *name, int type, const char *guid, const char *
     Crane *c = calloc(1, sizeof *c);
     callbacks = given;
     init(c);
+    if (logging) given->log(given->environment, name, 0, "all", "crane number %d", 7);
     return c;
 }
 
@@ -32,6 +33,7 @@ int fmi2Terminate(void *c)
 int fmi2SetupExperiment(void *c, int a, double b, double start, int d, double e)
 {
     ((Crane *)c)->time = start;
+    if (a) callbacks->log(callbacks->environment, "crane", 0, "all", "tolerance %g", b);
     return 0;
 }
 
