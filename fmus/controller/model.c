@@ -7,6 +7,8 @@
 
 /* How far from a sampling instant the importer's time may be [1 of the period]. */
 #define SAMPLE_SHARE 1e-6
+/* In one step. */
+#define MAX_SAMPLES 1e6
 
 static const double start_values[N_VALUES] = START_VALUES;
 
@@ -17,6 +19,7 @@ const char *model_explain(ModelStatus status)
     case MODEL_NOT_SETTABLE: return "this variable is computed by the model and cannot be set";
     case MODEL_BAD_VALUE: return "the value is not finite";
     case MODEL_NO_DERIVATIVES: return "the controller is sampled and has no derivatives";
+    case MODEL_TOO_LONG: return "the step is longer than a million periods";
     case MODEL_NOT_FINITE: return "the estimate or the command is not finite";
     case MODEL_NOT_DEFINITE: return "a covariance is not positive definite";
     case MODEL_NO_MEMORY: return "out of memory";
@@ -136,6 +139,7 @@ static ModelStatus take_sample(Model *model)
 ModelStatus model_step(Model *model, double step)
 {
     const double end = model->time + step - SAMPLE_SHARE * PERIOD;
+    if (!waits(model) && end - instant(model) > MAX_SAMPLES * PERIOD) return MODEL_TOO_LONG;
     while (instant(model) < end && !waits(model)) {
         const ModelStatus status = take_sample(model);
         if (status != MODEL_OK) return status;

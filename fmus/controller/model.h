@@ -35,6 +35,7 @@ typedef enum {
     MODEL_NOT_SETTABLE,
     MODEL_BAD_VALUE,
     MODEL_NO_DERIVATIVES,
+    MODEL_TOO_LONG,
     MODEL_NOT_FINITE, /* this and what follows ends a run */
     MODEL_NOT_DEFINITE,
     MODEL_NO_MEMORY

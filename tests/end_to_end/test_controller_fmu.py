@@ -148,6 +148,16 @@ def test_short_steps_take_a_sample_a_period_and_a_long_one_takes_several():
         np.testing.assert_allclose(controller.get(), other.get(), rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("step", [1e6, 1e300])
+def test_a_step_of_more_samples_than_anybody_waits_for_is_refused_and_changes_nothing(step):
+    inputs, commands = original("ukf_mfac:published")
+    with loaded("ukf_mfac:published", 2) as controller:
+        np.testing.assert_allclose(controller.answer(0, inputs[0]), commands[0], rtol=0, atol=1e-12)
+        with pytest.raises(Exception, match="fmi2DoStep failed"):
+            controller.step(PERIOD, step)
+        np.testing.assert_allclose(controller.answer(1, inputs[1]), commands[1], rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_saved_state_goes_on_with_equal_bits_and_reset_begins_anew(version):
     inputs, _ = original("map_mfac")

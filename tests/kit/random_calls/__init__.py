@@ -9,10 +9,13 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+from kit.controller_fmus import recorded
 from servobench.fmus.export import ExportOptions, product
+from servobench.fmus.product import Product
 
 HERE = Path(__file__).parent
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer")
+TIMEOUT = 3600.0  # [s] of a process: a call that does not return is found
 COMMON = ("-std=c11", "-O1", "-g", "-ffp-contract=off", "-Wall", "-Wextra")
 
 
@@ -29,17 +32,27 @@ def can_sanitize() -> bool:
         return built.returncode == 0 and subprocess.run([f"{folder}/main"], check=False).returncode == 0
 
 
-def build(folder: Path, version: int, defect: str = "") -> Path:
-    """Compile the driver with the sources of the exported UR5, without the check `defect`, to test the test."""
-    exported = product(ExportOptions(version))
-    for name, text in exported.sources().items():
+def arm(version: int) -> Product:
+    """Return the exported UR5."""
+    return product(ExportOptions(version))
+
+
+def controller(version: int, name: str = "ukf_mfac:published") -> Product:
+    """Return an exported controller."""
+    return recorded(name).product(version)
+
+
+def build(folder: Path, made: Product, defect: str = "") -> Path:
+    """Compile the driver with the sources of an FMU, without the check `defect`, to test the test."""
+    version = made.fmi_version
+    for name, text in made.sources().items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text if not defect else text.replace(defect, "0"))
     sources = folder / "sources"
     shutil.copy(HERE / "calls.h", sources)
     shutil.copy(HERE / f"calls{version}.c", sources)
-    files = [f"calls{version}.c", *exported.description.sources]
+    files = [f"calls{version}.c", *made.description.sources]
     command = [shutil.which("cc") or "cc", *COMMON, *SANITIZED, *files, "-o", str(folder / "calls"), "-lm"]
     subprocess.run(command, cwd=sources, check=True)
     return folder / "calls"
@@ -52,7 +65,7 @@ def run(program: Path, calls: int, seed: int) -> tuple[int, int]:
         AssertionError: a sanitizer found something.
     """
     command = [program, str(calls), str(seed)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace")
+    done = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace", timeout=TIMEOUT)
     assert done.returncode == 0, f"seed {seed}: {done.stderr[:3000]}"
     made, refused = re.fullmatch(r"(\d+) calls, (\d+) refused\n", done.stdout).groups()
     return int(made), int(refused)

@@ -2,7 +2,7 @@
 #ifndef CALLS_H
 #define CALLS_H
 
-#include "layout.h"
+#include "model.h"
 #include <math.h>
 #include <stdint.h>
 #include <stdio.h>

@@ -127,7 +127,7 @@ static int ask_status(fmi2Component instance)
 
 static int exchange(fmi2Component instance)
 {
-    const size_t count = below(6) ? 2 * N_JOINTS : few();
+    const size_t count = below(6) ? N_STATES : few();
     double *values = numbers(count);
     fmi2EventInfo info;
     int one, other, status = fmi2OK;

@@ -128,7 +128,7 @@ static int use_state(fmi3Instance instance)
 
 static int exchange(fmi3Instance instance)
 {
-    const size_t count = below(6) ? 2 * N_JOINTS : few();
+    const size_t count = below(6) ? N_STATES : few();
     double *values = numbers(count), time;
     size_t size;
     bool b[5];
