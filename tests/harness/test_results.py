@@ -55,6 +55,26 @@ def test_parts_are_readable_before_and_after_they_are_put_together(folder):
     assert results.collect(folder) == 2
 
 
+def test_tables_have_the_columns_that_were_written_and_no_others(folder):
+    steps = pd.DataFrame({"run_id": "run0", "step": np.arange(3)} | STEPS, index=[7, 8, 9])
+    outcome = [RunResult(made_up_row(name), steps.assign(run_id=name)) for name in ("run0", "run1")]
+    results.write_part(folder, 0, outcome)
+    assert list(results.load_steps(folder)) == list(steps)
+    assert list(results.load_runs(folder)) == list(made_up_row("run0"))
+
+
+def test_a_folder_that_a_killed_batch_had_begun_to_make_is_made(tmp_path):
+    begun = tmp_path / "out"
+    (begun / results.PARTS).mkdir(parents=True)
+    half = begun / f".{results.MANIFEST}-12-34"
+    half.write_text("{")
+    (begun / SUMS).write_text("of another time")
+    results.create_folder(begun, {"seeds": "0"})
+    assert not half.exists()
+    assert results.read_manifest(begun)["seeds"] == "0"
+    assert not examine(begun).findings
+
+
 def test_tables_with_different_columns_join_with_gaps(folder):
     add_part(folder, 0)
     add_part(folder, 1, torque=2.5)
@@ -89,6 +109,7 @@ def test_a_killed_clean_up_loses_nothing(folder):
     name = f"00000001.{results.RUNS}"
     (folder / results.PARTS / name).write_bytes(parts[name])
     assert results.collect(folder) == 2
+    assert not (folder / results.PARTS).exists()
     assert len(results.load_runs(folder)) == 2
 
 
@@ -180,8 +201,9 @@ def test_the_last_picture_of_a_run_is_kept_at_twice_its_size(folder):
     cv2 = pytest.importorskip("cv2")
     picture = np.full((6, 8, 3), (200, 30, 10), dtype=np.uint8)
     results.write_part(folder, 0, [RunResult(made_up_row("run0"), None, picture), RunResult(made_up_row("run1"), None)])
-    written = list((folder / results.PICTURES).iterdir())
-    assert [path.name for path in written] == ["run0.png"]
+    results.write_part(folder, 2, [RunResult(made_up_row("run2"), None, picture)])
+    written = sorted((folder / results.PICTURES).iterdir())
+    assert [path.name for path in written] == ["run0.png", "run2.png"]
     colours = cv2.cvtColor(cv2.imread(str(written[0])), cv2.COLOR_BGR2RGB)
     np.testing.assert_array_equal(colours, np.full((12, 16, 3), (200, 30, 10)))
 
@@ -191,6 +213,7 @@ def test_a_folder_of_several_sweeps_has_one_table_that_names_them(folder):
     results.write_summary(folder, tables, {"parts": ["a", "b"]})
     runs = results.load_runs(folder)
     assert runs[["run_id", "part"]].values.tolist() == [["a0", "a"], ["a1", "a"], ["b0", "b"], ["b1", "b"]]
+    assert list(runs) == [*tables["a"], "part"]
     assert results.read_manifest(folder)["parts"] == ["a", "b"]
 
 
@@ -255,3 +278,6 @@ def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
     with pytest.raises(ConfigurationError, match=f"runs.parquet is no table of runs: it {lack}$"):
         results.load_runs(folder)
     assert lack in [finding.what for finding in examine(folder).findings]
+    pd.DataFrame({"run_id": ["a"], "time_s": [0.0]}).to_parquet(folder / results.STEPS)
+    with pytest.raises(ConfigurationError, match="is no table of steps: it lacks the column error_norm$"):
+        results.load_steps(folder)
