@@ -1,4 +1,4 @@
-"""Takes the steps of runs elsewhere: CSV, MCAP for Foxglove and ROS 2, time responses for python-control."""
+"""Takes the steps of runs elsewhere: CSV, MCAP for Foxglove and other readers, time responses for python-control."""
 
 from __future__ import annotations
 
@@ -88,6 +88,8 @@ def time_response(steps: pd.DataFrame) -> TimeResponseData:
 
 def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> None:
     """Write one run as an MCAP file: a topic for each group of columns, a JSON message a period, time from 0.
+
+    Its messages are none of ROS, so that a reader of bags of ROS 2, such as rosbags, refuses the file.
 
     Args:
         path: the file.

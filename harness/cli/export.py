@@ -14,7 +14,7 @@ def export(
     folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
     format_: Annotated[
-        str, typer.Option("--format", help="csv, or mcap (Foxglove, tools of ROS 2; extra mcap).")
+        str, typer.Option("--format", help="csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
     ] = "csv",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
