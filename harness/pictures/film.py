@@ -31,8 +31,9 @@ from servobench.plant.settings import suggest
 
 SNAPSHOTS = "snapshots"
 KINDS = (MP4, GIF, SNAPSHOTS)
-WIDTH, HEIGHT = 960, 736  # px of a frame; ffmpeg wants multiples of 16
-HEAD, VIEW_WIDTH, VIEW_HEIGHT = 32, 640, 480  # px: line of text on top, overview below it at the left
+WIDTH, HEIGHT = 960, 816  # px of a frame; ffmpeg wants multiples of 16
+HEAD, VIEW_WIDTH, VIEW_HEIGHT = 48, 640, 480  # px: line of text on top, overview below it at the left
+TYPE = 19.0  # [pt] of all words: 9 px high where a page on a telephone shows the frame 330 px wide
 SIDE = WIDTH - VIEW_WIDTH
 CAMERA_HEIGHT = 240  # px
 MAX_RATE = 25.0  # frames a second
@@ -123,17 +124,23 @@ class _Board:
             figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
             self._figure = figure
             self._canvas = cast("Any", FigureCanvasAgg(figure))
-            figure.text(0.01, 1 - HEAD / 2 / HEIGHT, _title(run), va="center", fontsize=11, fontweight="bold")
-            self._axes = figure.add_axes((0.085, 0.075, 0.89, 0.2))
+            title = figure.text(0.01, 1 - HEAD / 2 / HEIGHT, _title(run), va="center", fontsize=TYPE, fontweight="bold")
+            title.set_fontsize(TYPE * min(1.0, 0.98 * WIDTH / title.get_window_extent().width))
+            self._axes = figure.add_axes((0.11, 0.1, 0.865, 0.225))
             self._prepare_axes()
-            left, top = VIEW_WIDTH / WIDTH + 0.02, 1 - (HEAD + CAMERA_HEIGHT + 18) / HEIGHT
-            figure.text(left, top, "what the camera sees, ball as detected", fontsize=9, va="top")
-            self._numbers = figure.text(left, top - 0.06, "", fontsize=13, va="top", family="monospace", animated=True)
+            left, top = VIEW_WIDTH / WIDTH + 0.02, 1 - (HEAD + CAMERA_HEIGHT + 10) / HEIGHT
+            figure.text(left, top, "the camera's view", fontsize=TYPE, va="top")
+            self._numbers = figure.text(
+                left, top - 0.06, "", fontsize=TYPE, va="top", family="monospace", animated=True
+            )
             lines = [
                 mpl.lines.Line2D([], [], color=self._style.colour, linewidth=3, label="ball, so far"),
                 mpl.lines.Line2D([], [], color=REFERENCE_HEX, linewidth=2, label=_desired(run)),
             ]
-            figure.legend(handles=lines, loc="upper left", bbox_to_anchor=(left - 0.012, top - 0.17), frameon=False)
+            figure.legend(
+                handles=lines, loc="upper left", bbox_to_anchor=(left - 0.015, top - 0.145), frameon=False,
+                fontsize=TYPE, handlelength=1.2, borderpad=0.0, labelspacing=0.2,
+            )  # fmt: skip
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(figure.bbox)
 
@@ -145,7 +152,7 @@ class _Board:
         time = run.track.time
         self._line.set_data(time[: k + 1], self._error[: k + 1])
         self._now.set_data(time[k : k + 1], self._error[k : k + 1])
-        self._numbers.set_text(f"time  {time[k]:6.2f} s\nerror {self._error[k]:6.1f} {run.track.error_unit[0]}")
+        self._numbers.set_text(f"time {time[k]:6.2f} s\nerror {self._error[k]:5.1f} {run.track.error_unit[0]}")
         for artist in (self._line, self._now):
             self._axes.draw_artist(artist)
         self._figure.draw_artist(self._numbers)
@@ -167,9 +174,11 @@ class _Board:
         axes.set_xlim(track.time[0], max(float(track.time[-1]), track.time[0] + 1e-3))
         mark_settling_band(axes, track)
         for line in axes.get_lines():
-            axes.annotate(str(line.get_label()), (0.995, band), xycoords=("axes fraction", "data"), fontsize=8,
+            axes.annotate(str(line.get_label()), (0.995, band), xycoords=("axes fraction", "data"), fontsize=TYPE - 2,
                           color="0.3", ha="right", va="bottom")  # fmt: skip
-        axes.set(xlabel="time [s]", ylabel=f"true error [{track.error_unit[0]}]")
+        axes.tick_params(labelsize=TYPE - 2)
+        axes.set_xlabel("time [s]", fontsize=TYPE)
+        axes.set_ylabel(f"error [{track.error_unit[0]}]", fontsize=TYPE)
         (self._line,) = axes.plot([], [], color=self._style.colour, linewidth=1.8, animated=True)
         (self._now,) = axes.plot([], [], color=self._style.colour, marker="o", markersize=6, animated=True)
 
