@@ -134,25 +134,33 @@ def compare(
         ConfigurationError: something that cannot be used; it is a ValueError.
     """
     chosen = range(seeds) if isinstance(seeds, int) else tuple(seeds)
-    for what, values in (("controllers", controllers), ("plants", plants), ("tasks", tasks), ("mismatches", mismatches),
-                         ("sensings", sensings), ("seeds", chosen)):  # fmt: skip
-        if not len(values):
-            raise ConfigurationError(f"{what} must name at least one, got none")
+    _check_lengths(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings,
+                   seeds=chosen)  # fmt: skip
     with offering():
         names = tuple(_name(each) for each in controllers)
         worlds = tuple(_plant_name(each) for each in plants)
         batch = Batch(worlds, names, tuple(tasks), tuple(mismatches), chosen, robot, tuple(sensings))
-        if not _can_travel(offered([*worlds, *names])):
-            workers, run_timeout, run_memory, isolate = 1, None, None, False
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
-        whole = Settings(settings or {})
-        if out is not None:
-            carry_out(comparison(batch, whole), Path(out), how)
-            return results.load_runs(Path(out))
-        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
-            campaign = Campaign(Grid(Cell, batch.requests()), whole)
-            carry_out(campaign, Path(folder), replace(how, resume=False))
-            return results.load_runs(Path(folder))
+        if not _can_travel(offered([*worlds, *names])):
+            how = Execution(1, None, Bounds(isolate=False), resume)
+        return _rows(batch, Settings(settings or {}), out, how)
+
+
+def _check_lengths(**given: Sequence[Any]) -> None:
+    """Raise a `ConfigurationError` if one of the arguments names nothing."""
+    for what, values in given.items():
+        if not len(values):
+            raise ConfigurationError(f"{what} must name at least one, got none")
+
+
+def _rows(batch: Batch, settings: Settings, out: Path | str | None, how: Execution) -> pd.DataFrame:
+    """Carry a batch out and return its table of runs, which is kept in `out` if there is one."""
+    if out is not None:
+        carry_out(comparison(batch, settings), Path(out), how)
+        return results.load_runs(Path(out))
+    with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+        carry_out(Campaign(Grid(Cell, batch.requests()), settings), Path(folder), replace(how, resume=False))
+        return results.load_runs(Path(folder))
 
 
 def load(folder: Path | str) -> Results:

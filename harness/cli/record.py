@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,6 @@ from servobench.harness.cli.named import split_names
 from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
 
 if TYPE_CHECKING:
-    from servobench.harness.config.settings import Settings
     from servobench.harness.pictures.replay import LoggedRun
 
 RECORDED = {
@@ -30,26 +30,45 @@ def _new(what: str, complete: Callable[[str], list[str]] | None = None) -> Any: 
     return typer.Option(help=f"New run: {what}, default {RECORDED[what]}.", autocompletion=complete)
 
 
-def record(
-    folder: Annotated[
-        Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
-    ] = None,
-    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+@dataclass(frozen=True)
+class NewRun:
+    """The run that is carried out where no folder is given."""
+
     plant: Annotated[
         str | None,
         typer.Option(
             help="New run: plant, default bullet, or mujoco without PyBullet.", autocompletion=completion.plants
         ),
-    ] = None,
-    controller: Annotated[str | None, _new("controller", completion.controllers)] = None,
-    task: Annotated[str | None, _new("task", completion.tasks)] = None,
-    mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None,
-    robot: Annotated[str | None, _new("robot", completion.robots)] = None,
-    seed: Annotated[int | None, _new("seed")] = None,
+    ] = None
+    controller: Annotated[str | None, _new("controller", completion.controllers)] = None
+    task: Annotated[str | None, _new("task", completion.tasks)] = None
+    mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None
+    robot: Annotated[str | None, _new("robot", completion.robots)] = None
+    seed: Annotated[int | None, _new("seed")] = None
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
+    ] = None
+    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None
+
+    def given(self) -> list[str]:
+        """Return the options of it that were given."""
+        return [f"--{name.rstrip('_')}" for name, value in vars(self).items() if value not in (None, [])]
+
+    def asked(self) -> dict[str, Any]:
+        """Return what the run is of, with defaults for what was not given."""
+        from servobench.harness.config.engines import rendered_plant
+
+        named = {name: getattr(self, name) for name in ("plant", *RECORDED)}
+        chosen = {name: value for name, value in named.items() if value is not None}
+        return {"plant": rendered_plant(self.plant), **RECORDED, **chosen}
+
+
+def record(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None,
+    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+    new: NewRun = NewRun(),
     kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
     begin: Annotated[float, typer.Option(min=0.0, help="Where in the run the film begins [s].")] = 0.0,
     length: Annotated[
@@ -65,33 +84,30 @@ def record(
     """
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.engines import engine_of, rendered_plant
-    from servobench.harness.config.settings import ConfigurationError, read_settings
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
-    new = {"plant": plant, "controller": controller, "task": task, "mismatch": mismatch, "robot": robot, "seed": seed}
-    given = [f"--{name}" for name, value in (new | {"set": set_, "config": config}).items() if value not in (None, [])]
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
-        if folder is not None:
-            if given:
-                raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
-            shown = _run_of(folder, run)
-        else:
-            if run is not None:
-                raise ConfigurationError("--run names a run of a results folder, and no folder is given")
-            shown_as = rendered_plant(plant)
-            chosen = {name: value for name, value in new.items() if value is not None}
-            shown = _new_run({"plant": shown_as, **RECORDED, **chosen}, read_settings(config, set_ or []))
+        shown = _shown(folder, run, new)
         say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
-        paths = write_recording(
-            stretch(shown, begin, length),
-            (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"]),
-            wanted,
-            tell,
-        )
+        stem = (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"])
+        paths = write_recording(stretch(shown, begin, length), stem, wanted, tell)
     for path in paths:
         say(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
+    """Return the run of a folder that is named, or carry out a new one."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    if folder is not None:
+        if given := new.given():
+            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+        return _run_of(folder, run_id)
+    if run_id is not None:
+        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+    return _carried_out(new)
 
 
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
@@ -106,17 +122,18 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     return logged_run(row, results.load_steps(folder, [row["run_id"]]), settings)
 
 
-def _new_run(asked: dict[str, Any], settings: Settings) -> LoggedRun:
+def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
     from servobench.harness.batch.apart import choose_controllers, choose_plants
     from servobench.harness.config.engines import rendered_plant
-    from servobench.harness.config.settings import ConfigurationError, flatten
+    from servobench.harness.config.settings import ConfigurationError, flatten, read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.rendered.settings import RenderedConfig
 
+    asked, settings = new.asked(), read_settings(new.config, new.set_ or [])
     (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
     chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
     request = RunRequest(**asked | chosen)

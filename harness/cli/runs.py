@@ -70,36 +70,48 @@ def run(
 
     The exit code is 1 if the run failed.
     """
-    from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.apart import choose_controllers, choose_plants
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.plant import PlantEntry
 
-    if method and controller and method != controller:
-        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
-    controller = method or controller or DEFAULT_CONTROLLER
-    (plant,) = [named.default_plant()] if plant is None else choose_plants([plant])
-    if view and plant != "bullet":
-        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
-    (name,) = choose_controllers([f"{controller}+{estimator}" if estimator else controller])
-    named.tell_unused(ControllerEntry, [name])
-    named.tell_unused(PlantEntry, [plant])
     batch = Batch(
-        (plant,),
-        (name,),
+        (_one_plant(plant, view=view),),
+        (_one_controller(method, controller, estimator),),
         (task,),
         (mismatch,),
         parse_seeds(f"{seed},"),
         named.known_robot(robot),
-        named.split_sensings(sensing),
+        (named.one_sensing(sensing),),
     )
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
-    folder = _carry_out(
-        campaign, out, Execution(workers=1, bounds=limited.bounds(), debug=debug), with_report=with_report
-    )
-    judge(folder, strict=True)
+    how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
+    judge(_carry_out(campaign, out, how, with_report=with_report), strict=True)
+
+
+def _one_plant(plant: str | None, *, view: bool) -> str:
+    """Return the name of the plant of a run."""
+    from servobench.harness.batch.apart import choose_plants
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.plant import PlantEntry
+
+    (name,) = [named.default_plant()] if plant is None else choose_plants([plant])
+    if view and name != "bullet":
+        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {name}")
+    named.tell_unused(PlantEntry, [name])
+    return name
+
+
+def _one_controller(method: str | None, controller: str | None, estimator: str | None) -> str:
+    """Return the name of the controller of a run, which may be named as an argument or as an option."""
+    from servobench.controllers.controller import ControllerEntry
+    from servobench.harness.batch.apart import choose_controllers
+    from servobench.harness.config.settings import ConfigurationError
+
+    if None not in (method, controller) and method != controller:
+        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
+    law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
+    (name,) = choose_controllers([law if estimator is None else f"{law}+{estimator}"])
+    named.tell_unused(ControllerEntry, [name])
+    return name
 
 
 def compare(
