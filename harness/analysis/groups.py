@@ -22,7 +22,7 @@ from servobench.harness.analysis.comparison import (
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.measures import MEASURES
+from servobench.harness.analysis.measures import MEASURES, in_handy_units
 from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, success_rate
 from servobench.harness.analysis.verdict import scores
 from servobench.harness.run.ending import COMPLETED
@@ -102,11 +102,13 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
 
 def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each move how many runs settled, how fast, and with what error."""
+    runs = in_handy_units(runs)
     return _by_task(split_tasks(runs)[0], MOVE_GROUPS)
 
 
 def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each curve how many runs followed it, and with what error."""
+    runs = in_handy_units(runs)
     return _by_task(split_tasks(runs)[1], CURVE_GROUPS)
 
 
@@ -159,6 +161,7 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return every run as a row: which it is, how it ended and what came of it, and its main measures."""
+    runs = in_handy_units(runs)
     named = runs.assign(outcome=outcomes(runs))
     table: dict[tuple[str, str], list[str]] = {}
     for name in ("controller", "task", *_varied(runs)):

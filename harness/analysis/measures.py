@@ -37,7 +37,7 @@ class Measure(NamedTuple):
         if self.unit:
             return self.unit, self.factor
         units = runs.reindex(columns=["feature_unit"])["feature_unit"].dropna().unique().tolist()
-        return handy_unit(units[0] if len(units) == 1 else None)
+        return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
 
 
 MEASURES: Final = {
@@ -65,3 +65,15 @@ MEASURES: Final = {
     "controller_time_overruns": Measure("steps over the period", 0, "1"),
     "plant_time_median_us": Measure("plant step, median", 0, "µs"),
 }
+
+
+def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return runs of several units with the errors of each in its handy one; runs of one unit as they are."""
+    units = runs.reindex(columns=["feature_unit"])["feature_unit"]
+    if units.nunique() < 2:
+        return runs
+    handy = [handy_unit(unit if isinstance(unit, str) else None) for unit in units]
+    factors = [factor for _, factor in handy]
+    errors = [name for name, measure in MEASURES.items() if measure.unit is None and name in runs]
+    changed = {name: factors * runs[name] for name in errors}
+    return runs.assign(feature_unit=[unit for unit, _ in handy], **changed)

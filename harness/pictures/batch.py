@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.analysis.measures import MEASURES
@@ -93,15 +94,16 @@ def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, la
     rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
     columns = min(layout.columns, len(rows))
     lines = -(-len(rows) // columns)
-    height = 0.55 + LINE * max(LEAST_ROWS, len(names))
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
     letters = round((layout.width - beside) / columns / LETTER)
+    words = [textwrap.fill(row.label, letters) for row in rows]
+    height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
     figure = Figure(figsize=(layout.width, 0.35 + lines * height), layout="constrained")
     panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
-    for axes, row in zip(panels, rows, strict=False):
+    for axes, row, label in zip(panels, rows, words, strict=False):
         _draw_dots(axes, runs, names, styles, row)
         _name_rows(axes, names, layout)
-        axes.set_xlabel(textwrap.fill(row.label, letters))
+        axes.set_xlabel(label)
     for axes in panels[len(rows) :]:
         axes.set_visible(False)
     return figure
@@ -124,15 +126,16 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
     Steps that take longer than the control period are marked and, on a wide sheet, counted.
     """
     names = list(dict.fromkeys(name for ensembles in tasks.values() for name in ensembles))
-    times = {name: np.concatenate([e[name].step_time for e in tasks.values() if name in e]) for name in names}
+    times = {name: 1e-3 * np.concatenate([e[name].step_time for e in tasks.values() if name in e]) for name in names}
     known = {name: values for name, values in times.items() if len(values)}
     if not known:
         return None
     periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
-    limit = 1e6 * max([period for period in periods if math.isfinite(period)], default=math.nan)
-    figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout="constrained")
+    limit = 1e3 * max([period for period in periods if math.isfinite(period)], default=math.nan)
+    inside = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.98, 1.0))  # fine pictures have slightly wider bold letters
+    figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout=inside)
     axes = figure.add_subplot()
-    top = 1.4 * max(np.max(values) for values in known.values())
+    top = 1.4 * max(float(np.max(values)) for values in known.values())
     for i, (name, values) in enumerate(known.items()):
         _draw_times(axes, i, values, limit, styles[name])
         if layout is WIDE:
@@ -144,13 +147,13 @@ def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layo
         top = max(top, 1.6 * limit)
         axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
         axes.axvspan(limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0)
-        axes.annotate(f"control period, {limit / 1000:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
+        axes.annotate(f"control period, {limit:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
                       ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
                       textcoords="offset points")  # fmt: skip
-    axes.set(xscale="log", xlabel="time of a controller's step [µs]" if layout is WIDE else "time of a step [µs]")
+    axes.set(xscale="log", xlabel="time of a controller's step [ms]" if layout is WIDE else "time of a step [ms]")
     axes.set_xlim(right=top)
     _name_rows(axes, list(known), layout)
-    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     return figure
 
 
@@ -169,21 +172,22 @@ def _write_times(axes: Axes, i: int, values: FloatArray, limit: float) -> None:
     late = int(np.count_nonzero(values > limit))
     words = f"{_short(middle)}, {_short(high)}, {_short(values.max())}"
     if late:
-        words += f"\n{late} of {len(values)} steps too slow"
+        words += f"\n{late} of {len(values)} too slow"
     axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
                   fontweight="bold" if late else None, linespacing=1.0)  # fmt: skip
 
 
-def _short(microseconds: float) -> str:
+def _short(milliseconds: float) -> str:
     """Return a time with its unit and at most three digits."""
-    return f"{microseconds:.0f} µs" if microseconds < 999.5 else f"{microseconds / 1000.0:.3g} ms"
+    return f"{1000.0 * milliseconds:.0f} µs" if milliseconds < 0.9995 else f"{milliseconds:.3g} ms"
 
 
 def _dots(column: str, runs: pd.DataFrame) -> _Dots:
     unit, factor = MEASURES[column].scale(runs)
     name = MEASURES[column].name
     if column == "rms_error_evaluated":
-        name = "RMS error of the judged part: end of a move, last lap of a curve"
+        name = "RMS error of the judged part"
+        name += ": end of a move, last lap of a curve" if runs["task"].nunique() > 1 else ""
     if column == "command_switches":
         name, unit = "sign switches of large commands", "count"
     return _Dots(column, f"{name} [{unit}]", factor)
@@ -233,7 +237,7 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
         if own.sum() > 1 and math.isfinite(middle):
             axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
         if never[own].any():
-            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="right", va="center", xytext=(-5, 0),
+            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="left", va="center", xytext=(5, 0),
                           textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
     if wide:
         axes.set_xscale("log")

@@ -97,7 +97,7 @@ def _blocks(tasks: Mapping[str, Tracks], views: list[View]) -> list[Block]:
 def _views(tracks: Tracks) -> list[View]:
     features = longest(tracks).features
     if features[:3] == list(CAMERA_FRAME):
-        return [View("as the camera sees it", 0, 1), View("from above", 0, 2)]
+        return [View("camera's view", 0, 1), View("from above", 0, 2)]
     names = [name.rpartition("_")[0] for name in features]
     if features[0].endswith(PIXELS) and len(names) % 2 == 0:
         return [View(f"{names[i + 1]} over {names[i]}", i, i + 1) for i in range(0, min(4, len(names)), 2)]

@@ -55,9 +55,10 @@ function prepare(table) {
   const labels = heads.map((th, i) => (groups[i] ? `${groups[i]}: ` : "") + th.textContent);
   const body = table.tBodies[0];
   const rows = [...body.rows];
+  const lengthy = heads.map((_, i) => labels[i].length > 36 || rows.some((row) => row.cells[i].textContent.length > 32));
   for (const row of rows) [...row.cells].forEach((cell, i) => {
     cell.dataset.label = labels[i];
-    if (cell.textContent.length > 40) cell.classList.add("whole");
+    if (lengthy[i] && cell.textContent !== "–") cell.classList.add("whole");
   });
   heads.forEach((th, i) => {
     if (rows.length && rows.every((row) => row.cells[i].classList.contains("n"))) th.classList.add("n");

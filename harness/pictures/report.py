@@ -23,9 +23,10 @@ from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import outcomes, split_tasks
 from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
-from servobench.harness.analysis.measures import MEASURES, handy_unit, settling_band
+from servobench.harness.analysis.measures import MEASURES, handy_unit, in_handy_units, settling_band
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.conditions import draw_conditions
 from servobench.harness.pictures.draw import page_figures, picture_of
@@ -33,6 +34,7 @@ from servobench.harness.pictures.interactive import error_curves, path_views, ro
 from servobench.harness.pictures.sheet import breakable, marked, sheet
 from servobench.harness.pictures.style import NARROW, TEXT, WIDE, Layout, figure_style, method_styles
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
+from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.files import write_atomically
 
 NAME: Final = "report.html"
@@ -41,6 +43,7 @@ PICTURE_BYTES: Final = 3_000_000  # of all figures in the page
 SHOWN_RUNS: Final = 1000  # rows of the table of runs
 LONG_TABLE: Final = 30  # rows; of a table that has more, the page shows a line that opens it
 COUNTED: Final = {"controller": "controllers", "task": "tasks", "plant": "plants", "mismatch": "mismatches"}
+USUAL: Final = {"robot": DEFAULT_ROBOT, "sensing": DEFAULT_SENSING}  # is not said
 SWEPT: Final = {"noise_factor": "factors of noise", "latency_s": "latencies", "period_s": "control periods"}
 KINDS: Final = ("errors", "paths", "settling", "tracking", "tracking_path", "jacobian", "step_times", "smoothness")
 
@@ -213,6 +216,8 @@ def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
     """Return in a line what was compared on what."""
     words = [f"{runs[name].nunique()} {many}" if runs[name].nunique() > 1 else str(runs[name].iloc[0])
              for name, many in COUNTED.items()]  # fmt: skip
+    words += [f"{name} {' and '.join(Path(str(each)).name for each in runs[name].unique())}"
+              for name, usual in USUAL.items() if name in runs and (runs[name] != usual).any()]  # fmt: skip
     words += [f"{runs[name].nunique(dropna=False)} {many}" for name, many in SWEPT.items()
               if name in runs and runs[name].nunique(dropna=False) > 1]  # fmt: skip
     count = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
@@ -235,12 +240,13 @@ def _numbered(table: pd.DataFrame, shown: pd.DataFrame) -> pd.DataFrame:
 
 def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what the scripts draw: runs by their number, with the error over time of those whose steps are kept."""
+    curves = error_curves(folder, shown)
+    shown = in_handy_units(shown)
     known = [name for name in MEASURES if name in shown and shown[name].notna().any()]
     scales = {name: MEASURES[name].scale(shown)[1] for name in known}
     place = shown.groupby(
         ["controller", *(n for n in ("task", *groups.CONDITIONS) if n in shown)], dropna=False
     ).ngroup()
-    curves = error_curves(folder, shown)
     runs = {
         str(number): {
             "id": str(row["run_id"]),

@@ -138,7 +138,7 @@ def test_along_a_curve_the_error_is_a_root_mean_square_over_half_a_second(tmp_pa
 def test_paths_are_drawn_to_scale_in_two_views_that_share_the_abscissa():
     tracks = {"ukf_mfac": Track(made_up_row("a"), made_up_steps("a"))}
     front, above = draw_paths({"exp1": tracks}, STYLES).axes
-    assert (front.get_title(), above.get_title()) == ("exp1: as the camera sees it", "exp1: from above")
+    assert (front.get_title(), above.get_title()) == ("exp1: camera's view", "exp1: from above")
     assert front.get_aspect() == above.get_aspect() == 1.0
     assert front.get_xlim() == above.get_xlim()
     assert front.yaxis_inverted()
@@ -178,7 +178,7 @@ def test_steps_longer_than_the_period_are_marked_and_counted(tmp_path):
     ensembles = load(tmp_path / "out", rows, [made_up_steps("ukf_mfac"), slow])
     (axes,) = draw_step_times(ensembles, STYLES).axes
     texts = [text.get_text() for text in axes.texts]
-    assert [text for text in texts if "too slow" in text] == ["132 µs, 60 ms, 60 ms\n2 of 60 steps too slow"]
+    assert [text for text in texts if "too slow" in text] == ["132 µs, 60 ms, 60 ms\n2 of 60 too slow"]
     assert "control period, 50 ms" in texts
 
 
