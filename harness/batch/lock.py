@@ -238,9 +238,13 @@ def check_empty(folder: Path, *, can_resume: bool = False) -> None:
         can_resume: whether the batch could go on in it.
 
     Raises:
-        ConfigurationError: it has.
+        ConfigurationError: it has, or it cannot be looked at.
     """
-    if folder.exists() and not is_unused(folder):
+    try:
+        taken = folder.exists() and not is_unused(folder)
+    except OSError as error:
+        raise ConfigurationError(f"results folder {folder} cannot be written: {error.strerror}") from error
+    if taken:
         resume = ", or continue its batch with --resume" if can_resume and folder.is_dir() else ""
         raise ConfigurationError(f"results folder {folder} exists already; name another one with --out{resume}")
 

@@ -78,7 +78,9 @@ def logged_in_file(path: Path, controller: str, robot: str, sensing: str) -> tup
     try:
         table = reader(path)
         period = float(table["time_s"].diff().median())
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except KeyError as error:
+        raise ConfigurationError(f"{path} is no table with a column time_s") from error
+    except (OSError, ValueError, TypeError) as error:
         raise ConfigurationError(f"{path} is no table with a column time_s: {error}") from error
     if not period > 0.0:
         raise ConfigurationError(f"{path} needs two rows or more whose time_s grows; it has {len(table)}")

@@ -67,6 +67,9 @@ def _with_axis(mismatch: Mismatch, axis: str, magnitude: Magnitude) -> Mismatch:
     return mismatch.with_axis(axis, magnitude)
 
 
+OWN_OPTIONS = {"noise": "noise 0,1,2", "latency": "latency 0,0.05,0.1", "period": "period 0.02,0.05"}
+
+
 def parse_variation(text: str) -> Variation:
     """Return the axis and the magnitudes in `axis=begin:end:step` (both ends included) or `axis=one/another`.
 
@@ -76,6 +79,8 @@ def parse_variation(text: str) -> Variation:
         ConfigurationError: an unknown axis, or an empty or malformed range.
     """
     axis, _, values = text.strip().partition("=")
+    if axis in OWN_OPTIONS:
+        raise ConfigurationError(f"--vary: {axis} is no axis of the mismatch and has an option, --{OWN_OPTIONS[axis]}")
     try:
         return axis, parse_magnitudes(axis, values)
     except ValueError as error:

@@ -24,12 +24,12 @@ PlatformsOption = Annotated[
     typer.Option(help="Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine."),
 ]
 SeedOption = Annotated[int, typer.Option(help="Seed of the run whose robot this is.")]
-FileArgument = Annotated[Path, typer.Argument(help="The .fmu file.")]
+FileArgument = Annotated[Path, typer.Argument(dir_okay=False, help="The .fmu file.")]
 
 
 @fmu_app.command()
 def export(
-    output: Annotated[Path, typer.Option("--output", "-o", help="The .fmu file to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", dir_okay=False, help="The .fmu file to write.")],
     fmi: Annotated[int, typer.Option(help="2 or 3; an arm has co-simulation and model exchange.")] = 2,
     controller: Annotated[
         str | None,
@@ -63,7 +63,7 @@ def export(
 
 @fmu_app.command()
 def ssp(
-    output: Annotated[Path, typer.Option("--output", "-o", help="The .ssp file to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", dir_okay=False, help="The .ssp file to write.")],
     controller: Annotated[str, typer.Option(help="The controller.", autocompletion=completion.controllers)],
     mismatch: Annotated[str, typer.Option(help="Of the arm: none, factory, moderate, severe, or axes.")] = "none",
     robot: RobotOption = "ur5",

@@ -16,7 +16,8 @@ LEGEND = "The log does not answer to the controller, so that this does not say h
 
 def shadow(
     log: Annotated[
-        Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
+        Path,
+        typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps."),
     ],
     controller: Annotated[
         str | None,
@@ -39,6 +40,8 @@ def shadow(
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see
 
+    if not log.exists():
+        raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
     chosen = None if controller is None else choose_controller(controller)
     if log.is_dir():
         resolved, table = logged_in_folder(log, run, chosen)

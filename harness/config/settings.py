@@ -90,7 +90,7 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
     """Read a TOML file and apply `section.key=value` assignments on top of it.
 
     Raises:
-        ConfigurationError: an unreadable or malformed file, or a malformed assignment.
+        ConfigurationError: an unreadable or malformed file, a malformed assignment, or two of one setting.
     """
     sections: dict[str, Any] = {}
     if path is not None:
@@ -101,7 +101,13 @@ def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:
         for name, section in sections.items():
             if not isinstance(section, dict):
                 raise ConfigurationError(f"configuration file {path}: {name!r} stands outside a [section]")
-    return Settings(sections, tuple(_assign(sections, text) for text in assignments))
+    assigned: dict[tuple[str, str], Assignment] = {}
+    for text in assignments:
+        new = _assign(sections, text)
+        if old := assigned.get((new.section, new.key)):
+            raise ConfigurationError(f"--set gives {new.section}.{new.key} twice: {old.text} and {new.text}")
+        assigned[new.section, new.key] = new
+    return Settings(sections, tuple(assigned.values()))
 
 
 def flatten(config: Any, prefix: str = "") -> dict[str, Any]:  # noqa: ANN401 - any configuration dataclass
