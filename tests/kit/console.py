@@ -4,24 +4,35 @@ from __future__ import annotations
 
 import re
 import shlex
+import textwrap
 from pathlib import Path
 
 from kit.command import servobench
 from kit.documents import FENCED
 
-SAVED = re.compile(r"`([\w/]+\.\w+)`:\s*$")  # the line before a block that is a file
+BLOCK = re.compile(rf"{FENCED.pattern}|(?<=\n\n)((?: {{4}}[^\n]*\n)+)", FENCED.flags)  # fenced, or indented
+PASTED = re.compile(r" {4}(servobench|pip|python3?|for) ")  # an indented block that goes into a shell
+SAVED = re.compile(r"`([\w/-]+\.\w+)`:\s*$")  # the line before a block that is a file
 ELLIPSIS = "..."
 PROGRESS = re.compile(r"^(running|training)\b.*[━╸]|^report: ")  # times and sizes differ
 VARYING = re.compile(r"; \* some steps took longer than the period|\d+ (?=figure files)")  # 1: when busy
+SLOW = re.compile(r"^note +time .*longer than the period.*$")  # of a check, when busy
 CLOCK = re.compile(r"(?<=\S) +\d+\*? *$")  # the last column of a table of runs: microseconds of wall clock
 
 
 def steps(text):
-    """Yield what a page asks for in order: ("file", name, content) or ("command", words, lines that it prints)."""
+    """Yield what a page asks for in order.
+
+    ("file", name, content), ("command", words, lines that it prints), or what is pasted elsewhere and prints what it
+    likes: ("shell", lines, "") and ("python", code, "").
+    """
     end = 0
-    for match in FENCED.finditer(text):
+    for match in BLOCK.finditer(text):
         before, end = text[end : match.start()].rstrip(), match.end()
-        if match[1] == "console":
+        if match[3]:
+            if PASTED.match(match[3]):
+                yield "shell", textwrap.dedent(match[3]), ""
+        elif match[1] == "console":
             for session in re.split(r"^\$ ", match[2], flags=re.MULTILINE)[1:]:
                 command, _, printed = session.partition("\n")
                 while command.endswith("\\"):
@@ -30,6 +41,8 @@ def steps(text):
                 yield "command", shlex.split(command), printed
         elif saved := SAVED.search(before):
             yield "file", saved[1], match[2]
+        elif match[1] == "python":
+            yield "python", match[2], ""
 
 
 def plain(printed):
@@ -43,14 +56,15 @@ def plain(printed):
             found.append(" ".join(CLOCK.sub("", line).split()))
             text = []
         else:
-            text += line.split()
+            text += SLOW.sub("ok time", line).split()
     return found[:-1]
 
 
-def carry_out(text, monkeypatch, capsys, folder):
+def carry_out(text, monkeypatch, capsys, folder, paste=None):
     """Do what a page says in a folder, and return how many commands it had.
 
-    Every output is that of the page, with `...` for lines that are left out.
+    Every output is that of the page, with `...` for lines that are left out. Without `paste(kind, block)` only sessions
+    with a prompt are carried out.
     """
     monkeypatch.chdir(folder)
     count = 0
@@ -58,6 +72,10 @@ def carry_out(text, monkeypatch, capsys, folder):
         if kind == "file":
             Path(what).parent.mkdir(parents=True, exist_ok=True)
             Path(what).write_text(content, encoding="utf-8")
+            continue
+        if kind != "command":
+            if paste is not None:
+                paste(kind, what)
             continue
         assert what[0] == "servobench", what
         capsys.readouterr()
