@@ -86,12 +86,13 @@ class Examination:
         imported = Imported()
         reach = self._trace(session, imported) if session.items and not session.testsfailed else None
         self.sound = reach is not None
-        gc.freeze()  # so that children copy little
+        gc.freeze()  # so that children copy little; frozen objects are not found any more
         for mutant in self._mutants if reach is not None else []:
             if not self._fails(session, mutant, imported, reach):
                 self.survivors.append(str(mutant))
             self.tried += 1
             print(f"\r{self.tried} of {len(self._mutants)}, {len(self.survivors)} survived ", end="", flush=True)
+        gc.unfreeze()
         return True
 
     def _trace(self, session: pytest.Session, imported: Imported) -> Reach | None:
