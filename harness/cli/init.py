@@ -46,7 +46,7 @@ def init(
         for (kind, find), each in zip(finds.items(), names, strict=True)
         for name in each
     }
-    sections, defaults = resolve_sections(requests, settings), resolve_sections(requests, Settings())
+    sections, defaults = (resolve_sections(requests, each, to_run=False) for each in (settings, Settings()))
     text = configuration_file(sections, defaults, titles, f"run --config {'FILE' if file == PRINTED else file.name}")
     if file == PRINTED:
         sys.stdout.write(text)

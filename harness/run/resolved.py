@@ -22,6 +22,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.harness.run.teaching import taught
+from servobench.plant.plant import PlantEntry
 from servobench.plant.robot.robot import Robot
 from servobench.plant.sensing import change_sensing, vary_sensing
 
@@ -46,8 +47,13 @@ def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
     return select(request, resolve_sections([request], settings))
 
 
-def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict[str, Any]:
+def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_run: bool = True) -> dict[str, Any]:
     """Return the typed settings of every section that `requests` read, by name.
+
+    Args:
+        requests: the runs.
+        settings: what is set.
+        to_run: whether what the plants need has to be installed; their settings are known without it.
 
     Raises:
         ConfigurationError: an unknown name, or a setting that cannot be used.
@@ -61,7 +67,10 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings) -> dict
         if request.plant == request.controller:
             raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
     robot = _common_robot(requests)
-    defaults |= {name: _plant_default(name, robot) for name in dict.fromkeys(each.plant for each in requests)}
+    find = installed_plant if to_run else find_plant
+    defaults |= {
+        name: _plant_default(name, find(name), robot) for name in dict.fromkeys(each.plant for each in requests)
+    }
     defaults |= {
         name: default_config(find_controller(name), model_known=robot.known)
         for name in dict.fromkeys(each.controller for each in requests)
@@ -78,8 +87,7 @@ def _common_robot(requests: Iterable[RunRequest]) -> Robot:
     return find_robot(names[0])
 
 
-def _plant_default(name: str, robot: Robot) -> Any:  # noqa: ANN401 - any configuration dataclass
-    entry = installed_plant(name)
+def _plant_default(name: str, entry: PlantEntry, robot: Robot) -> Any:  # noqa: ANN401 - any configuration dataclass
     if entry.own_robot and robot.name != DEFAULT_ROBOT:
         raise ConfigurationError(f"plant {name} brings a robot of its own, so --robot {robot.name} does not apply")
     return entry.config() if entry.config_for is None else entry.config_for(robot)

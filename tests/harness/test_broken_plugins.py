@@ -11,6 +11,7 @@ import pytest
 
 from kit.command import PACKAGE
 from kit.own import CELL, CONFIGURED, install, write
+from servobench.harness.config.registry import RENDERED
 
 POINTS = """[servobench.controllers]
 whole = some_law:Mine
@@ -229,7 +230,7 @@ def test_the_list_marks_each_and_shows_the_others(told):
 def test_the_list_of_plants_marks_each_and_shows_the_others(told):
     code, out, _ = told["plants"]
     listed = [(each["name"], each.get("error")) for each in json.loads(out)]
-    errors = [error for _, error in listed if error]
+    errors = [error for name, error in listed if error and name not in RENDERED]  # which may be missing here
     assert code == 0
     assert errors[0] == PLANTS["crashing"]
     assert errors[1] == PLANTS["ending"]

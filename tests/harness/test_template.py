@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 
 from kit.command import servobench
+from servobench.harness.config import registry
 from servobench.harness.config.describe import describe_settings
 from servobench.harness.config.registry import controller_names
-from servobench.harness.config.settings import flatten, read_settings
+from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
 from servobench.harness.config.template import configuration_file
+from servobench.harness.run import resolved
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve_sections
 from servobench.harness.run.tasks import TASKS
@@ -22,7 +25,7 @@ PLANTS = ("kinematic", "bullet", "mujoco", "fmu")
 
 def sections(plants, controllers, tasks, *assignments, path=None):
     requests = [RunRequest(*each, "none", 0) for each in product(plants, controllers, tasks)]
-    return resolve_sections(requests, read_settings(path, assignments))
+    return resolve_sections(requests, read_settings(path, assignments), to_run=False)
 
 
 def assert_same(found, wanted):
@@ -93,3 +96,12 @@ def test_a_wrong_name_is_one_line_and_writes_nothing(monkeypatch, capsys, tmp_pa
     assert servobench(monkeypatch, "init", *arguments) == 2
     assert line in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_of_a_plant_that_cannot_run_here_can_be_written(monkeypatch):
+    missing = replace(registry.find_plant("bullet"), needs=("a_package_that_is_not_there",))
+    monkeypatch.setattr(resolved, "find_plant", lambda _: missing)
+    monkeypatch.setattr(registry, "find_plant", lambda _: missing)
+    assert "bullet" in sections(("bullet",), ("constant",), ("exp2",))
+    with pytest.raises(ConfigurationError, match="plant 'bullet' needs a_package_that_is_not_there"):
+        resolve_sections([RunRequest("bullet", "constant", "exp2", "none", 0)], Settings())
