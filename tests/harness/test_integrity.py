@@ -62,7 +62,8 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "out"
     run(folder)
     assert results.load_runs(folder)["status"].nunique() > 1
-    assert examine(folder).findings == []
+    found = examine(folder)
+    assert (found.findings, found.runs, found.wanted) == ([], RUNS, RUNS)
     return folder
 
 
@@ -107,8 +108,10 @@ def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(half, who
     for command in (results.load_runs, results.collect):
         with pytest.raises(DamagedFile, match=rf"00000008\.runs\.parquet {what}; repeat .* --resume, or type: servob"):
             command(folder)
-    (finding,) = examine(folder).findings
+    found = examine(folder)
+    (finding,) = found.findings
     assert (finding.name, finding.what) == (results.part_name(8, results.RUNS), what)
+    assert found.runs == RUNS - 16
     resumed = run(folder, resume=True)
     assert resumed.repeated == 16
     assert any(f"{part} {what}: its runs are carried out again" in note for note in resumed.notes)
@@ -322,7 +325,9 @@ def test_a_changed_bit_is_found_by_the_pages_where_nothing_vouches_for_a_table(h
     content[60] ^= 1  # within the first page
     place.write_bytes(content)
     named = {each.name: each.what for each in examine(folder).findings}
-    assert named[results.part_name(8, results.RUNS)].startswith("cannot be read (")
+    said = named[results.part_name(8, results.RUNS)]
+    assert said.startswith("cannot be read (")
+    assert "CRC" in said  # the words of the library
 
 
 def test_a_manifest_of_another_schema_is_not_written_anew(half, tmp_path):
