@@ -46,7 +46,7 @@ def extract_fmu(path: Path) -> Path:
     """
     try:
         if not path.is_file():
-            raise ValueError(f"fmu file {path} does not exist")
+            raise ValueError(f"fmu file {path} {'is a directory' if path.is_dir() else 'does not exist'}")
         status = path.stat()
         digest = _digest(path.resolve(), status.st_mtime_ns, status.st_size)
     except OSError as error:

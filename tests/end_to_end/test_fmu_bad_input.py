@@ -52,7 +52,7 @@ def write(path: Path, entries: dict[str, str]) -> None:
 # What is wrong before anything is loaded; all three commands say so.
 ARCHIVES = {
     "no such file": (lambda path: None, "crane.fmu does not exist"),
-    "a folder": (lambda path: path.mkdir(), "crane.fmu does not exist"),
+    "a folder": (lambda path: path.mkdir(), " is a directory"),
     "not a zip": (lambda path: path.write_text("hello"), "crane.fmu is not a zip archive"),
     "climbs": (
         lambda path: write(path, {"modelDescription.xml": "<x/>", "../../evil.txt": "evil"}),

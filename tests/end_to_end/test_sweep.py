@@ -142,7 +142,7 @@ def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(undisturbed
     assert "exists already" in capsys.readouterr().err
     assert servobench(monkeypatch, *SWEEP, "--seeds", "5", "--out", str(undisturbed), "--resume") == 2
     assert "holds results of other runs or settings" in capsys.readouterr().err
-    assert servobench(monkeypatch, *SWEEP, "--set", "random.duration=3", "--out", str(undisturbed), "--resume") == 2
+    assert servobench(monkeypatch, *SWEEP, "--set", "kinematic.lag=0.03", "--out", str(undisturbed), "--resume") == 2
     assert "holds results of other runs or settings" in capsys.readouterr().err
 
 
