@@ -6,6 +6,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
+import pandas as pd
+
 from servobench.harness.config.settings import ConfigurationError
 
 NEEDED: Final = {
@@ -28,3 +30,14 @@ def refuse_lacking(path: Path, kind: str, columns: Collection[str]) -> None:
     """
     if lack := lacking(kind, columns):
         raise ConfigurationError(f"{path} is no table of {kind}: it {lack}")
+
+
+def refuse_nameless(path: Path, runs: pd.DataFrame) -> None:
+    """Refuse a table of runs in which one does not say which it is.
+
+    Raises:
+        ConfigurationError: names the table, the column and the row.
+    """
+    for name in NEEDED["runs"]:
+        if (empty := runs[name].isna()).any():
+            raise ConfigurationError(f"{path} is no table of runs: row {int(empty.to_numpy().argmax())} has no {name}")

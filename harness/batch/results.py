@@ -32,7 +32,7 @@ from servobench.harness.batch.checksums import (
     write_vouched,
     writing,
 )
-from servobench.harness.batch.columns import refuse_lacking
+from servobench.harness.batch.columns import refuse_lacking, refuse_nameless
 from servobench.harness.batch.lock import PARTS, check_empty
 from servobench.harness.batch.manifest_text import decode, encode
 from servobench.harness.config.settings import ConfigurationError
@@ -209,6 +209,7 @@ def load_runs(folder: Path) -> pd.DataFrame:
     names = _intact(folder, RUNS)
     runs = parquet.read_tables(folder, names)
     refuse_lacking(folder / names[0], "runs", runs.columns)
+    refuse_nameless(folder / names[0], runs)
     return runs
 
 

@@ -170,7 +170,7 @@ def parse_magnitudes(axis: str, text: str) -> tuple[Magnitude, ...]:
             raise ValueError(
                 f"the range {text!r} of {axis} has more than {MAX_MAGNITUDES:,} magnitudes; use larger steps"
             )
-        count = math.floor(steps) + 1
+        count = math.floor(max(steps, -1.0)) + 1  # none where it begins beyond its end
         numbers = [round(begin + i * step, 9) for i in range(count)]
     if not numbers:
         raise ValueError(f"the range {text!r} of {axis} is empty")

@@ -94,6 +94,9 @@ def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa:
     """Return the turning joints from the base to a tip, the flange after the last one, and the name of the tip."""
     above = {joint.child: joint for joint in tree.joints}
     links = [link.name for link in tree.links]
+    for joint in tree.joints:
+        if lost := {joint.parent, joint.child} - set(links):
+            raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(map(str, lost))!r}")
     if tip and tip not in links:
         raise ValueError(f"it has no link {tip!r}; valid: {', '.join(links)}")
     ways = {name: _way(name, above) for name in ([tip] if tip else links)}

@@ -116,6 +116,7 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
     [
         (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens': did you mean 'links'? valid: "),
         (("--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
+        (("--vary", f"links={'9' * 320}:30:10%"), "of links is empty"),
         (("--noise", "loud"), "--noise must be comma-separated numbers, got 'loud'"),
         (("--noise", "-1"), "--noise must be numbers from 0 on, got '-1'"),
         (("--latency", "1,2"), "--latency is in seconds, below 1, such as 0.05 for a period of 20 Hz; got '1,2'"),

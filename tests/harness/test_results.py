@@ -270,6 +270,15 @@ def test_a_foreign_table_that_lacks_a_column_is_read_without_it_or_refused_in_on
     assert set(refused) - set(needed) <= {"settling_time_s", "rms_error_evaluated"}  # what pairs are compared by
 
 
+def test_a_run_that_does_not_say_which_it_is_is_named(tmp_path):
+    folder = comparison(tmp_path / "out")
+    (folder / SUMS).unlink()
+    runs = results.load_runs(folder)
+    runs.assign(controller=runs["controller"].where(runs.index != 1)).to_parquet(folder / results.RUNS)
+    with pytest.raises(ConfigurationError, match=r"runs.parquet is no table of runs: row 1 has no controller$"):
+        results.load_runs(folder)
+
+
 def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
     folder = comparison(tmp_path / "out")
     (folder / SUMS).unlink()

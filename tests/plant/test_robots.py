@@ -253,6 +253,13 @@ def test_a_urdf_that_is_no_xml_is_one_line_in_which_its_reader_says_why(tmp_path
     assert caplog.records == []
 
 
+def test_a_urdf_whose_joints_name_links_that_it_lacks_is_one_line(tmp_path):
+    pytest.importorskip("yourdfpy")
+    (tmp_path / "arm.urdf").write_text(odd_urdf().replace('<link name="link_1"/>', '<link name="dink_1"/>'))
+    with pytest.raises(ValueError, match=r"joint 'joint_1' is between links of which the file has no 'link_1'"):
+        find_robot(str(tmp_path / "arm.urdf"))
+
+
 def test_arms_that_are_drawn_differ_and_each_is_the_same_for_ever():
     seven, again, eight = random_robot(7), random_robot(7), random_robot(8)
     q = np.full(seven.n, 0.3)
