@@ -160,8 +160,8 @@ RATES_STUDY = Study(
     "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic` and 10 on `bullet`",
     30,
     {
-        "kinematic": sweep("kinematic", BOTH, "random", "44000:44100", "--period", PERIODS),
-        "bullet": sweep("bullet", RENDERED, "random", "44100:44110", "--period", PERIODS, *SHORT, *RENDERING),
+        "kinematic": sweep("kinematic", BOTH, "random", "52000:52100", "--period", PERIODS),
+        "bullet": sweep("bullet", RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT, *RENDERING),
     },
     rates_table,
 )
