@@ -26,10 +26,10 @@ def deviations(found, stored):
 
 
 @pytest.mark.parametrize("plant", plant_parameters(golden.DURATIONS))
-def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(plant):
+def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(plant, tmp_path):
     if plant == "mujoco" and golden.RENDERER not in engine_of(plant):
         pytest.skip(f"the images of the table are of {golden.RENDERER}, and those here of {engine_of(plant)}")
-    found, stored = golden.golden_runs(plant), golden.stored()
+    found, stored = golden.made_apart(tmp_path, [plant]), golden.stored()
     stored = stored[stored["plant"] == plant].reset_index(drop=True)
     assert found["controller"].tolist() == stored["controller"].tolist(), RENEW
     commands, settled = deviations(found, stored)
