@@ -11,10 +11,11 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law, Stage
-from servobench.controllers.laws.preview import check_preview, in_periods, sampled
+from servobench.controllers.laws.preview import check_preview, sampled
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, sum_of_squares, update_step
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
+from servobench.controllers.periods import in_periods
 from servobench.controllers.stages.inverses import project_to_row_space
 from servobench.controllers.stages.joint_response import pushed
 from servobench.controllers.stages.limit import largest_excess

@@ -27,8 +27,9 @@ import numpy as np
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
+from servobench.controllers.periods import whole_periods
 from servobench.controllers.sight import of_points, seen_through, through
-from servobench.controllers.stages.pairing import NO_DEPTH, Paired, Pairing, PairState, whole_periods
+from servobench.controllers.stages.pairing import NO_DEPTH, Paired, Pairing, PairState
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch, norm, transposed
 from servobench.plant.signals import BoolArray, Observation

@@ -4,11 +4,11 @@
     Δy ≈ M x_d                                                             M a map (m, m), of a turned camera
 
 Where it is known how cameras see points, x_d has the motions of the points, and a map turns those of each camera
-(`sight_map`); else a map is a matrix between features (`feature_map`). For each candidate delay d a filter holds a map;
-the delay is that of the filter that predicts best:
+(`sight_map`); else a map is a matrix between features (`feature_map`). For each candidate delay d, in periods and not
+always a whole number of them, a filter holds a map; the delay is that of the filter that predicts best:
 
     P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← update(x_d, Δy)        for each delay d
-    d = argmin ℓ_d, once it is better than the present one by a margin
+    d = argmin ℓ_d, once it is better than the present one by a margin; motions that tell no delays apart are left out
     M̄, R = completed(M_d, P_d)
 
 P returns to P₀ for all delays when the camera seems to have been moved: a feature step that no motion of the arm
@@ -18,7 +18,6 @@ gate. M stays, as the best guess. The first sample of the noise σ is a guess (`
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple, TypeAlias, final
 
 import numpy as np
@@ -26,8 +25,10 @@ import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.estimators.estimator import MOTION_TIME
+from servobench.controllers.periods import in_periods, whole_periods
 from servobench.controllers.sight import Sight
 from servobench.controllers.stages.camera_map import CameraMap, Step, of_delay
+from servobench.controllers.stages.candidates import Candidates
 from servobench.controllers.stages.feature_map import FeatureMap
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.sight_map import SightMap
@@ -36,20 +37,15 @@ from servobench.plant.lanes import branch, norm, pick
 from servobench.plant.signals import BoolArray, Observation, PlantSpec
 
 MAX_GAP = 16  # motions of the least length that one over lost frames may span; from a longer one nothing is learned
-MAX_CANDIDATES = 25  # delays that are compared; at fast rates they lie more than one period apart
 MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
 MIN_JUMP_DEVIATIONS = 10.0  # [σ] above which it is no noise either
+UNSTEADY = 0.8  # [1] change of a motion from one candidate to the next over noise, above which delays differ
+BIASED = 0.25  # [1] error of the model over noise, above which it decides between delays that explain a motion alike
 NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), of one motion in the score of a delay
 CUSUM_DRIFT = 3.0  # [1] NIS per feature that is subtracted at each motion; 1 is its expectation
 CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier cannot reach the gate
-NOW_AND_BEFORE = np.array([0, 1])
 NO_DEPTH = np.zeros(0)
 Bank: TypeAlias = Any  # of either form of map
-
-
-def whole_periods(time: float, period: float) -> int:
-    """Return the number of control periods that is nearest to a time [s]."""
-    return round(time / period)
 
 
 class PairState(NamedTuple):
@@ -120,13 +116,14 @@ class Pairing:
         """
         self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
         motion = max(1, whole_periods(MOTION_TIME, spec.period))
-        longest = whole_periods(aids.longest_delay, spec.period)
-        spacing = max(1, math.ceil(longest / (MAX_CANDIDATES - 1)))
-        given = whole_periods(latency, spec.period) if aids.delay == "given" else 0
-        candidates = np.arange(0, longest + 1, spacing) if aids.delay == "identified" else np.array([given])
-        self.delays: npt.NDArray[np.int_] = candidates
+        if aids.delay == "identified":
+            self._candidates = Candidates.up_to(aids.longest_delay, spec.period)
+        else:
+            given = in_periods(latency, spec.period) if aids.delay == "given" else 0.0
+            self._candidates = Candidates(np.array([given]))
+        self.delays = self._candidates.delays
         self.gap = MAX_GAP * motion
-        self._rows = int(candidates[-1]) + self.gap + 2
+        self._rows = self._candidates.longest + self.gap + 3
         self._aligns = aids.model == "map"
         self.learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
         self._sight = sight
@@ -165,14 +162,13 @@ class Pairing:
         new[..., 0, end:] = depth
         return state._replace(past=new)
 
-    def delay(self, state: PairState) -> npt.NDArray[np.int_]:
+    def delay(self, state: PairState) -> FloatArray:
         """Return d, (...), periods."""
-        delay: npt.NDArray[np.int_] = np.take(self.delays, state.candidate)
-        return delay
+        return np.asarray(np.take(self.delays, state.candidate))[()]
 
     def exposed(self, state: PairState) -> tuple[FloatArray, FloatArray]:
         """Return q(k−d) and q(k−d) − q(k−d−1), (..., n), rad."""
-        rows = pick(state.past, self.delay(state)[..., None] + NOW_AND_BEFORE, axes=1)[..., : self._n]
+        rows = self._candidates.exposed(state.past[..., : self._n], state.candidate)
         return rows[..., 0, :], rows[..., 0, :] - rows[..., 1, :]
 
     def noise(self, state: PairState) -> FloatArray | None:
@@ -197,8 +193,7 @@ class Pairing:
             valid: features that were seen at both ends, (..., m).
         """
         n, periods = self._n, np.rint(duration / self._period).astype(np.int_)
-        begin = pick(state.past, self.delays + periods[..., None], axes=1)
-        end = state.past[..., self.delays, :]
+        begin, end = self._candidates.begins(state.past, periods), self._candidates.ends(state.past)
         passed = end - begin
         x, depth = passed[..., n : self._end], 0.5 * (begin + end)[..., self._end :]
         rates = np.zeros((*feature.shape[:-1], 0))
@@ -271,7 +266,8 @@ class Pairing:
             moved = cusum > aids.move_gate
             bank = branch(moved, self._learn_any_map, bank, before, step, lengths, frame)
             cusum, moves = cusum * ~moved, moves + moved
-        scores = aids.score_memory * state.scores + np.minimum(said.nis, NIS_CAP) + said.spread
+        told = self._tells_delays_apart(step, lengths, noise)[..., None]
+        scores = aids.score_memory * state.scores + (np.minimum(said.nis, NIS_CAP) + said.spread) * told
         best = scores.argmin(axis=-1)
         better = pick(scores, best) < pick(scores, candidate) - aids.delay_margin
         candidate = np.where(better, best, candidate)[()]
@@ -282,6 +278,17 @@ class Pairing:
             return state
         nearest, rotation = self.maps.completed(of_delay(bank, candidate), state.rotation)
         return state._replace(map=nearest, rotation=rotation)
+
+    def _tells_delays_apart(self, step: Step, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
+        """Return whether a motion counts in the scores, (...).
+
+        A steady one hardly differs from one delay to another. What differs is which of the noise of frames, as the
+        loop turned it into motion, is in it, and an error of the model is then easily taken for that noise.
+        """
+        changes = self.maps.lengths(step._replace(x=step.x - step.x[..., self._candidates.beside, :]))
+        change, length = (np.maximum.reduce(each, axis=-1) for each in (changes, lengths))
+        error = self._aids.map_error * length
+        return np.asarray((change >= UNSTEADY * noise.deviation) | (error < BIASED * noise.deviation))
 
     def _learn_any_map(self, bank: Bank, before: Bank, step: Step, lengths: FloatArray, frame: FloatArray) -> Bank:
         return self.maps.update(self.maps.unknown(before, frame), step, lengths, frame)[0]

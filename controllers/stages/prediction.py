@@ -16,20 +16,18 @@ from dataclasses import replace
 from typing import NamedTuple, final
 
 import numpy as np
-import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
+from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.feature_filter import FeatureFilter
 from servobench.controllers.stages.joint_response import WINDOW, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.pairing import whole_periods
 from servobench.plant.checks import FloatArray
 from servobench.plant.lanes import branch
 from servobench.plant.signals import BoolArray, Observation
 
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
-IntArray = npt.NDArray[np.int_]
 
 
 class Prediction(NamedTuple):
@@ -56,7 +54,7 @@ class Past(NamedTuple):
         window: q(k) − q(k−w), (..., n), rad, over the w periods of a window of the response.
     """
 
-    delay: IntArray
+    delay: FloatArray
     exposed: FloatArray
     before: FloatArray
     window: FloatArray
@@ -73,7 +71,7 @@ class PredictorState(NamedTuple):
 
     response: JointResponse
     filter: FeatureFilter
-    delay: IntArray
+    delay: FloatArray
 
 
 @final
@@ -111,7 +109,7 @@ class Predictor:
             response = JointResponse.given(delays.command_delay, delays.lag, self._period, count, q)
         else:
             response = JointResponse.immediate(self._length, q, self._period, self.window)
-        return PredictorState(response, FeatureFilter(y, noise.variance, noise), np.full(y.shape[:-1], -1))
+        return PredictorState(response, FeatureFilter(y, noise.variance, noise), np.full(y.shape[:-1], -1.0))
 
     def predict(
         self, state: PredictorState, jacobian: FloatArray, past: Past, observation: Observation

@@ -60,6 +60,12 @@ def test_the_noise_of_frames_does_not_hide_the_delay_of_a_camera_from_an_arm_tha
         assert found["rms_error_evaluated"] < 0.003
 
 
+@pytest.mark.parametrize("name", [*IDENTIFYING, "calibrated"])
+def test_a_latency_of_half_a_period_costs_little_more_than_one_of_a_period(name):
+    half, whole = (row(name, "circle", "moderate", 2, latency=latency) for latency in (0.025, 0.05))
+    assert half["rms_error_evaluated"] < 1.6 * whole["rms_error_evaluated"]
+
+
 @pytest.mark.parametrize(
     ("name", "sensing", "seed"),
     [("map_mfac", "position", 40448), ("ukf_mfac", "position", 40448), ("map_mfac", "stereo", 40450)],

@@ -93,6 +93,15 @@ def test_the_latency_in_seconds_is_found_at_every_rate(period, latency):
     np.testing.assert_allclose(made.pair.map, TURN, atol=0.1)  # the delay may lie between two candidates
 
 
+@pytest.mark.parametrize(("period", "latency"), [(0.05, 0.025), (0.05, 0.0875), (0.02, 0.05)])
+def test_a_latency_between_two_periods_is_found(period, latency):
+    fine, parts = path(4.0, period / 8), 8
+    y = features(fine, TURN, round(parts * latency / period))[::parts]
+    made = Following(period).follow(fine[::parts], y + 2e-4 * np.random.default_rng(0).normal(size=y.shape))
+    assert made.found["delay"] == pytest.approx(latency, abs=0.007)
+    np.testing.assert_allclose(made.pair.map, TURN, atol=0.05)
+
+
 def test_the_delay_is_found_within_a_few_motions():
     q, found = path(0.6), []
     for seed in range(20):
@@ -101,15 +110,16 @@ def test_the_delay_is_found_within_a_few_motions():
     assert found.count(2) >= 18
 
 
-@pytest.mark.parametrize("latency", [0.0, 0.1, 0.25])
+@pytest.mark.parametrize("latency", [0.0, 0.06, 0.1, 0.25])
 def test_a_given_delay_is_used_as_it_is(latency):
     made, q = Following(latency=latency, delay="given"), path(1.0)
     made.follow(q, features(q, TURN, 4))
     assert made.found["delay"] == pytest.approx(latency)
     exposed, before = made.stages.pairing.exposed(made.pair)
-    d = round(latency / PERIOD)
-    np.testing.assert_array_equal(exposed, q[len(q) - 1 - d])
-    np.testing.assert_array_equal(before, q[len(q) - 1 - d] - q[len(q) - 2 - d])
+    at, rows = len(q) - 1 - latency / PERIOD, np.arange(len(q))
+    wanted = [np.array([np.interp(place, rows, joint) for joint in q.T]) for place in (at, at - 1.0)]
+    np.testing.assert_allclose(exposed, wanted[0], atol=1e-15)
+    np.testing.assert_allclose(before, wanted[0] - wanted[1], atol=1e-15)
 
 
 def test_the_map_is_that_of_generalised_least_squares():

@@ -291,7 +291,7 @@ def test_a_delay_that_is_found_to_be_another_restarts_the_filter_at_the_frame():
     exposed, _ = made.stages.pairing.exposed(made.stages.pairing.advance(learned.pair, made.look.joint_position))
     bound = made.predict()
     np.testing.assert_allclose(bound.feature, made.look.feature + A @ (made.look.joint_position - exposed))
-    assert made.state.delay == 3
+    assert made.state.delay == made.stages.pairing.delays[3]
 
 
 def test_the_shifted_reference_is_interpolated_and_goes_on():

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servobench.controllers.laws.preview import check_preview, in_periods, sampled
+from servobench.controllers.laws.preview import check_preview, sampled
+from servobench.controllers.periods import in_periods
 
 
 @given(

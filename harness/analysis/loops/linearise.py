@@ -67,7 +67,7 @@ def frozen(servo: Servo, state: ServoState, jacobian: JacobianFunction) -> tuple
     if pairing is not None:
         pair = estimation.learned.pair
         window = 0 if servo.predictor is None else servo.predictor.window
-        rows = max(int(pairing.delay(pair)) + 2, window + 1)
+        rows = max(int(pairing.delay(pair)) + 3, window + 1)
         learned = estimation.learned._replace(pair=pair._replace(past=pair.past[:rows]))
         estimation = estimation._replace(learned=learned)
     return other, state._replace(estimation=estimation)
