@@ -188,7 +188,7 @@ HELD_OUT = Study(
 RENDERED_STUDY = Study(
     "rendered",
     "36 held-out robots on rendered images, on both physics engines",
-    60,
+    30,
     on_engines(lambda plant: sweep(plant, RENDERED, "random,circle", "42004:42040", *bare(plant))),
     rendered_tables,
 )

@@ -176,7 +176,7 @@ SWITCHES: Final[Mapping[str, tuple[str, ...]]] = {
 RATES_STUDY = Study(
     "rates",
     "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic`, 10 on each physics engine",
-    45,
+    35,
     {"kinematic": sweep("kinematic", BOTH, "random", "44000:44100", "--period", PERIODS)}
     | on_engines(
         lambda plant: sweep(plant, RENDERED, "random", "44100:44110", "--period", PERIODS, *SHORT, *bare(plant))
@@ -203,7 +203,7 @@ ENDS = Study(
 DYNAMICS = Study(
     "dynamics",
     "what each switch of `bullet` and `mujoco` does to each method, and both against `kinematic`",
-    60,
+    50,
     {"kinematic": sweep("kinematic", RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT)}
     | on_engines(rendered)
     | {
