@@ -177,9 +177,9 @@ RATES_STUDY = Study(
     "rates",
     "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic`, 10 on each physics engine",
     35,
-    {"kinematic": sweep("kinematic", BOTH, "random", "44000:44100", "--period", PERIODS)}
+    {"kinematic": sweep("kinematic", BOTH, "random", "52000:52100", "--period", PERIODS)}
     | on_engines(
-        lambda plant: sweep(plant, RENDERED, "random", "44100:44110", "--period", PERIODS, *SHORT, *bare(plant))
+        lambda plant: sweep(plant, RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT, *bare(plant))
     ),
     rates_table,
 )
