@@ -70,13 +70,15 @@ def named_methods(kind: str) -> str:
 
 
 def measured_table(name: str, folder: Path) -> str:
-    """Return a table of docs/tables with a line that says when it was made.
+    """Return a table of docs/tables with a line that says when it was made; nothing before its study was carried out.
 
     Args:
         name: of the table.
         folder: of the page, from which its links go.
     """
     path = stored_tables.FOLDER / f"{name}.csv"
+    if not path.exists():
+        return ""
     stamp, rows = stored_tables.read(path)
     place = Path(os.path.relpath(path, folder)).as_posix()
     made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"

@@ -133,6 +133,7 @@ def write_fmi3(description: Description, token: str) -> bytes:
         "canGetAndSetFMUState": "true",
         "canSerializeFMUState": "true",
         "providesDirectionalDerivatives": "true" if description.exchange else "false",
+        "providesAdjointDerivatives": "true" if description.exchange else "false",
     }
     if description.exchange:
         ET.SubElement(root, "ModelExchange", capabilities)

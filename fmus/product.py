@@ -34,7 +34,10 @@ HEADERS: Final = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
-FMI_SOURCES: Final = {2: ("fmi2.c", "fmi2_exchange.c"), 3: ("fmi3.c", "fmi3_exchange.c", "fmi3_absent.c")}
+FMI_SOURCES: Final = {
+    2: ("fmi2.c", "fmi2_exchange.c"),
+    3: ("fmi3.c", "fmi3_exchange.c", "fmi3_derivatives.c", "fmi3_absent.c"),
+}
 INSTANCE_HEADERS: Final = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
 SHARED_SOURCES: Final = ("model.c", "instance.c")
 ZIP_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date that a zip archive can hold
@@ -72,7 +75,13 @@ class Product:
     def sources(self) -> dict[str, str]:
         """Return the C files by their path in the archive, with a placeholder for the token."""
         described, version_ = self.description, self.fmi_version
-        machinery = ("instance.h", "instance.c", INSTANCE_HEADERS[version_], *FMI_SOURCES[version_])
+        machinery = (
+            "model_functions.h",
+            "instance.h",
+            "instance.c",
+            INSTANCE_HEADERS[version_],
+            *FMI_SOURCES[version_],
+        )
         texts = {name: committed(MACHINERY, name) for name in machinery}
         texts |= {name: committed(self.folder, name) for name in (f"{self.core}.h", "model.h", "model.c")}
         texts |= {name: (files("fmpy") / "c-code" / name).read_text(encoding="utf-8") for name in HEADERS[version_]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from page_studies.aids import AIDS
 from page_studies.audit import AUDIT
 from page_studies.claims import CLAIMS
-from page_studies.engines import ENGINES
+from page_studies.engines import CLAIMS_ENGINES, MAP_ENGINES
 from page_studies.eyes import EYES
 from page_studies.failures import FAILURES
 from page_studies.held_out import HELD_OUT, RENDERED_STUDY, TUNING_STUDIES
@@ -18,7 +18,7 @@ from page_studies.worlds import LEARNING, MAP, PAIRS_STUDY, WORLDS
 STUDIES = {
     study.name: study
     for study in (
-        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, AUDIT, CLAIMS, ENGINES, RATES_STUDY, LONG, ENDS, DYNAMICS,
-        WORLDS, LEARNING, PAIRS_STUDY, EYES, MAP, README, FAILURES, PERFORMANCE, *NOISE_STUDIES,
+        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, AUDIT, CLAIMS, CLAIMS_ENGINES, RATES_STUDY, LONG, ENDS,
+        DYNAMICS, WORLDS, LEARNING, PAIRS_STUDY, EYES, MAP, MAP_ENGINES, README, FAILURES, PERFORMANCE, *NOISE_STUDIES,
     )
 }  # fmt: skip

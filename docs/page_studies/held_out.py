@@ -28,6 +28,7 @@ from page_studies.methods import (
     share,
     worst_errors,
 )
+from page_studies.side_by_side import ENGINES, bare, differences, on_engines
 from page_studies.study import Study, Words, sweep
 from servobench.harness.analysis.statistics import MISSING
 from servobench.harness.batch.results import load_runs
@@ -48,9 +49,35 @@ def tables(folder: Path) -> dict[str, pd.DataFrame]:
     }
 
 
-def rendered_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the same of all methods on rendered images."""
-    return {"held_out_rendered": pd.DataFrame(method_rows(load_runs(folder / "rendered")))}
+def rendered_tables(folder: Path) -> dict[str, pd.DataFrame]:
+    """Return the same of all methods on rendered images, and the differences between methods, on both engines."""
+    runs = {engine: load_runs(folder / engine) for engine in ENGINES}
+    rows = zip(*(method_rows(runs[engine]) for engine in ENGINES), strict=True)
+    beside = [
+        {"method": row.pop("method"), "division": row.pop("division"), "plant": engine} | row
+        for both in rows
+        for engine, row in zip(ENGINES, both, strict=True)
+    ]
+    return {"held_out_rendered": pd.DataFrame(beside), "held_out_engines": pd.DataFrame(engine_rows(runs))}
+
+
+def engine_rows(runs: Mapping[str, pd.DataFrame]) -> Iterator[dict[str, str]]:
+    """Yield the better method against each other one on both engines, what holds on one only in bold."""
+    pairs = [pair for pair in method_pairs() if set(pair) <= set(RENDERED)]
+    moves, circles = (
+        differences(
+            {engine: own[own["task"] == task] for engine, own in runs.items()},
+            pairs, metric=metric, never=never, digits=digits, factor=factor,
+        )
+        for task, metric, never, digits, factor in (
+            ("random", "settling_time_s", MOVE, 2, 1.0),
+            ("circle", "rms_error_evaluated", LOST, 1, 1e3),
+        )
+    )  # fmt: skip
+    for (first, second), move, circle in zip(pairs, moves, circles, strict=True):
+        row = {"pair": f"{quoted(first)} − {quoted(second)}"}
+        row |= {f"settling time on `{engine}`, s": move[engine] for engine in ENGINES}
+        yield row | {f"circle on `{engine}`, mm": circle[engine] for engine in ENGINES}
 
 
 def studies_table(folder: Path) -> dict[str, pd.DataFrame]:
@@ -88,8 +115,7 @@ def headline_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
 
 def pair_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
     """Yield the better method against each other one, and each method best equipped against itself as published."""
-    pairs = [(BETTER, name) for name in BOTH if name != BETTER]
-    pairs += [(name.removesuffix(SUFFIX), name) for name in PUBLISHED]
+    pairs = method_pairs()
     moves, circles = (
         paired(runs[runs["task"] == task], pairs, metric=metric, never=never)
         for task, metric, never in (("random", "settling_time_s", MOVE), ("circle", "rms_error_evaluated", LOST))
@@ -100,6 +126,12 @@ def pair_rows(runs: pd.DataFrame) -> Iterator[dict[str, str]]:
             "settling time, s": difference(move),
             "circle, mm": difference(circle, 1, 1e3),
         }
+
+
+def method_pairs() -> list[tuple[str, str]]:
+    """Return the better method with each other one, and each method best equipped with itself as published."""
+    pairs = [(BETTER, name) for name in BOTH if name != BETTER]
+    return pairs + [(name.removesuffix(SUFFIX), name) for name in PUBLISHED]
 
 
 def study_rows(folder: Path) -> Iterator[dict[str, str]]:
@@ -155,10 +187,10 @@ HELD_OUT = Study(
 )
 RENDERED_STUDY = Study(
     "rendered",
-    "36 held-out robots on rendered images",
-    40,
-    {"rendered": sweep("bullet", RENDERED, "random,circle", "42004:42040", "--set", "bullet.scenery=false")},
-    rendered_table,
+    "36 held-out robots on rendered images, on both physics engines",
+    30,
+    on_engines(lambda plant: sweep(plant, RENDERED, "random,circle", "42004:42040", *bare(plant))),
+    rendered_tables,
 )
 TUNING_STUDIES = Study(
     "tuning",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -23,30 +23,40 @@ from page_studies.methods import (
     settling,
     short,
 )
+from page_studies.side_by_side import ENGINES, bare, differences, marked, most, on_engines
 from page_studies.study import Study, sweep
 from servobench.harness.analysis.comparison import column_of, outcomes, settling_times
-from servobench.harness.analysis.statistics import median_with_interval, success_rate
+from servobench.harness.analysis.statistics import median_with_interval
 from servobench.harness.batch.results import load_runs
 from servobench.harness.run.ending import COMPLETED
 
 RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
+NOWHERE: Final = "nowhere"
 PERIODS: Final = ",".join(f"{1.0 / rate:g}" for rate in RATES)
 SHORT: Final = ("--set", "random.duration=5")  # [s]; a bullet run costs seconds, and methods settle within three
-RENDERING: Final = ("--set", "bullet.scenery=false")  # the same observations, bit for bit
 CURVES: Final = ("circle", "lemniscate")
 
 
 def rates_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return how many robots settle and when at each rate, and where a faster rate is worse than the next one."""
-    rows = []
-    for plant in ("kinematic", "bullet"):
-        runs = load_runs(folder / plant)
-        for name, own in by_method(runs):
-            at = {rate: own[np.isclose(own["period_s"], 1.0 / rate)] for rate in RATES}
-            worse = [f"{fast} Hz: {words}" for slow, fast in pairwise(RATES) if (words := loss(at[slow], at[fast]))]
-            cells = {f"{rate} Hz": count_and_median(each) for rate, each in at.items()}
-            rows.append({"method": quoted(name), "plant": plant} | cells | {"worse": "; ".join(worse) or "nowhere"})
-    return {"rates": pd.DataFrame(rows)}
+    """Return how many robots settle and when at each rate, and where a faster rate is worse than the next one.
+
+    What is worse on one engine only is in bold.
+    """
+    rows = [row for plant in RATES_STUDY.commands for row in rate_rows(load_runs(folder / plant), plant)]
+    table = pd.DataFrame(rows)
+    for _, own in table[table["plant"].isin(ENGINES)].groupby("method"):
+        if len({worse != NOWHERE for worse in own["worse"]}) > 1:
+            table.loc[own.index, "worse"] = own["worse"].map(marked)
+    return {"rates": table}
+
+
+def rate_rows(runs: pd.DataFrame, plant: str) -> Iterator[dict[str, str]]:
+    """Yield a row for each method on one plant."""
+    for name, own in by_method(runs):
+        at = {rate: own[np.isclose(own["period_s"], 1.0 / rate)] for rate in RATES}
+        worse = [f"{fast} Hz: {words}" for slow, fast in pairwise(RATES) if (words := loss(at[slow], at[fast]))]
+        cells = {f"{rate} Hz": count_and_median(each) for rate, each in at.items()}
+        yield {"method": quoted(name), "plant": plant} | cells | {"worse": "; ".join(worse) or NOWHERE}
 
 
 def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
@@ -58,7 +68,7 @@ def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
     settles = [set(runs.loc[settling_times(runs).notna(), "seed"]) for runs in (slow, fast)]
     lost, won = len(settles[0] - settles[1]), len(settles[1] - settles[0])
     words = []
-    if lost and success_rate(lost, lost + won).low > 0.5:
+    if most(lost, won):
         words.append(f"{lost} fewer settle, {won} more")
     named = pd.concat([slow.assign(controller="slow"), fast.assign(controller="fast")])
     later = paired(named, [("fast", "slow")], never=MOVE)[0]
@@ -107,40 +117,48 @@ def counted(runs: pd.DataFrame) -> str:
 
 
 def dynamics_tables(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the paired difference that each switch of `bullet` makes to each method, in moves and on the circle."""
-    usual = load_runs(folder / USUAL)
+    """Return the paired difference that each switch makes to each method on both engines, moves and circle."""
+    usual = {engine: load_runs(folder / engine) for engine in ENGINES}
+    changes = {"`kinematic` instead": dict.fromkeys(ENGINES, "kinematic")}
+    changes |= {words: {engine: part_of(words, engine) for engine in ENGINES} for words in SWITCHES}
     made: dict[str, list[dict[str, str]]] = {"dynamics": [], "dynamics_circle": []}
-    parts = {"`kinematic` instead": "kinematic"} | {words: part_of(words) for words in SWITCHES}
-    for words, part in parts.items():
-        changed = load_runs(folder / part)
-        for table, task, metric, never, factor in (
-            ("dynamics", "random", "settling_time_s", MOVE, 1.0),
-            ("dynamics_circle", "circle", "rms_error_evaluated", LOST, 1e3),
+    for words, parts in changes.items():
+        changed = {engine: load_runs(folder / part) for engine, part in parts.items()}
+        for table, task, metric, never, digits, factor in (
+            ("dynamics", "random", "settling_time_s", MOVE, 2, 1.0),
+            ("dynamics_circle", "circle", "rms_error_evaluated", LOST, 1, 1e3),
         ):
-            row = {"changed": words}
+            rows = {engine: {"changed": words, "plant": engine} for engine in ENGINES}
             for name in RENDERED:
-                named = [
-                    runs[(runs["controller"] == name) & (runs["task"] == task)].assign(controller=label, plant="")
-                    for label, runs in (("changed", changed), ("usual", usual))
-                ]
-                compared = paired(pd.concat(named), [("changed", "usual")], metric=metric, never=never)[0]
-                row[quoted(name)] = difference(compared, 2 if factor == 1.0 else 1, factor)
-            made[table].append(row)
+                both = {engine: changed_and_usual(changed[engine], usual[engine], name, task) for engine in ENGINES}
+                pairs = [("changed", "usual")]
+                cells = next(differences(both, pairs, metric=metric, never=never, digits=digits, factor=factor))
+                for engine in ENGINES:
+                    rows[engine][quoted(name)] = cells[engine]
+            made[table] += rows.values()
     return {name: pd.DataFrame(rows) for name, rows in made.items()}
 
 
-def part_of(words: str) -> str:
-    """Return the part with one switch changed."""
-    return words.replace(" ", "_")
+def changed_and_usual(changed: pd.DataFrame, usual: pd.DataFrame, name: str, task: str) -> pd.DataFrame:
+    """Return the runs of a method in a task under two names, `changed` and `usual`."""
+    labelled = (("changed", changed), ("usual", usual))
+    return pd.concat(
+        runs[(runs["controller"] == name) & (runs["task"] == task)].assign(controller=label, plant="")
+        for label, runs in labelled
+    )
 
 
-def rendered(*settings: str) -> tuple[str, ...]:
-    """Return the sweep of moves and circles on `bullet` with some settings."""
-    options = [word for each in settings for word in ("--set", f"bullet.{each}")]
-    return sweep("bullet", RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT, *RENDERING, *options)
+def part_of(words: str, engine: str) -> str:
+    """Return the part with one switch changed on one engine."""
+    return f"{engine}_{words.replace(' ', '_')}"
 
 
-USUAL: Final = "bullet"
+def rendered(plant: str, *settings: str) -> tuple[str, ...]:
+    """Return the sweep of moves and circles on a rendered plant with some settings."""
+    options = [word for each in settings for word in ("--set", f"{plant}.{each}")]
+    return sweep(plant, RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT, *bare(plant), *options)
+
+
 DYNAMICS_SEEDS: Final = "47000:47008"
 SWITCHES: Final[Mapping[str, tuple[str, ...]]] = {
     "without dynamics": ("drives.dynamics=false",),
@@ -157,12 +175,12 @@ SWITCHES: Final[Mapping[str, tuple[str, ...]]] = {
 
 RATES_STUDY = Study(
     "rates",
-    "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic` and 10 on `bullet`",
-    30,
-    {
-        "kinematic": sweep("kinematic", BOTH, "random", "52000:52100", "--period", PERIODS),
-        "bullet": sweep("bullet", RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT, *RENDERING),
-    },
+    "control rates from 10 to 250 Hz in the same physical worlds, 100 robots on `kinematic`, 10 on each physics engine",
+    35,
+    {"kinematic": sweep("kinematic", BOTH, "random", "52000:52100", "--period", PERIODS)}
+    | on_engines(
+        lambda plant: sweep(plant, RENDERED, "random", "52100:52110", "--period", PERIODS, *SHORT, *bare(plant))
+    ),
     rates_table,
 )
 LONG = Study(
@@ -184,12 +202,14 @@ ENDS = Study(
 )
 DYNAMICS = Study(
     "dynamics",
-    "what each switch of `bullet` does to each method, and `bullet` against `kinematic`",
-    45,
-    {
-        "kinematic": sweep("kinematic", RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT),
-        USUAL: rendered(),
-    }
-    | {part_of(words): rendered(*settings) for words, settings in SWITCHES.items()},
+    "what each switch of `bullet` and `mujoco` does to each method, and both against `kinematic`",
+    50,
+    {"kinematic": sweep("kinematic", RENDERED, "random,circle", DYNAMICS_SEEDS, *SHORT)}
+    | on_engines(rendered)
+    | {
+        part_of(words, engine): rendered(engine, *settings)
+        for words, settings in SWITCHES.items()
+        for engine in ENGINES
+    },
     dynamics_tables,
 )

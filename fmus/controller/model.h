@@ -4,14 +4,13 @@
 
    The first sample is taken when a feature is seen. At a sampling instant the outputs follow the inputs as soon as one is
    set; until then, and between the instants, they are those of the last sample. A step makes the samples of the instants
-   from its beginning on and before its end. */
+   from its beginning on and before its end. There are no events, no continuous states and no derivatives. */
 #ifndef MODEL_H
 #define MODEL_H
 
 #include "layout.h"
 #include <stddef.h>
 
-/* Nothing is continuous. */
 enum { HAS_EXCHANGE = 0, N_STATES = 0, OFFSET_STATES = 0, OFFSET_DERIVATIVES = 0, OFFSET_INDICATORS = 0 };
 
 typedef struct {
@@ -41,25 +40,6 @@ typedef enum {
     MODEL_NO_MEMORY
 } ModelStatus;
 
-/* What a status says to the user; NULL for MODEL_OK. */
-const char *model_explain(ModelStatus status);
-
-/* Start values, before the first sample. */
-void model_reset(Model *model, int exchange);
-void model_start(Model *model);
-ModelStatus model_check(const Model *model);
-
-ModelStatus model_admits(size_t index, int starting, int exchanging);
-ModelStatus model_set(Model *model, size_t index, double value);
-/* Computes outputs of the present inputs where these are due. */
-ModelStatus model_get(Model *model, size_t index, double *value);
-ModelStatus model_step(Model *model, double step);
-
-/* There are no events, no continuous states and no derivatives. */
-#define MESSAGE_SIZE 256
-ModelStatus model_settle(Model *model, int *changed);
-int model_next_event(Model *model, char text[MESSAGE_SIZE]);
-void model_set_states(Model *model, const double *states);
-ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting);
+#include "model_functions.h"
 
 #endif

@@ -29,8 +29,7 @@ void report_events(Instance *instance)
 
 #define NO_SUCH_VARIABLE "there is no variable with this value reference"
 
-/* Number of values behind a reference, 0 if there is no such variable. */
-static size_t size_of(fmi3ValueReference reference)
+size_t size_of(fmi3ValueReference reference)
 {
     for (size_t i = 0; i < N_GROUPS; i++) {
         if (groups[i].offset == reference) return groups[i].size;
@@ -222,33 +221,6 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[]
     free(*state);
     *state = snapshot;
     return fmi3OK;
-}
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t n_unknowns,
-                                        const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[],
-                                        size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity)
-{
-    OPEN("fmi3GetDirectionalDerivative", DIFFERENTIABLE);
-    double direction[N_VALUES] = {0.0};
-    size_t k = 0;
-    for (size_t i = 0; i < n_knowns; i++) {
-        const size_t size = size_of(knowns[i]);
-        if (size == 0 || knowns[i] >= N_SETTABLE) return answer(self, "fmi3GetDirectionalDerivative", "this is no known");
-        if (k + size > n_seed) return answer(self, "fmi3GetDirectionalDerivative", "too few values in the seed");
-        memcpy(direction + knowns[i], seed + k, size * sizeof(double));
-        k += size;
-    }
-    const ModelStatus status = model_derive(&self->core.model, direction, self->core.phase == INITIALISING);
-    if (status != MODEL_OK) return answer(self, "fmi3GetDirectionalDerivative", model_explain(status));
-    size_t j = 0;
-    for (size_t i = 0; i < n_unknowns; i++) {
-        const size_t size = size_of(unknowns[i]);
-        if (size == 0) return answer(self, "fmi3GetDirectionalDerivative", "this is no unknown");
-        if (j + size > n_sensitivity) return answer(self, "fmi3GetDirectionalDerivative", "too little room");
-        memcpy(sensitivity + j, direction + unknowns[i], size * sizeof(double));
-        j += size;
-    }
-    return answer(self, "fmi3GetDirectionalDerivative", k == n_seed && j == n_sensitivity ? NULL : "too many values");
 }
 
 fmi3Status fmi3EnterStepMode(fmi3Instance instance)

@@ -48,8 +48,6 @@ ABSENT(fmi3SetClock, fmi3Instance i, Reference r[], size_t n, const fmi3Clock v[
 ABSENT(fmi3GetNumberOfVariableDependencies, fmi3Instance i, fmi3ValueReference r, size_t *n)
 ABSENT(fmi3GetVariableDependencies, fmi3Instance i, fmi3ValueReference r, size_t e[], fmi3ValueReference d[], size_t f[],
        fmi3DependencyKind k[], size_t n)
-ABSENT(fmi3GetAdjointDerivative, fmi3Instance i, Reference u[], size_t nu, Reference k[], size_t nk,
-       const fmi3Float64 seed[], size_t ns, fmi3Float64 sensitivity[], size_t n)
 ABSENT(fmi3EnterConfigurationMode, fmi3Instance i)
 ABSENT(fmi3ExitConfigurationMode, fmi3Instance i)
 ABSENT(fmi3GetIntervalDecimal, fmi3Instance i, Reference r[], size_t n, fmi3Float64 v[], Qualifier q[])

@@ -15,6 +15,8 @@ typedef struct {
 /* fmi3OK if there is no message, otherwise an error. */
 fmi3Status answer(const Instance *instance, const char *function, const char *message);
 void report_events(Instance *instance);
+/* Number of values behind a reference, 0 if there is no such variable. */
+size_t size_of(fmi3ValueReference reference);
 
 #define OPEN(function, phases)                                                                    \
     Instance *const self = instance;                                                              \

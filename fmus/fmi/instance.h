@@ -1,7 +1,7 @@
 /* What FMI 2 and FMI 3 have in common beside the model: phases, time, saved states, messages.
 
    A model is a folder with model.h and model.c. Its Model has `time` and `exchange`; the offsets and sizes of its
-   variables are in the generated layout.h; the functions are those that are declared in either model.h. */
+   variables are in the generated layout.h, its functions in model_functions.h. */
 #ifndef INSTANCE_H
 #define INSTANCE_H
 

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import casadi
 import numpy as np
 
-from servobench.fmus.trace.array import Expression, Traced, as_traced
+from servobench.fmus.trace.array import Expression, NotTraceable, Traced, as_traced
 from servobench.fmus.trace.faults import NOT_DEFINITE, note_fault
 from servobench.fmus.trace.ufuncs import choose, elementwise, reduced
 
@@ -103,12 +103,12 @@ def svd(a: Any, full_matrices: bool = True, compute_uv: bool = True) -> Svd | Tr
     """Return the singular value decomposition by one-sided Jacobi rotations.
 
     Raises:
-        NotImplementedError: square factors of a matrix that is not square.
+        NotTraceable: square factors of a matrix that is not square.
     """
     table = as_traced(a)
     m, n = table.shape[-2:]
     if full_matrices and compute_uv and m != n:
-        raise NotImplementedError("svd of a matrix that is not square, with square factors")
+        raise NotTraceable("it calls numpy.linalg.svd of a matrix that is not square without full_matrices=False")
     function = _svd(max(m, n), min(m, n))
     if m >= n:
         U, values, V = each_matrix(function, table)

@@ -2,7 +2,8 @@
 
    dq/dt = v,   dv/dt = (clip(u) - v) / lag;   y = features at q, such as the ball in the camera frame
 
-   A joint that meets a stop rests there, v = 0, for as long as u drives it into the stop. */
+   A joint that meets a stop rests there, v = 0, for as long as u drives it into the stop. At the start it is at home, at
+   rest. A step is exact and stops act at its end; the states are positions, then velocities. */
 #ifndef MODEL_H
 #define MODEL_H
 
@@ -42,33 +43,6 @@ typedef enum {
     MODEL_NOT_FINITE /* this and what follows ends a run */
 } ModelStatus;
 
-/* What a status says to the user; NULL for MODEL_OK. */
-const char *model_explain(ModelStatus status);
-
-/* Start values, at home, time 0. */
-void model_reset(Model *model, int exchange);
-/* Places the joints at home, at rest. */
-void model_start(Model *model);
-/* Whether every joint has a range and is within it. */
-ModelStatus model_check(const Model *model);
-
-/* Whether a value may be set now: at the start, by a solver, or else between steps. */
-ModelStatus model_admits(size_t index, int starting, int exchanging);
-ModelStatus model_set(Model *model, size_t index, double value);
-ModelStatus model_get(Model *model, size_t index, double *value);
-/* Positions, then velocities. */
-void model_set_states(Model *model, const double *states);
-
-/* Advances by `step` under the present input, exactly; stops act at its end. Without a range nothing changes. */
-ModelStatus model_step(Model *model, double step);
-/* Brings to rest the joints that have met a stop, and frees those that are driven away; says whether states changed. */
-ModelStatus model_settle(Model *model, int *changed);
-/* Writes what happened at a stop since the last call; zero if nothing (more) did. */
-#define MESSAGE_SIZE 256
-int model_next_event(Model *model, char text[MESSAGE_SIZE]);
-
-/* Turns `direction` (N_VALUES, set for parameters, inputs and states) into the derivatives of all values along it.
-   `starting`: the states still follow the home position. */
-ModelStatus model_derive(Model *model, double direction[N_VALUES], int starting);
+#include "model_functions.h"
 
 #endif

@@ -57,7 +57,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
 
     with the true feature y at its end in natural sizes and the period T [s], so that a return is the error's integral.
     The episode is truncated at the end of the task. A run that fails (a feature that is lost, a contact) terminates
-    it, and its last error is charged for the rest of the task.
+    it, and its last error is charged for the rest of the task. A run may fail before anything is measured, as with an
+    arm that touches the table at its start: then no feature is valid, and the first step terminates the episode.
 
     Attributes:
         observation: of the plant, as controllers get it; None before the first `reset`.
@@ -106,7 +107,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             options: none are known.
 
         Returns:
-            What the policy sees, and `seed` and `robot`, the drawn values.
+            What the policy sees; `seed`, `robot` (the drawn values) and, of a run that failed already, `reason`.
         """
         super().reset(seed=seed)
         run_seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
@@ -116,8 +117,16 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self._desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
         self._k = self._lost = 0
         self._action = np.zeros(self._view.spec.n)
-        self.observation = experiment.plant.reset(named_seed(run_seed, "plant"))
-        return self._see(), {"seed": run_seed, "robot": experiment.drawn.as_record()}
+        info = {"seed": run_seed, "robot": experiment.drawn.as_record()}
+        self._fault: RunFault | None = None
+        try:
+            self.observation = experiment.plant.reset(named_seed(run_seed, "plant"))
+        except RunFault as fault:
+            spec, start = self._view.spec, experiment.scenario.start
+            start = np.zeros(spec.n) if start is None else start
+            self.observation, self._fault = Observation(0.0, start, np.zeros(spec.m), feature_valid=False), fault
+            info["reason"] = str(fault)
+        return self._see(), info
 
     def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, dict[str, Any]]:
         """Hold an action for a period.
@@ -140,6 +149,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             plant.move_camera(loop.camera_move.X_BC)
         self._action = np.asarray(action, dtype=np.float64)
         try:
+            if self._fault is not None:
+                raise self._fault
             self.observation = plant.step(Command(self._view.command(self._action)))
             self._lost = 0 if self.observation.feature_valid else self._lost + 1
             if self._lost >= loop.lost_after_periods:

@@ -29,7 +29,7 @@ from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.sweep import Place
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.draw import save_figure
@@ -113,7 +113,7 @@ def make_map(
         carry_out(Campaign(cells, chosen), folder, how.of_part(folder))
     results.write_summary(out, map_tables(out), results.read_manifest(out / made[0]))
     limits: dict[str, float] = {}
-    if any(line.axis == LATENCY for line in lines) and sensing == DEFAULT_SENSING:
+    if any(line.axis == LATENCY for line in lines) and sensing == DEFAULT_SENSING and plant not in RENDERED:
         limits = predicted_limits(controllers, settings, robot)
     pd.Series(limits, name="predicted_latency_limit_s").to_csv(out / LIMITS, index_label="controller")
     return draw_map(results.load_runs(out), out / FIGURES, limits)

@@ -17,7 +17,7 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
-from page_studies import STUDIES, audit, held_out, physical, readme, worlds
+from page_studies import STUDIES, audit, engines, held_out, physical, readme, side_by_side, worlds
 from page_studies.study import Study, nothing, sweep
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import TUNING, parse_seeds
@@ -266,3 +266,75 @@ def test_numbers_of_runs_that_crashed_are_not_stored(toy):
     runs.to_parquet(table)
     with pytest.raises(SystemExit, match=r"1 of 3 runs in .* crashed, nothing is stored: OSError: no more room"):
         call(toy)
+
+
+def test_a_difference_that_holds_on_one_engine_only_is_in_bold_on_both():
+    robots = np.arange(20)
+
+    def runs(**times):
+        return pd.concat([
+            pd.DataFrame({
+                "plant": "", "task": "random", "seed": robots, "controller": name, "status": "completed",
+                "settling_time_s": seconds,
+            })
+            for name, seconds in times.items()
+        ])  # fmt: skip
+
+    def bold(*both):
+        pairs = [("changed", "usual")]
+        found = dict(zip(side_by_side.ENGINES, both, strict=True))
+        (cells,) = side_by_side.differences(found, pairs, metric="settling_time_s", never=10.0)
+        assert len({cell.startswith("**") for cell in cells.values()}) == 1
+        return cells["bullet"].startswith("**")
+
+    spread = 0.1 * np.sin(robots)
+    later, earlier, alike = (runs(usual=1.0, changed=1.0 + shift + spread) for shift in (0.5, -0.5, 0.0))
+    assert bold(later, alike)
+    assert bold(later, earlier)
+    assert not bold(later, runs(usual=2.0, changed=2.9 + spread))
+    assert not bold(alike, alike)
+    barely = runs(usual=1.0, changed=1.07 + spread)
+    hardly = runs(usual=1.0, changed=1.04 + 0.2 * np.cos(5 * robots))
+    assert not bold(barely, hardly)  # one interval leaves 0 out and the other does not, but they differ by chance
+
+
+def test_what_is_worse_at_a_faster_rate_on_one_engine_only_is_in_bold(monkeypatch, tmp_path):
+    def runs(plant):
+        late = plant == "bullet"
+        return pd.DataFrame([
+            {
+                "plant": plant, "task": "random", "controller": "pid", "seed": seed, "status": "completed",
+                "period_s": 1.0 / rate, "settling_time_s": 2.0 if late and rate == 250 else 1.0,
+            }
+            for rate, seed in product(physical.RATES, range(10))
+        ])  # fmt: skip
+
+    monkeypatch.setattr(physical, "load_runs", lambda path: runs(path.name))
+    worse = physical.rates_table(tmp_path)["rates"].set_index("plant")["worse"]
+    assert worse["kinematic"] == "nowhere"
+    assert worse["bullet"].startswith("**250 Hz: +1.00")
+    assert worse["mujoco"] == "**nowhere**"
+
+
+def test_an_axis_of_the_map_along_which_one_engine_loses_robots_is_in_bold(monkeypatch, tmp_path):
+    lost = {("mujoco", "b", 60.0), ("mujoco", "b", 90.0)}
+    runs = pd.DataFrame([
+        {
+            "axis": "camera_rotation", "plant": plant, "controller": name, "magnitude": magnitude, "seed": seed,
+            "status": "completed",
+            "settling_time_s": math.nan if (plant, name, magnitude) in lost else 1.0,
+        }
+        for plant, name, magnitude, seed in product(side_by_side.ENGINES, "ab", (0.0, 60.0, 90.0), range(5))
+    ])  # fmt: skip
+    monkeypatch.setattr(engines, "load_runs", lambda path: runs[runs["plant"] == path.name])
+    rows = engines.map_tables(tmp_path)["robustness_engines"].to_dict("records")
+    assert [(row["plant"], row["`a`"], row["`b`"]) for row in rows] == [
+        ("bullet", "5 5 5", "**5 5 5**"), ("mujoco", "5 5 5", "**5 0 0**"),
+    ]  # fmt: skip
+    assert rows[0]["axis"] == "camera turned [°]: 0, 30, 60, 90, 120, 150, 180"
+
+
+def test_a_table_whose_study_was_not_carried_out_leaves_its_page_as_it_is(toy):
+    page = toy / "page.md"
+    page.write_text("<!-- table: nothing -->\n\nas it was\n\n<!-- end -->\n")
+    assert generated_tables.renewed(page) == page.read_text()

@@ -225,6 +225,71 @@ def test_derivatives_can_be_asked_after_the_end(version):
         np.testing.assert_allclose(column, arm.get("jacobian").reshape(3, 6)[:, 0], atol=1e-12)
 
 
+KNOWNS = ("tool", "gear_ratio", "lag", "max_speed", "home", "joint_velocity_command")
+UNKNOWNS = (
+    "ball_position",
+    "jacobian",
+    "joint_position",
+    "der(joint_position)",
+    "der(joint_velocity)",
+    "stop_indicator",
+)
+
+
+def sizes(names) -> list[int]:
+    return [next(group.size for group in LAYOUT.groups if group.name == name) for name in names]
+
+
+@pytest.mark.parametrize("starting", [True, False])
+def test_adjoint_derivatives_are_the_transposed_product_of_the_directional_ones(starting):
+    generator = np.random.default_rng(4)
+    with Fmu(3) as arm:
+        if starting:
+            arm.fmu.enterInitializationMode(startTime=0.0)
+        else:
+            arm.start()
+        arm.fmu.setFloat64(arm.references("joint_velocity_command"), [0.5, 2.0, -2.0, 0.1, 0.0, -0.3])
+        if not starting:
+            arm.step(0.0, 0.3)
+        states = () if starting else ("joint_position", "joint_velocity")
+        knowns, unknowns = ([arm.references(name)[0] for name in names] for names in ((*KNOWNS, *states), UNKNOWNS))
+        n, m = sum(sizes((*KNOWNS, *states))), sum(sizes(UNKNOWNS))
+        matrix = [arm.fmu.getDirectionalDerivative(unknowns, knowns, row.tolist(), m) for row in np.eye(n)]
+        seed = generator.standard_normal(m)
+        came = arm.fmu.getAdjointDerivative(unknowns, knowns, seed.tolist(), n)
+        assert np.count_nonzero(came) > n / 2
+        np.testing.assert_allclose(came, np.array(matrix) @ seed, rtol=0, atol=1e-12)
+
+
+def test_one_adjoint_call_gives_a_row_of_the_jacobian_and_equals_differences():
+    with Fmu(3) as arm:
+        arm.start()
+        arm.set("joint_velocity_command", 0.5)
+        arm.step(0.0, 0.4)
+        ball, q, tool = (arm.references(name) for name in ("ball_position", "joint_position", "tool"))
+        row = arm.fmu.getAdjointDerivative(ball, q, [0.0, 1.0, 0.0], 6)
+        np.testing.assert_allclose(row, arm.get("jacobian").reshape(3, 6)[1], rtol=0, atol=1e-12)
+        weights, at = np.array([0.3, -1.0, 0.7]), arm.get("tool")
+        came = arm.fmu.getAdjointDerivative(ball, tool, weights.tolist(), len(at))
+        for k, derivative in enumerate(came):
+            heights = []
+            for sign in (1.0, -1.0):
+                arm.fmu.setFloat64(tool, (at + sign * 1e-6 * np.eye(len(at))[k]).tolist())
+                heights.append(weights @ arm.get("ball_position"))
+            assert derivative == pytest.approx((heights[0] - heights[1]) / 2e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("unknown", "known", "seed", "size"),
+    [("ball_position", "ball_position", 3, 3), ("ball_position", "tool", 2, 3), ("ball_position", "tool", 3, 4)],
+)
+def test_adjoint_derivatives_of_what_does_not_fit_are_refused(unknown, known, seed, size):
+    with Fmu(3) as arm:
+        arm.start()
+        with refused():
+            arm.fmu.getAdjointDerivative(arm.references(unknown), arm.references(known), [1.0] * seed, size)
+
+
 def test_the_description_says_what_tools_ask_for():
     with zipfile.ZipFile(cached_fmu(3)) as archive:
         build = ET.fromstring(archive.read("sources/buildDescription.xml"))

@@ -155,6 +155,10 @@ def test_what_ends_a_run_is_said_by_a_code(check, value, code):
         (lambda x: x if x[0] > 0 else -x, "decides by a number"),
         (lambda x: np.linalg.eigh(x[:, None] * x), "numpy.eigh, which has no exported form"),
         (lambda x: np.logaddexp(x, x), "numpy.logaddexp, which has no exported form"),
+        (
+            lambda x: np.linalg.svd(x[None]),
+            "numpy.linalg.svd of a matrix that is not square without full_matrices=False",
+        ),
         (lambda x: np.zeros(2) + x[x > 0.0], "decides by a number"),
         (lambda x: lanes.branch(x[0] > 0.0, lambda y: y + x, x), "uses more of the run than its arguments"),
     ],

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
+from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -99,6 +100,20 @@ def test_the_map_carries_the_predicted_limit_of_the_latency(tmp_path, monkeypatc
     lines = [np.asarray(each.get_xdata()) for each in figures[0].axes[0].get_lines()]
     upright = [x[0] for x in lines if len(x) == 2 and x[0] == x[1]]
     assert upright == [pytest.approx(1000.0 * limits["pid+true"])]
+
+
+@pytest.mark.parametrize(
+    ("plant", "predicted"), [("kinematic", ["constant"]), pytest.param("mujoco", [], marks=NEEDS_MUJOCO)]
+)
+def test_limits_are_those_of_kinematic_joints_and_not_predicted_for_rendered_arms(
+    monkeypatch, tmp_path, plant, predicted
+):
+    line = Line(LATENCY, "camera latency [ms]", (Magnitude(0.0, "ms"),))
+    monkeypatch.setattr(robustness, "KNOWN_LINES", {LATENCY: line})
+    monkeypatch.setattr(map_lines, "KNOWN_LINES", {LATENCY: line})
+    words = ("--axes", LATENCY, "--plant", plant, "--controllers", "constant", "--seeds", "1", "--workers", "1")
+    assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=0.2", "--out", str(tmp_path)) == 0
+    assert pd.read_csv(tmp_path / "predicted_limits.csv")["controller"].to_list() == predicted
 
 
 def test_the_map_draws_no_panel_in_which_nothing_differs_and_names_it(tmp_path, monkeypatch):

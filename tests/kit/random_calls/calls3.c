@@ -73,8 +73,11 @@ static int access_values(fmi3Instance instance, unsigned kind)
     switch (kind) {
     case 0: status = fmi3GetFloat64(instance, which, count, values, n_values); break;
     case 1: status = fmi3SetFloat64(instance, which, count, values, n_values); break;
-    default:
+    case 2:
         status = fmi3GetDirectionalDerivative(instance, which, count, knowns, others, seed, n_seed, values, n_values);
+        break;
+    default:
+        status = fmi3GetAdjointDerivative(instance, knowns, others, which, count, seed, n_seed, values, n_values);
         break;
     }
     free(which), free(knowns), free(values), free(seed);
@@ -179,7 +182,7 @@ static int call(void)
     case 9: case 10: case 11: return use_state(instance);
     case 12: case 13: case 14: return access_values(instance, 0);
     case 15: case 16: return access_values(instance, 1);
-    case 17: return access_values(instance, 2);
+    case 17: return access_values(instance, 2 + below(2));
     case 18: case 19: return exchange(instance);
     default: return step(instance, k);
     }
