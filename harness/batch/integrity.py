@@ -189,7 +189,7 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
 @dataclass(frozen=True)
 class _Part:
     names: list[str]  # of its files within the folder, rows last
-    count: int = 0  # of its runs that are intact
+    count: int  # of its runs that are intact
     wrong: str = ""  # name of the file with which something is wrong
     what: str = ""  # is wrong with it
 
