@@ -76,3 +76,7 @@ def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, chan
 
 def test_all_laws_are_in_the_table():
     assert {name for name, *_ in SETTINGS} == set(LAWS)
+
+
+def test_only_the_law_that_was_trained_on_the_nominal_model_works_in_its_frame():
+    assert {name for name, part in LAWS.items() if part.make.in_model_frame} == {"rbfnn"}

@@ -38,6 +38,9 @@ def test_the_derivative_is_the_filtered_difference_of_the_error():
     u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
     # d = (0.15 · 0 + 0.1) / (0.15 + 0.05) = 0.5
     np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05 + 0.5, 0.0], atol=1e-14)
+    u = law.command(Estimate(J), look([-0.3, 0.0]), np.zeros((2, 2)))
+    # d = (0.15 · 0.5 + 0.3 − 0.1) / (0.15 + 0.05) = 1.375
+    np.testing.assert_allclose(J @ u, [0.3 * (1.0 - np.exp(-0.05)) / 0.05 + 1.375, 0.0], atol=1e-14)
 
 
 def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():
