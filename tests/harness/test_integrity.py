@@ -148,6 +148,8 @@ def test_a_damaged_table_is_named_and_made_again(whole, tmp_path, what):
         results.load_runs(folder)
     with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
         results.collect(folder)
+    (finding,) = examine(folder).findings
+    assert finding.remedy.endswith("--resume; runs that are in no part are repeated")
     resumed = run(folder, resume=True)
     assert resumed.repeated == RUNS
     assert resumed.notes == [f"{folder / results.RUNS} {what}: runs that are in no part are carried out again"]
@@ -215,7 +217,9 @@ def test_a_flipped_bit_is_found_by_the_page_checksums_where_the_table_stands_alo
 def test_a_lost_log_of_failures_is_made_from_the_table(whole, tmp_path):
     folder = copy(whole, tmp_path)
     (folder / results.FAILURES).write_bytes(b"")
-    assert [finding.name for finding in examine(folder).findings] == [results.FAILURES]
+    (finding,) = examine(folder).findings
+    assert finding.name == results.FAILURES
+    assert finding.remedy.endswith("--resume; it is written anew, without traces")
     resumed = run(folder, resume=True)
     assert resumed.repeated == 0
     assert resumed.notes == [f"{folder / results.FAILURES} is empty: it is written anew, without traces"]
@@ -280,6 +284,22 @@ def test_stray_files_are_named_and_count_for_nothing(half, whole, tmp_path):
     shutil.copy(part, folder / results.part_name(20, results.RUNS))
     assert examine(folder).findings[0].what == "is not listed in SHA256SUMS"
     assert run(folder, resume=True).repeated == 8
+    assert_same(folder, whole)
+
+
+def test_files_that_a_killed_process_had_begun_are_removed(half, whole, tmp_path):
+    folder = copy(half, tmp_path)
+    begun = [folder / f".{results.RUNS}-12-34", folder / results.PARTS / f".00000016.{results.RUNS}-12-34"]
+    for path in begun:
+        path.write_bytes(b"half")
+    assert examine(folder).findings == []
+
+    class Look(Notes):
+        def finished(self, rows) -> None:
+            assert not any(path.exists() for path in begun)
+            super().finished(rows)
+
+    assert run(folder, Look(), resume=True).repeated == 8
     assert_same(folder, whole)
 
 
