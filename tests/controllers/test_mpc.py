@@ -67,7 +67,11 @@ def test_first_step_of_the_constant_mode_by_hand():
     spec = make_spec(1, 1, speed=10.0)
     law = make_law(spec, mode="constant", **blocks(2), decay=1.0 / PERIOD, move_weight=1 / 3)
     velocity = law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.3]))
-    np.testing.assert_allclose(velocity, [(1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0 / PERIOD], rtol=1e-9)
+    dq = (1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0
+    np.testing.assert_allclose(velocity, [dq / PERIOD], rtol=1e-9)
+    # The criterion ½ (a + q) dq² − (b − c) e dq is least there; two blocks go 2 dq.
+    assert law.diagnostics()["objective"] == pytest.approx(-1.5 * dq**2, rel=1e-9)
+    assert law.diagnostics()["predicted_terminal_error"] == pytest.approx(abs(0.3 - 2.0 * dq), rel=1e-9)
 
 
 def test_first_step_of_free_moves_by_hand():
@@ -76,6 +80,7 @@ def test_first_step_of_free_moves_by_hand():
     law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0)
     velocity = law.command(Estimate(np.array([[2.0]])), observe(spec), hold([0.2]))
     np.testing.assert_allclose(velocity, [0.04 / PERIOD], rtol=1e-9)
+    assert law.diagnostics()["objective"] == pytest.approx(0.5 * 0.02**2 + 0.5 * 0.04**2, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
