@@ -97,6 +97,24 @@ def test_motions_that_do_not_join_begin_a_new_way() -> None:
         state = arm.update(state, motion)
     np.testing.assert_array_equal(state.begin, path[9])
     np.testing.assert_allclose(state.joint_step, path[11] - path[9])
+    np.testing.assert_allclose(state.duration, 2 * 0.05)
+
+
+def test_a_way_counts_by_its_noise_the_error_of_the_model_and_the_time_it_takes() -> None:
+    noise, model_error, gear_walk, deviation = 0.005, 0.3, 0.02, 0.05
+    arm = estimator(
+        feature_noise=noise, model_error=model_error, walk=gear_walk, gear_deviation=deviation,
+        offset_deviation=deviation, min_joint_step=0.1,
+    )  # fmt: skip
+    model, q = nominal_ur5(), walk(5, 20)[0]
+    path = q + 0.02 * np.arange(4)[:, None]  # three motions of 0.049 rad each
+    J0, J1 = model.jacobian(path[0]), model.jacobian(path[-1])
+    H = np.hstack([J1 * path[-1] - J0 * path[0], J1 - J0])
+    predicted = model.feature(path[-1]) - model.feature(path[0])
+    R = (2.0 * noise**2 + model_error**2 * predicted @ predicted) * np.eye(3)
+    P = (deviation**2 + gear_walk**2 * 3 * 0.05) * np.eye(12)
+    P -= P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+    np.testing.assert_allclose(learned(arm, path).P, P, atol=1e-7 * deviation**2)
 
 
 def test_the_sensitivity_is_the_derivative_of_the_predicted_motion() -> None:

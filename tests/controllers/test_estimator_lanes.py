@@ -23,6 +23,11 @@ SETTINGS = [
 ]
 
 
+def made(name, changes):
+    part = ESTIMATORS[name]
+    return part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+
+
 def seen():
     """Return joint positions, features and where they are valid, each with axes of periods and lanes.
 
@@ -58,14 +63,17 @@ def learned(estimator, lanes):
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
 def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes):
-    part, order = ESTIMATORS[name], np.array([2, 0, 1])
-    estimator = part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+    estimator, order = made(name, changes), np.array([2, 0, 1])
     together, permuted = learned(estimator, np.arange(LANES)), learned(estimator, order)
     for lane in range(LANES):
         for alone, among, other in zip(learned(estimator, lane), together, permuted, strict=True):
             for key, value in alone.items():
                 np.testing.assert_array_equal(value, among[key][lane], err_msg=key)
                 np.testing.assert_array_equal(value, other[key][order.tolist().index(lane)], err_msg=key)
+
+
+def test_estimators_say_which_of_them_bring_a_model():
+    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {"true", "rbf", "rbf_lyapunov", "arm"}
 
 
 def test_probing_has_the_same_bits_alone_and_among_others():

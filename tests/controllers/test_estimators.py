@@ -228,6 +228,13 @@ def test_forgetting_does_not_wind_up_while_one_joint_rests():
     np.testing.assert_allclose(run.jacobian(), [[0.3, 0.0, 0.0]], atol=1e-3)
 
 
+def test_a_covariance_that_is_not_positive_definite_ends_least_squares_by_name():
+    estimator = RlsEstimator(RlsConfig())
+    state = estimator.start(np.zeros((1, 2)))._replace(P=np.diag([2.0, -1.0]))
+    with pytest.raises(FilterDiverged, match="covariance is not"):
+        estimator.update(state, motion([0.1, 0.0], [0.1]))
+
+
 def test_the_compact_form_returns_to_its_start_when_its_sign_is_lost():
     for reset, expected in ((True, 0.5), (False, -0.5)):
         estimator = CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset=reset))
