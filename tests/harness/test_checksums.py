@@ -51,12 +51,15 @@ def test_a_file_may_have_the_content_of_any_of_its_lines(tmp_path):
 
 
 def test_a_line_is_on_the_disk_before_its_file_has_its_name_and_the_file_before_its_line(tmp_path, monkeypatch):
-    events = []
+    events, written = [], []
     fsync, replace = os.fsync, Path.replace
 
     def synced(descriptor):
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        events.append(("on the disk", path.name))
+        if path.name == SUMS:
+            written.append(path.read_text().count("\n"))
         fsync(descriptor)
-        events.append(("on the disk", Path(f"/proc/self/fd/{descriptor}").readlink().name))
 
     def renamed(path, target):
         events.append(("named", target.name))
@@ -70,6 +73,7 @@ def test_a_line_is_on_the_disk_before_its_file_has_its_name_and_the_file_before_
     folder = ("on the disk", tmp_path.name)
     lines = ("on the disk", SUMS)
     assert events == [first, lines, folder, ("named", "first"), folder, second, lines, ("named", "second"), folder]
+    assert written == [1, 2]
 
 
 def test_what_could_not_be_written_leaves_nothing(tmp_path):

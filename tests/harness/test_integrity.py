@@ -134,6 +134,8 @@ def test_a_part_with_the_rows_of_another_is_refused(half, whole, tmp_path):
 def test_parts_without_checksums_are_read_and_kept(half, whole, tmp_path):
     folder = copy(half, tmp_path)
     (folder / SUMS).unlink()
+    (finding,) = examine(folder).findings
+    assert (finding.name, finding.what) == (SUMS, "is missing, so that nothing vouches for the other files")
     assert len(results.load_runs(folder)) == RUNS - 8
     resumed = run(folder, resume=True)
     assert (resumed.repeated, resumed.notes) == (8, [])
@@ -161,6 +163,17 @@ def test_an_intact_folder_is_left_as_it_is(whole, tmp_path):
     resumed = run(folder, resume=True)
     assert (resumed.repeated, resumed.notes) == (0, [])
     assert read_sums(folder) == read_sums(whole)
+    assert_same(folder, whole)
+
+
+def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(half, whole, tmp_path):
+    folder = copy(whole, tmp_path)
+    name = results.part_name(8, results.RUNS)
+    (folder / results.PARTS).mkdir()
+    shutil.copy(half / name, folder / name)
+    with (folder / SUMS).open("a") as file:
+        file.writelines(f"{digest}  {name}\n" for digest in read_sums(half)[name])
+    assert run(folder, resume=True).repeated == 0
     assert_same(folder, whole)
 
 
