@@ -235,6 +235,22 @@ def test_a_covariance_that_is_not_positive_definite_ends_least_squares_by_name()
         estimator.update(state, motion([0.1, 0.0], [0.1]))
 
 
+@pytest.mark.parametrize("form", ["full", "split"])
+def test_a_covariance_that_is_not_positive_definite_ends_the_kalman_filter_by_name(form):
+    estimator = KalmanEstimator(KalmanConfig(form=form))
+    state = estimator.start(np.zeros((2, 3)))
+    with pytest.raises(FilterDiverged, match="covariance is not"):
+        estimator.update(state._replace(P=-state.P), motion(np.full(3, 0.1), np.zeros(2)))
+
+
+@pytest.mark.parametrize(("size", "resets"), [(0.011, 0.0), (0.009, 1.0)])
+def test_the_compact_form_returns_to_its_start_when_it_vanishes(size, resets):
+    run = Learning(CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset_norm=0.01)), np.array([[0.5]]))
+    run.update(motion([0.1], [0.1 * size]))
+    assert run.diagnostics()["jacobian_resets"] == resets
+    np.testing.assert_allclose(run.jacobian(), [[0.5 if resets else size]], atol=1e-9)
+
+
 def test_the_compact_form_returns_to_its_start_when_its_sign_is_lost():
     for reset, expected in ((True, 0.5), (False, -0.5)):
         estimator = CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset=reset))
