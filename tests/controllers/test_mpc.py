@@ -83,6 +83,14 @@ def test_first_step_of_free_moves_by_hand():
     assert law.diagnostics()["objective"] == pytest.approx(0.5 * 0.02**2 + 0.5 * 0.04**2, rel=1e-9)
 
 
+def test_a_joint_of_twice_the_weight_moves_less():
+    # As above with q = 2 for the second joint alone: dq = J Q⁻¹ 0.1 / (1 + J Q⁻¹ Jᵀ), J = [2, 2].
+    spec = make_spec(2, 1)
+    law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0, joint_weight=(1.0, 2.0))
+    velocity = law.command(Estimate(np.array([[2.0, 2.0]])), observe(spec), hold([0.2]))
+    np.testing.assert_allclose(velocity * PERIOD, [0.2 / 7.0, 0.1 / 7.0], rtol=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("solver", ["daqp", "qpoases"])
 def test_constant_mode_without_active_limits_is_equation_46(seed, solver):

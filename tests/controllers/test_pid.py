@@ -44,6 +44,12 @@ def test_the_derivative_is_the_filtered_difference_of_the_error():
     np.testing.assert_allclose(J @ u, [0.3 * (1.0 - np.exp(-0.05)) / 0.05 + 1.375, 0.0], atol=1e-14)
 
 
+def test_the_first_error_has_no_derivative():
+    law = fresh(proportional_gain=1.0, derivative_gain=1.0)
+    u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
+    np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05, 0.0], atol=1e-14)
+
+
 def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():
     law, y, ref = fresh(proportional_gain=3.0), np.array([0.2, -0.1]), np.array([[0.5, 0.3]] * 2)
     for _ in range(50):

@@ -217,6 +217,16 @@ def test_the_preview_is_used_only_where_it_is_switched_on():
     np.testing.assert_array_equal(off[0], on[1])
 
 
+def test_the_roll_out_follows_the_reference_from_step_to_step():
+    net, rng = network(), np.random.default_rng(4)
+    reference, q, y = rng.normal(size=(PREVIEW + 1, 2)), rng.normal(size=3), rng.normal(size=2)
+    made, J = law(net, horizon=4), rng.normal(size=(2, 3))
+    made.command(Estimate(J), seen(q, y), reference)
+    history = (reference[:1] - y, q[None])
+    ahead = roll_out(net, net.weights, J, history, np.diff(reference[:5], axis=0), np.full(3, 1e6))
+    np.testing.assert_allclose(made.state.predicted, ahead.errors, rtol=1e-12)
+
+
 def test_the_commanded_position_may_stand_in_for_the_measured_one():
     """Where every command is carried out in full, both are the same."""
     J, target = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]]), np.array([0.3, 0.2])
