@@ -220,6 +220,7 @@ def test_recursive_least_squares_equals_weighted_batch_least_squares(forgetting)
 
 def test_forgetting_does_not_wind_up_while_one_joint_rests():
     run, config = Learning(RlsEstimator(RlsConfig()), np.zeros((1, 3))), RlsConfig()
+    assert run.diagnostics()["covariance_mean"] == pytest.approx(config.initial_covariance)
     rng = np.random.default_rng(1)
     for _ in range(2000):
         dq = np.array([*rng.normal(scale=0.05, size=2), 0.0])
