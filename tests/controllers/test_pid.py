@@ -29,7 +29,7 @@ def test_the_first_step_equals_the_one_computed_by_hand():
     first = seen([0.0], [0.0])
     # γ = 0.1, e = 0.1, I = 0.05 · 0.1 = 0.005, v = 0.1 / 0.05 · 0.1 + 4 · 0.005 = 0.22, u = 0.22 / 0.5
     assert law.start(first).started.shape == ()
-    _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.full((2, 1), 0.1))
+    _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.array([[0.1], [0.7]]))
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
 
