@@ -24,13 +24,14 @@ test: lint
 results: $(VENV)/ready
 	$(BIN)/python docs/renewal.py $(ONLY) --runs $(RUNS)
 
-# Too long for every change: whether each block of the first pages runs, whether the stored figures of these studies come out again, whether a sweep with hostile
-# controllers loses no run, and whether the unit tests notice small faults in the code; writes nothing into the pages.
-# What the tests did not notice is listed in results/mutation.
+# Too long for every change: whether each block of the first pages runs, whether the stored figures of these studies come out again,
+# whether FMPy runs exported loops as the harness does, whether a sweep with hostile controllers loses no run, and whether the unit
+# tests notice small faults in the code; writes nothing into the pages. What the tests did not notice is listed in results/mutation.
 nightly: $(VENV)/ready
 	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest tests/end_to_end/test_first_hour.py
 	$(BIN)/python tests/fuzz/campaign.py --inputs 1000000
 	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
+	PYTHONPATH=tests $(BIN)/python -m kit.system_loops
 	PYTHONPATH=tests $(BIN)/python -m kit.breaking
 	PYTHONPATH=tests $(BIN)/python -m kit.breaking --steps --runs 12
 	PYTHONPATH=tests $(BIN)/python -m kit.breaking --caches

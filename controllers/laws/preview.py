@@ -31,9 +31,9 @@ def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:
         rows: (..., N, m).
         places: (K,), from 0 to N − 1, in rows.
     """
-    before = np.minimum(places.astype(np.int_), max(rows.shape[-2] - 2, 0))
-    after = np.minimum(before + 1, rows.shape[-2] - 1)
+    before = places.astype(np.int_)
     share = (places - before)[:, None]
-    if not np.remainder(share, 1.0).any():
-        return rows[..., places.astype(np.int_), :]
+    if not share.any():
+        return rows[..., before, :]
+    after = np.minimum(before + 1, rows.shape[-2] - 1)
     return np.asarray((1.0 - share) * rows[..., before, :] + share * rows[..., after, :])

@@ -260,14 +260,14 @@ def _load(block: Block) -> None:
 def _carry_out(block: Block, tell: Tell, steps: bool, keep: Path | None, debug: bool = False) -> None:
     """Carry a block out and tell the result of each run."""
     with offering(block.own):
+        together: list[RunResult] = []
         if block.together:
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
             with contextlib.suppress(Exception, SystemExit):
                 together = episode.carry_out_together([job.run for job in block.jobs], keep=keep)
-                for job, result in zip(block.jobs, together, strict=True):
-                    tell(_with_columns(job.cell, result))
-                return
-        for job in block.jobs:
+        for job, result in zip(block.jobs, together, strict=bool(together)):
+            tell(_with_columns(job.cell, result))
+        for job in block.jobs[len(together) :]:
             tell(_carry_out_run(job, steps, keep, debug))
 
 

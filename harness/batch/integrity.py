@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,7 +141,6 @@ def mend(folder: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
         if not results.is_whole(folder, manifest["run_count"]):
             (folder / PARTS).mkdir(exist_ok=True)
             return
-        shutil.rmtree(folder / PARTS, ignore_errors=True)
         if FAILURES in kept and (what := fault(folder, FAILURES, kept)):
             yield f"{folder / FAILURES} {what}: it is written anew, without traces"
             write_vouched(folder, {FAILURES: lambda file: file.write_text(_log(folder), encoding="utf-8")})
@@ -189,7 +187,7 @@ def restore_manifest(folder: Path, manifest: dict[str, Any]) -> str:
 @dataclass(frozen=True)
 class _Part:
     names: list[str]  # of its files within the folder, rows last
-    count: int = 0  # of its runs that are intact
+    count: int  # of its runs that are intact
     wrong: str = ""  # name of the file with which something is wrong
     what: str = ""  # is wrong with it
 

@@ -25,7 +25,7 @@ SHOWN: Final = 60  # letters of a wrong value that a message holds
 
 def encode(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as text; JSON has no infinity, so a setting without limit reads "inf"."""
-    return json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2, allow_nan=False) + "\n"
+    return json.dumps(_in_json({"schema_version": SCHEMA_VERSION, **manifest}), indent=2) + "\n"
 
 
 def decode(folder: Path, name: str, text: str) -> dict[str, Any]:

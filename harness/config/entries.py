@@ -192,14 +192,15 @@ def _config_class(kind: type[Any], argument: str) -> type[Any] | None:
         )
     if len(needed) < 2:
         return None
+    wanted = (
+        f"{where}.__init__ must name the dataclass of its settings, such as {needed[0].name}: {kind.__name__}Config"
+    )
     try:
         config = get_type_hints(kind.__init__).get(needed[0].name)
-    except Exception:  # noqa: BLE001 - annotations are code of the user
-        config = None
+    except Exception as error:  # annotations are code of the user
+        raise ConfigurationError(f"{wanted}; {describe_at(error, folder_of(kind))}") from error
     if not isinstance(config, type):
-        raise ConfigurationError(
-            f"{where}.__init__ must name the dataclass of its settings, such as {needed[0].name}: {kind.__name__}Config"
-        )
+        raise ConfigurationError(wanted)
     return config
 
 

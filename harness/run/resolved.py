@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -141,9 +140,8 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
     settings.check_sections([*known_sections(), *pairs, *names])
     settings.check_running(names)
     for section in settings.sections:
-        if section not in names:
-            with contextlib.suppress(MissingPart):
-                settings.resolve(section, _default(section))
+        if section not in names and (default := _default(section)) is not None:
+            settings.resolve(section, default)
 
 
 def known_sections() -> list[str]:
@@ -151,22 +149,14 @@ def known_sections() -> list[str]:
     return ["run", *plant_names(), *controller_names(), *TASKS]
 
 
-class MissingPart(Exception):
-    """A plant or controller that cannot be loaded here."""
-
-
 def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
-    """Return the defaults of a section; a plug-in that cannot be loaded has none.
-
-    Raises:
-        MissingPart: such a plug-in.
-    """
+    """Return the defaults of a section; None for a plant or controller that cannot be loaded here."""
     if section in TASKS:
         return find_task(section).default
     try:
         return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
-    except Exception as error:  # whatever code of a third party raises
-        raise MissingPart from error
+    except ConfigurationError:  # a plug-in, or a library that is not installed: nothing of this section runs here
+        return None
 
 
 def _is_pair(section: str) -> bool:

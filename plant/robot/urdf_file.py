@@ -82,7 +82,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
             str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
         ).robot
     except Exception as error:  # noqa: BLE001 - whatever it raises, the line says it
-        said.append(str(error))
+        said.append(str(error) or type(error).__name__)
     finally:
         log.removeFilter(collect)
     if said:

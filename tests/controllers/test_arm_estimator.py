@@ -6,12 +6,14 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmState
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.sight import Sight
 from servobench.plant.checks import FloatArray
+from servobench.plant.faults import FilterDiverged
 from servobench.plant.lanes import stack, take
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
@@ -67,15 +69,35 @@ def test_the_jacobian_elsewhere_is_that_of_the_bent_arm() -> None:
     assert error < 0.1 * nominal
 
 
-def test_points_move_as_the_bent_arm_moves_them() -> None:
+def sighted() -> ArmEstimator:
+    """Return an estimator that also knows how the ball moves, as a point."""
+
     def look(q: FloatArray) -> tuple[FloatArray, FloatArray]:
         y, J = nominal_ur5().feature_and_jacobian(q)
         return y[..., None, None, :], J[..., None, None, :, :]
 
-    model, q = nominal_ur5(), walk(4, 20)[3]
+    model = nominal_ur5()
     sight = Sight(1, 1, look, lambda _, depth: np.eye(3) * depth[..., None, None])
     spec = hand_eye_spec(model, 0.05, 1.0, 6.0)
-    arm = ArmEstimator(ArmConfig(), RobotKnowledge(spec, 10, nominal_jacobian=model.jacobian, nominal_sight=sight))
+    return ArmEstimator(ArmConfig(), RobotKnowledge(spec, 10, nominal_jacobian=model.jacobian, nominal_sight=sight))
+
+
+def test_features_that_are_known_to_move_with_points_teach_what_the_points_teach() -> None:
+    path, turn = walk(4, 40), np.eye(3)[[1, 2, 0]]
+    expected = learned(estimator(), path)
+    arm = sighted()
+    plain = turned = arm.start(nominal_ur5().jacobian(path[0]))
+    for motion in motions(path):
+        plain = arm.update(plain, motion)
+        turned = arm.update(turned, replace(motion, feature_step=turn @ motion.feature_step, seen=turn))
+    np.testing.assert_array_equal(plain.x, expected.x)
+    np.testing.assert_allclose(turned.x, expected.x, atol=1e-9)
+    np.testing.assert_allclose(turned.P, expected.P, atol=1e-9)
+
+
+def test_points_move_as_the_bent_arm_moves_them() -> None:
+    model, q = nominal_ur5(), walk(4, 20)[3]
+    arm = sighted()
     state = arm.start(model.jacobian(q))._replace(x=np.concatenate([GEARS, OFFSETS]))
     np.testing.assert_allclose(arm.motions(state, q), bent_arm().jacobian(q), atol=1e-12)
     told = arm.diagnostics(state)
@@ -97,6 +119,31 @@ def test_motions_that_do_not_join_begin_a_new_way() -> None:
         state = arm.update(state, motion)
     np.testing.assert_array_equal(state.begin, path[9])
     np.testing.assert_allclose(state.joint_step, path[11] - path[9])
+    np.testing.assert_allclose(state.duration, 2 * 0.05)
+
+
+def test_a_way_counts_by_its_noise_the_error_of_the_model_and_the_time_it_takes() -> None:
+    noise, model_error, gear_walk, deviation = 0.005, 0.3, 0.02, 0.05
+    arm = estimator(
+        feature_noise=noise, model_error=model_error, walk=gear_walk, gear_deviation=deviation,
+        offset_deviation=deviation, min_joint_step=0.1,
+    )  # fmt: skip
+    model, q = nominal_ur5(), walk(5, 20)[0]
+    path = q + 0.02 * np.arange(4)[:, None]  # three motions of 0.049 rad each
+    J0, J1 = model.jacobian(path[0]), model.jacobian(path[-1])
+    H = np.hstack([J1 * path[-1] - J0 * path[0], J1 - J0])
+    predicted = model.feature(path[-1]) - model.feature(path[0])
+    R = (2.0 * noise**2 + model_error**2 * predicted @ predicted) * np.eye(3)
+    P = (deviation**2 + gear_walk**2 * 3 * 0.05) * np.eye(12)
+    P -= P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
+    np.testing.assert_allclose(learned(arm, path).P, P, atol=1e-7 * deviation**2)
+
+
+def test_a_covariance_that_is_not_positive_definite_is_a_named_fault() -> None:
+    arm, path = estimator(min_joint_step=1e-3), walk(3, 20)
+    state = arm.start(nominal_ur5().jacobian(path[0]))
+    with pytest.raises(FilterDiverged, match="covariance is not"):
+        arm.update(state._replace(P=-state.P), motions(path)[0])
 
 
 def test_the_sensitivity_is_the_derivative_of_the_predicted_motion() -> None:

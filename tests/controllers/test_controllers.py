@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kit.toy import KNOWLEDGE, networks, plant_spec, seen
+from kit.toy import plant_spec, seen
 from servobench.controllers import nmpc_calibrated
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import RobotKnowledge
@@ -190,20 +190,6 @@ def test_a_row_of_the_table_may_change_defaults_of_its_law():
     assert METHODS["ukf_mpc:published"].config().law.mode == "constant"
     assert METHODS["ukf_mpc"].config().law == compose("mpc", "ukf").config().law
     assert METHODS["map_mfac"].config().law.gain > 5.0 * compose("mfac", "constant").config().law.gain
-
-
-def test_laws_declare_the_stages_that_they_bring():
-    for name, config, owned in (
-        ("pid", {}, set()),
-        ("mfac", {}, set()),
-        ("mpc", {}, {"limit", "preview"}),
-        ("mpc", {"use_preview": False, "delay": 0.1}, {"limit", "predict"}),
-        ("rbfnn", {}, {"preview"}),
-        ("rbfnn", {"preview": False}, set()),
-    ):
-        part = LAWS[name]
-        made = part.make(part.config(**config), KNOWLEDGE, *([networks()] if part.trained else []))
-        assert made.owns == owned
 
 
 def test_published_means_no_aids_and_plain_names_bring_all_that_their_laws_do_not():

@@ -23,6 +23,11 @@ SETTINGS = [
 ]
 
 
+def made(name, changes):
+    part = ESTIMATORS[name]
+    return part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+
+
 def seen():
     """Return joint positions, features and where they are valid, each with axes of periods and lanes.
 
@@ -58,14 +63,36 @@ def learned(estimator, lanes):
 
 @pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
 def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, changes):
-    part, order = ESTIMATORS[name], np.array([2, 0, 1])
-    estimator = part.make(part.config(**changes), KNOWING, *([only_jacobian(NETWORK)] if part.trained else []))
+    estimator, order = made(name, changes), np.array([2, 0, 1])
     together, permuted = learned(estimator, np.arange(LANES)), learned(estimator, order)
     for lane in range(LANES):
         for alone, among, other in zip(learned(estimator, lane), together, permuted, strict=True):
             for key, value in alone.items():
                 np.testing.assert_array_equal(value, among[key][lane], err_msg=key)
                 np.testing.assert_array_equal(value, other[key][order.tolist().index(lane)], err_msg=key)
+
+
+@pytest.mark.parametrize(("name", "changes"), SETTINGS, ids=lambda part: part if isinstance(part, str) else "")
+def test_at_the_start_each_lane_tells_its_own_numbers(name, changes):
+    estimator = made(name, changes)
+    for lead in ((), (LANES,), (2, LANES)):
+        J = np.ones((*lead, M, N))
+        state = estimator.start(J)
+        assert {np.shape(value) for value in estimator.diagnostics(state).values()} <= {lead}
+        assert estimator.jacobian(state, np.zeros((*lead, N))).shape == J.shape
+
+
+@pytest.mark.parametrize("name", ["kalman", "ukf", "mckf", "rls", "cfdl", "broyden", "arm"])
+def test_a_motion_of_the_least_length_counts_and_a_smaller_one_does_not(name):
+    estimator = made(name, {"min_joint_step": 0.25})
+    for length, counts in ((0.25, True), (0.2499, False)):
+        state = estimator.start(np.ones((M, N)))
+        way = Motion(np.zeros(N), length * np.eye(N)[1], np.full(M, 0.1), np.zeros(M), np.asarray(PERIOD)[()])
+        assert bool(estimator.diagnostics(estimator.update(state, way))["estimator_updated"]) == counts
+
+
+def test_estimators_say_which_of_them_bring_a_model():
+    assert {name for name in ESTIMATORS if made(name, {}).brings_model} == {"true", "rbf", "rbf_lyapunov", "arm"}
 
 
 def test_probing_has_the_same_bits_alone_and_among_others():

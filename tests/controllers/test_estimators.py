@@ -220,12 +220,36 @@ def test_recursive_least_squares_equals_weighted_batch_least_squares(forgetting)
 
 def test_forgetting_does_not_wind_up_while_one_joint_rests():
     run, config = Learning(RlsEstimator(RlsConfig()), np.zeros((1, 3))), RlsConfig()
+    assert run.diagnostics()["covariance_mean"] == pytest.approx(config.initial_covariance)
     rng = np.random.default_rng(1)
     for _ in range(2000):
         dq = np.array([*rng.normal(scale=0.05, size=2), 0.0])
         run.update(motion(dq, [0.3 * dq[0]]))
         assert run.diagnostics()["covariance_mean"] <= config.covariance_limit * (1 + 1e-12)
     np.testing.assert_allclose(run.jacobian(), [[0.3, 0.0, 0.0]], atol=1e-3)
+
+
+def test_a_covariance_that_is_not_positive_definite_ends_least_squares_by_name():
+    estimator = RlsEstimator(RlsConfig())
+    state = estimator.start(np.zeros((1, 2)))._replace(P=np.diag([2.0, -1.0]))
+    with pytest.raises(FilterDiverged, match="covariance is not"):
+        estimator.update(state, motion([0.1, 0.0], [0.1]))
+
+
+@pytest.mark.parametrize("form", ["full", "split"])
+def test_a_covariance_that_is_not_positive_definite_ends_the_kalman_filter_by_name(form):
+    estimator = KalmanEstimator(KalmanConfig(form=form))
+    state = estimator.start(np.zeros((2, 3)))
+    with pytest.raises(FilterDiverged, match="covariance is not"):
+        estimator.update(state._replace(P=-state.P), motion(np.full(3, 0.1), np.zeros(2)))
+
+
+@pytest.mark.parametrize(("size", "resets"), [(0.011, 0.0), (0.009, 1.0)])
+def test_the_compact_form_returns_to_its_start_when_it_vanishes(size, resets):
+    run = Learning(CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-12, reset_norm=0.01)), np.array([[0.5]]))
+    run.update(motion([0.1], [0.1 * size]))
+    assert run.diagnostics()["jacobian_resets"] == resets
+    np.testing.assert_allclose(run.jacobian(), [[0.5 if resets else size]], atol=1e-9)
 
 
 def test_the_compact_form_returns_to_its_start_when_its_sign_is_lost():

@@ -76,3 +76,21 @@ def test_a_lane_has_the_same_bits_alone_and_among_others_in_any_order(name, chan
 
 def test_all_laws_are_in_the_table():
     assert {name for name, *_ in SETTINGS} == set(LAWS)
+
+
+def test_only_the_law_that_was_trained_on_the_nominal_model_works_in_its_frame():
+    assert {name for name, part in LAWS.items() if part.make.in_model_frame} == {"rbfnn"}
+
+
+def test_laws_declare_the_stages_that_they_bring():
+    for name, config, owned in (
+        ("pid", {}, set()),
+        ("mfac", {}, set()),
+        ("mpc", {}, {"limit", "preview"}),
+        ("mpc", {"use_preview": False, "delay": 0.1}, {"limit", "predict"}),
+        ("rbfnn", {}, {"preview"}),
+        ("rbfnn", {"preview": False}, set()),
+    ):
+        part = LAWS[name]
+        made = part.make(part.config(**config), KNOWLEDGE, *([networks()] if part.trained else []))
+        assert made.owns == owned

@@ -11,6 +11,7 @@ from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import UnlimitedPlan, horizon_integrals, move_weights
+from servobench.controllers.laws.mpc.limits import exceeds, view_rows
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
 from servobench.plant.faults import SolverFailed
@@ -66,7 +67,11 @@ def test_first_step_of_the_constant_mode_by_hand():
     spec = make_spec(1, 1, speed=10.0)
     law = make_law(spec, mode="constant", **blocks(2), decay=1.0 / PERIOD, move_weight=1 / 3)
     velocity = law.command(Estimate(np.array([[1.0]])), observe(spec), hold([0.3]))
-    np.testing.assert_allclose(velocity, [(1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0 / PERIOD], rtol=1e-9)
+    dq = (1.0 + 3.0 * np.exp(-2.0)) * 0.3 / 3.0
+    np.testing.assert_allclose(velocity, [dq / PERIOD], rtol=1e-9)
+    # The criterion ½ (a + q) dq² − (b − c) e dq is least there; two blocks go 2 dq.
+    assert law.diagnostics()["objective"] == pytest.approx(-1.5 * dq**2, rel=1e-9)
+    assert law.diagnostics()["predicted_terminal_error"] == pytest.approx(abs(0.3 - 2.0 * dq), rel=1e-9)
 
 
 def test_first_step_of_free_moves_by_hand():
@@ -75,6 +80,15 @@ def test_first_step_of_free_moves_by_hand():
     law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0)
     velocity = law.command(Estimate(np.array([[2.0]])), observe(spec), hold([0.2]))
     np.testing.assert_allclose(velocity, [0.04 / PERIOD], rtol=1e-9)
+    assert law.diagnostics()["objective"] == pytest.approx(0.5 * 0.02**2 + 0.5 * 0.04**2, rel=1e-9)
+
+
+def test_a_joint_of_twice_the_weight_moves_less():
+    # As above with q = 2 for the second joint alone: dq = J Q⁻¹ 0.1 / (1 + J Q⁻¹ Jᵀ), J = [2, 2].
+    spec = make_spec(2, 1)
+    law = make_law(spec, **blocks(1), decay=math.log(2.0) / PERIOD, move_weight=1.0, joint_weight=(1.0, 2.0))
+    velocity = law.command(Estimate(np.array([[2.0, 2.0]])), observe(spec), hold([0.2]))
+    np.testing.assert_allclose(velocity * PERIOD, [0.2 / 7.0, 0.1 / 7.0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -118,6 +132,51 @@ def test_both_solvers_find_the_same_plan_multipliers_and_criterion(constant, see
     np.testing.assert_allclose(one.multiplier, other.multiplier, atol=1e-6)
     assert one.objective == pytest.approx(other.objective, abs=1e-8)
     assert np.count_nonzero(np.abs(one.multiplier) > 1e-6) > 0
+
+
+@pytest.mark.parametrize("solver", ["daqp", "qpoases"])
+def test_the_objective_is_the_criterion_of_the_moves(solver):
+    qp, shape = program(solver=solver, move=0.3, change=0.12)
+    J, targets = random_jacobian(0, 2, 4), np.random.default_rng(0).normal(size=(shape.moves, 2))
+    found = qp.solve(J, targets, make_bounds(shape, travel=0.7))
+    missed = targets - np.cumsum(found.moves, axis=0) @ J.T
+    criterion = 0.5 * (np.sum(shape.weights @ missed**2) + np.sum(found.moves**2 @ shape.move_weight))
+    assert found.objective == pytest.approx(criterion, rel=1e-9)
+
+
+def test_the_rows_of_the_view_are_positive_inside_its_pyramid_alone():
+    rows = view_rows((0.5, 0.4), 3)
+    assert (rows @ [0.49, -0.39, 1.0] > 0.0).all()
+    for outside in ([0.51, 0.0, 1.0], [-0.51, 0.0, 1.0], [0.0, 0.41, 1.0], [0.0, -0.41, 1.0]):
+        assert np.count_nonzero(rows @ outside < 0.0) == 1
+    assert view_rows((), 2).shape == (0, 2)
+
+
+BREACHES = {  # one limit each: first moves, later ones, and the ways of two joints [rad]
+    "none": [[0.4, -0.4], [0.8, -0.8], [0.3, -0.3]],
+    "a move": [[0.4, 0.0], [0.8, -0.1], [1.1, -0.4]],
+    "the first move": [[0.6, 0.0], [0.8, 0.0], [0.3, 0.0]],
+    "the first move back": [[0.0, -0.6], [0.0, -0.8], [0.0, -0.3]],
+    "a change": [[0.4, 0.0], [0.7, -0.4], [0.1, -0.4]],
+    "a way": [[0.5, 0.0], [0.9, 0.0], [0.7, 0.0]],
+    "a way back": [[0.0, -0.5], [0.0, -0.9], [0.0, -0.7]],
+    "the view": [[0.2, -0.5], [0.2, -0.7], [0.2, -0.4]],
+}
+
+
+def test_a_plan_is_checked_against_every_limit_for_each_run():
+    shape = QpShape(np.ones(3), np.ones(2), None, np.ones(2), np.full(2, 0.5), True, np.array([[1.0, 1.0]]))
+    count = len(BREACHES)
+    bounds = QpBounds(
+        *(np.full((count, 2), value) for value in (-0.5, 0.5, -2.0, 2.0)),
+        view_margin=np.where(np.array(list(BREACHES)) == "the view", -0.9, -9.0)[:, None],
+    )
+    plans = np.array(list(BREACHES.values()))
+    broken = exceeds(shape, bounds, np.eye(2), plans, np.cumsum(plans, axis=1))
+    assert broken.tolist() == [False] + [True] * (count - 1)
+    unlimited = replace(shape, largest_change=None, limit_position=False, view_rows=np.zeros((0, 2)))
+    broken = exceeds(unlimited, bounds, np.eye(2), plans, np.cumsum(plans, axis=1))
+    assert broken.tolist() == [name == "a move" for name in BREACHES]
 
 
 @pytest.mark.parametrize("constant", [False, True])

@@ -28,7 +28,8 @@ def test_the_first_step_equals_the_one_computed_by_hand():
     law = PidLaw(PidConfig(proportional_gain=-20.0 * np.log(0.9), integral_gain=4.0, damping=0.0), knowledge(n=1, m=1))
     first = seen([0.0], [0.0])
     # γ = 0.1, e = 0.1, I = 0.05 · 0.1 = 0.005, v = 0.1 / 0.05 · 0.1 + 4 · 0.005 = 0.22, u = 0.22 / 0.5
-    _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.full((2, 1), 0.1))
+    assert law.start(first).started.shape == ()
+    _, u = law.command(law.start(first), Estimate(np.array([[0.5]])), first, np.array([[0.1], [0.7]]))
     np.testing.assert_allclose(u, [0.44], rtol=1e-14)
 
 
@@ -38,6 +39,15 @@ def test_the_derivative_is_the_filtered_difference_of_the_error():
     u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
     # d = (0.15 · 0 + 0.1) / (0.15 + 0.05) = 0.5
     np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05 + 0.5, 0.0], atol=1e-14)
+    u = law.command(Estimate(J), look([-0.3, 0.0]), np.zeros((2, 2)))
+    # d = (0.15 · 0.5 + 0.3 − 0.1) / (0.15 + 0.05) = 1.375
+    np.testing.assert_allclose(J @ u, [0.3 * (1.0 - np.exp(-0.05)) / 0.05 + 1.375, 0.0], atol=1e-14)
+
+
+def test_the_first_error_has_no_derivative():
+    law = fresh(proportional_gain=1.0, derivative_gain=1.0)
+    u = law.command(Estimate(J), look([-0.1, 0.0]), np.zeros((2, 2)))
+    np.testing.assert_allclose(J @ u, [0.1 * (1.0 - np.exp(-0.05)) / 0.05, 0.0], atol=1e-14)
 
 
 def test_with_the_exact_jacobian_the_error_of_an_affine_plant_decays_as_exp_kp_t():

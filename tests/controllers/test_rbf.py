@@ -1,5 +1,7 @@
 """Tests of the windowed estimator: automatic differentiation, plain loops, hand arithmetic and the Lyapunov proof."""
 
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
@@ -69,6 +71,14 @@ def test_the_first_update_equals_the_one_computed_by_hand():
     np.testing.assert_allclose(estimator.jacobian(np.zeros(1)), [[2.75]], atol=1e-14)
     assert estimator.diagnostics()["estimator_step_size"] == pytest.approx(25.0)
     assert estimator.diagnostics()["window_error"] == pytest.approx(0.3)
+
+
+def test_epsilon_grows_with_the_square_of_the_noise_that_is_known():
+    net = JacobianNetwork(np.zeros((1, 1, 1)), np.ones((1, 1)), np.full((1, 1, 1), 2.0))
+    estimator = started(RbfConfig(window=4, k2=0.5, epsilon=0.01), net)
+    # Twice the usual millimetre: α₂ = 0.5 / (4 · 0.01 + 0.01) = 10
+    estimator.update(replace(motion([0.1], [0.5]), noise=np.asarray(0.002)))
+    assert estimator.diagnostics()["estimator_step_size"] == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("k2", [0.1, 1.0, 1.9])

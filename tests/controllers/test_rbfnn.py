@@ -183,6 +183,15 @@ def test_anti_windup_lessens_the_overshoot_of_a_limited_loop():
     assert with_it < without
 
 
+@pytest.mark.parametrize(("step", "learns"), [(0.15, False), (0.25, True)])
+def test_beyond_the_limit_nothing_is_learned_that_leads_further_beyond(step, learns):
+    # As above with Ĵ = 1: the weights ask for 0.2 rad, and for more after the update.
+    net = ControllerNetwork(np.array([[0.4, 1.0]]), np.ones(1), np.array([[[0.5], [1.0]]]), 1, 1)
+    made = law(net, limit=step / PERIOD, horizon=1, k=0.5, epsilon=0.0)
+    made.command(Estimate(np.array([[1.0]])), seen([1.0], [0.0]), np.full((PREVIEW + 1, 1), 0.4))
+    assert bool(made.diagnostics()["step_size"] > 0.0) == bool(made.state.learned.any()) == learns
+
+
 def test_a_lost_feature_teaches_nothing():
     made = law(network())
     u = made.command(ONES, seen(np.zeros(3), np.zeros(2), valid=False), np.ones((PREVIEW + 1, 2)))
@@ -206,6 +215,16 @@ def test_the_preview_is_used_only_where_it_is_switched_on():
     assert not np.allclose(on[0], on[1])
     np.testing.assert_array_equal(off[0], off[1])
     np.testing.assert_array_equal(off[0], on[1])
+
+
+def test_the_roll_out_follows_the_reference_from_step_to_step():
+    net, rng = network(), np.random.default_rng(4)
+    reference, q, y = rng.normal(size=(PREVIEW + 1, 2)), rng.normal(size=3), rng.normal(size=2)
+    made, J = law(net, horizon=4), rng.normal(size=(2, 3))
+    made.command(Estimate(J), seen(q, y), reference)
+    history = (reference[:1] - y, q[None])
+    ahead = roll_out(net, net.weights, J, history, np.diff(reference[:5], axis=0), np.full(3, 1e6))
+    np.testing.assert_allclose(made.state.predicted, ahead.errors, rtol=1e-12)
 
 
 def test_the_commanded_position_may_stand_in_for_the_measured_one():

@@ -66,6 +66,8 @@ def test_a_filter_without_weights_is_the_kalman_filter_of_feature_and_jacobian()
         np.testing.assert_allclose(run.jacobian(), x[:, 1:], atol=1e-10)
         np.testing.assert_allclose(run.state.deviation, y[k] - x[:, 0], atol=1e-10)
         np.testing.assert_allclose(run.state.P, P, atol=1e-10)
+    of_jacobian = np.mean([np.diagonal(each)[1:] for each in P])
+    np.testing.assert_allclose(run.diagnostics()["jacobian_deviation"], np.sqrt(of_jacobian), rtol=1e-6)
 
 
 def test_the_weight_is_that_of_tukey_and_belongs_to_the_residual():

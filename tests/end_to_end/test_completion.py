@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import select
 import shutil
 import sys
@@ -18,8 +19,8 @@ from servobench.harness.cli.completion import join_words
 BASH = shutil.which("bash")
 
 
-def complete(line: str, expected: str, folder: Path) -> None:
-    """Type a line and the tab key in an interactive bash, and wait until it shows what is expected."""
+def complete(line: str, folder: Path) -> str:
+    """Type a line and the tab key in an interactive bash, and return what the line is then."""
     program = folder / "servobench"
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m servobench "$@"\n')
     program.chmod(0o755)
@@ -29,20 +30,21 @@ def complete(line: str, expected: str, folder: Path) -> None:
         os.execve(BASH, [BASH, "--norc", "--noprofile", "-i"], {**environment, "PS1": "> "})
     shown = ""
 
-    def wait_for(text: str) -> None:
+    def wait_for(pattern: str) -> re.Match[str]:
         nonlocal shown
         deadline = time.monotonic() + 120
-        while text not in shown:
+        while not (found := re.search(pattern, shown)):
             assert time.monotonic() < deadline, shown
             if select.select([terminal], [], [], 1.0)[0]:
                 shown += os.read(terminal, 4096).decode()
+        return found
 
     try:
         os.write(terminal, b'eval "$(servobench --show-completion bash)"; echo "rea""dy"\n')
         wait_for("ready\r\n")
         shown = ""
-        os.write(terminal, f"{line}\t".encode())
-        wait_for(expected)
+        os.write(terminal, f'{line}\t\x01echo "is: \x05"\n'.encode())  # control and A, E: to the begin and the end
+        return wait_for("\nis: (.*)\r\n")[1]
     finally:
         os.close(terminal)
         os.waitpid(pid, 0)
@@ -51,7 +53,7 @@ def complete(line: str, expected: str, folder: Path) -> None:
 @pytest.mark.skipif(BASH is None, reason="bash is not installed")
 def test_bash_completes_a_name_behind_its_colon(tmp_path):
     line = "servobench compare --controllers constant,ukf_mfac:"
-    complete(f"{line}pub", f"{line}published ", tmp_path)
+    assert complete(f"{line}pub", tmp_path) == f"{line}published "
 
 
 @pytest.mark.parametrize(

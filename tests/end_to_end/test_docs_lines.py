@@ -64,10 +64,12 @@ def test_the_pages_show_every_command():
 def test_every_line_is_one_that_the_command_line_reads(words):
     command = typer.main.get_command(app)
     context = command.make_context("servobench", list(words))
-    while hasattr(command, "resolve_command") and words[-1] != "--help":
+    while hasattr(command, "resolve_command"):
         name, command, rest = command.resolve_command(context, context._protected_args + context.args)
         if "--help" not in rest:
             context = command.make_context(name, rest, parent=context)
+    options = {option for each in command.params for option in each.opts} | {"--help"}
+    assert {word for word in words if word.startswith("--")} <= options
 
 
 @pytest.mark.parametrize(

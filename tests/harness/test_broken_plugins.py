@@ -197,6 +197,7 @@ COMMANDS = {
     **RUNS,
     "run crashing": ["run", "constant", "--plant", "crashing", *SHORT],
     "run cell": ["run", "constant", "--plant", "cell", *SHORT],
+    "settings of others": ["run", "constant", "--plant", "kinematic", "--config", "all.toml", "--out", "one", *SHORT],
     "show all plants": ["init", "--plants", "all", "--controllers", "constant", "-"],
 }  # fmt: skip
 
@@ -209,6 +210,7 @@ def told(tmp_path_factory):
     write(site, CELLS, "some_cell.py")
     for name, text in MODULES.items():
         write(site, text, f"some_{name}.py")
+    write(folder, "".join(f"[{name}]\ngain = 1\n" for name in ("import-error", "dependency", "number")), "all.toml")
     done = subprocess.run(
         [sys.executable, "-c", DRIVER, json.dumps(list(COMMANDS.values()))], cwd=folder, capture_output=True, text=True,
         env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"}, check=False, timeout=900,
@@ -279,3 +281,8 @@ def test_what_is_whole_runs_beside_them(told):
     assert (code, "[cell.sensing]" in out) == (0, True), errors
     assert f"servobench: left out: {PLANTS['crashing']}" in errors
     assert f"servobench: note: {UNUSED_PLANT}" in errors
+
+
+def test_settings_of_what_cannot_be_loaded_are_left_for_where_it_can(told):
+    code, _, err = told["settings of others"]
+    assert code == 0, err

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
+import re
 import shutil
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
 from kit.command import judged
 from kit.folders import made_up_row
 from servobench.harness.batch import parquet, results
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
-from servobench.harness.batch.checksums import SUMS, DamagedFile, UnwritableFolder, fault, read_sums, writing
+from servobench.harness.batch.checksums import SUMS, DamagedFile, fault, read_sums
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.sweep import SweepPlan
@@ -31,7 +32,7 @@ class Notes(Observer):
         self.repeated = 0
 
     def note(self, text: str) -> None:
-        self.notes.append(text)
+        self.notes.append(text.removeprefix("note: "))
 
     def finished(self, rows) -> None:
         self.repeated += len(rows)
@@ -64,6 +65,7 @@ def whole(tmp_path_factory):
     assert results.load_runs(folder)["status"].nunique() > 1
     found = examine(folder)
     assert (found.findings, found.runs, found.wanted) == ([], RUNS, RUNS)
+    assert found.files == 3  # runs, failures, manifest
     return folder
 
 
@@ -114,7 +116,7 @@ def test_a_damaged_part_is_named_by_all_and_only_its_runs_are_repeated(half, who
     assert found.runs == RUNS - 16
     resumed = run(folder, resume=True)
     assert resumed.repeated == 16
-    assert any(f"{part} {what}: its runs are carried out again" in note for note in resumed.notes)
+    assert resumed.notes == [f"{part} {what}: its runs are carried out again"]
     assert_same(folder, whole)
 
 
@@ -132,8 +134,11 @@ def test_a_part_with_the_rows_of_another_is_refused(half, whole, tmp_path):
 def test_parts_without_checksums_are_read_and_kept(half, whole, tmp_path):
     folder = copy(half, tmp_path)
     (folder / SUMS).unlink()
+    (finding,) = examine(folder).findings
+    assert (finding.name, finding.what) == (SUMS, "is missing, so that nothing vouches for the other files")
     assert len(results.load_runs(folder)) == RUNS - 8
-    assert run(folder, resume=True).repeated == 8
+    resumed = run(folder, resume=True)
+    assert (resumed.repeated, resumed.notes) == (8, [])
     assert_same(folder, whole)
 
 
@@ -145,7 +150,42 @@ def test_a_damaged_table_is_named_and_made_again(whole, tmp_path, what):
         results.load_runs(folder)
     with pytest.raises(DamagedFile, match=rf"runs\.parquet {what}"):
         results.collect(folder)
-    assert run(folder, resume=True).repeated == RUNS
+    (finding,) = examine(folder).findings
+    assert finding.remedy.endswith("--resume; runs that are in no part are repeated")
+    resumed = run(folder, resume=True)
+    assert resumed.repeated == RUNS
+    assert resumed.notes == [f"{folder / results.RUNS} {what}: runs that are in no part are carried out again"]
+    assert_same(folder, whole)
+
+
+def test_an_intact_folder_is_left_as_it_is(whole, tmp_path):
+    folder = copy(whole, tmp_path)
+    resumed = run(folder, resume=True)
+    assert (resumed.repeated, resumed.notes) == (0, [])
+    assert read_sums(folder) == read_sums(whole)
+    assert_same(folder, whole)
+
+
+def test_parts_that_are_left_beside_whole_tables_are_removed_and_no_run_is_repeated(half, whole, tmp_path):
+    folder = copy(whole, tmp_path)
+    name = results.part_name(8, results.RUNS)
+    (folder / results.PARTS).mkdir()
+    shutil.copy(half / name, folder / name)
+    with (folder / SUMS).open("a") as file:
+        file.writelines(f"{digest}  {name}\n" for digest in read_sums(half)[name])
+    assert run(folder, resume=True).repeated == 0
+    assert_same(folder, whole)
+
+
+@pytest.mark.parametrize("name", [results.MANIFEST, results.RUNS])
+def test_a_file_that_lost_its_line_is_vouched_for_again(whole, tmp_path, name):
+    folder = copy(whole, tmp_path)
+    lines = (folder / SUMS).read_text().splitlines(keepends=True)
+    (folder / SUMS).write_text("".join(line for line in lines if not line.endswith(f"  {name}\n")))
+    named = [(each.name, each.what) for each in examine(folder).findings]
+    assert named == ([] if name == results.MANIFEST else [(name, f"is not listed in {SUMS}")])
+    assert run(folder, resume=True).repeated == (0 if name == results.MANIFEST else RUNS)
+    assert fault(folder, name, read_sums(folder)) is None
     assert_same(folder, whole)
 
 
@@ -159,6 +199,16 @@ def test_no_bit_of_a_folder_can_change_in_silence(whole, tmp_path):
             results.load_runs(folder)
         (folder / name).write_bytes(kept[name])
     results.load_runs(folder)
+
+
+def test_a_manifest_that_is_lost_beside_whole_tables_is_written_anew(whole, tmp_path):
+    folder = copy(whole, tmp_path)
+    (folder / results.MANIFEST).unlink()
+    found = examine(folder)
+    assert (found.runs, found.wanted) == (RUNS, 0)
+    resumed = run(folder, resume=True)
+    assert (resumed.repeated, resumed.notes) == (0, [f"{folder / results.MANIFEST} is missing: it is written anew"])
+    assert_same(folder, whole)
 
 
 def test_a_flipped_bit_is_found_by_the_page_checksums_where_the_table_stands_alone(whole, tmp_path):
@@ -180,8 +230,12 @@ def test_a_flipped_bit_is_found_by_the_page_checksums_where_the_table_stands_alo
 def test_a_lost_log_of_failures_is_made_from_the_table(whole, tmp_path):
     folder = copy(whole, tmp_path)
     (folder / results.FAILURES).write_bytes(b"")
-    assert [finding.name for finding in examine(folder).findings] == [results.FAILURES]
-    assert run(folder, resume=True).repeated == 0
+    (finding,) = examine(folder).findings
+    assert finding.name == results.FAILURES
+    assert finding.remedy.endswith("--resume; it is written anew, without traces")
+    resumed = run(folder, resume=True)
+    assert resumed.repeated == 0
+    assert resumed.notes == [f"{folder / results.FAILURES} is empty: it is written anew, without traces"]
     assert_same(folder, whole)
 
 
@@ -215,6 +269,7 @@ def test_a_manifest_that_is_lost_together_with_a_part_is_written_anew_by_what_th
         ("run_count", "many", "a whole number"),
         ("run_count", True, "a whole number"),
         ("created", 3, "text"),
+        ("created", ["many words"] * 10, "text"),
         ("plants", ["a", 1], "a list of text"),
         ("configuration", {"run": 1}, "an object of an object"),
         ("own_controllers", {"mine": None}, "an object of an object"),
@@ -227,7 +282,8 @@ def test_a_manifest_of_wrong_types_is_one_line(whole, tmp_path, key, value, want
     manifest = json.loads((folder / results.MANIFEST).read_text()) | {key: value}
     (folder / results.MANIFEST).write_text(json.dumps(manifest))
     for command in (results.load_runs, results.collect):
-        with pytest.raises(ConfigurationError, match=f"manifest.json is damaged: {key} must be {wanted}, got"):
+        shown = re.escape(repr(str(value)[:60]))
+        with pytest.raises(ConfigurationError, match=f"manifest.json is damaged: {key} must be {wanted}, got {shown};"):
             command(folder)
 
 
@@ -241,6 +297,22 @@ def test_stray_files_are_named_and_count_for_nothing(half, whole, tmp_path):
     shutil.copy(part, folder / results.part_name(20, results.RUNS))
     assert examine(folder).findings[0].what == "is not listed in SHA256SUMS"
     assert run(folder, resume=True).repeated == 8
+    assert_same(folder, whole)
+
+
+def test_files_that_a_killed_process_had_begun_are_removed(half, whole, tmp_path):
+    folder = copy(half, tmp_path)
+    begun = [folder / f".{results.RUNS}-12-34", folder / results.PARTS / f".00000016.{results.RUNS}-12-34"]
+    for path in begun:
+        path.write_bytes(b"half")
+    assert examine(folder).findings == []
+
+    class Look(Notes):
+        def finished(self, rows) -> None:
+            assert not any(path.exists() for path in begun)
+            super().finished(rows)
+
+    assert run(folder, Look(), resume=True).repeated == 8
     assert_same(folder, whole)
 
 
@@ -276,26 +348,6 @@ def test_a_file_that_is_gone_is_named(whole, tmp_path, name):
     assert found == [(name, "is missing")]
 
 
-def test_a_folder_in_the_place_of_a_file_is_named(whole, tmp_path):
-    folder = copy(whole, tmp_path)
-    (folder / results.RUNS).unlink()
-    (folder / results.RUNS).mkdir()
-    assert fault(folder, results.RUNS, read_sums(folder)) == "cannot be read: Is a directory"
-    (folder / SUMS).unlink()
-    (folder / SUMS).mkdir()
-    with pytest.raises(ConfigurationError, match=f"{SUMS} cannot be read: Is a directory"):
-        read_sums(folder)
-
-
-def test_a_folder_that_takes_no_more_files_says_why_once(tmp_path):
-    full = pytest.raises(UnwritableFolder, match=f"results folder {tmp_path} cannot be written: No space left")
-    with full as caught, writing(tmp_path / "other"), writing(tmp_path):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert caught.value.errno == errno.ENOSPC
-    with pytest.raises(UnwritableFolder, match="gone cannot be written: it was removed"), writing(tmp_path / "gone"):
-        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
-
-
 @pytest.mark.parametrize(
     ("source", "name", "what"),
     [(8, 12, "holds the rows of other runs"), (None, 12, "holds runs that the part before it has, too")],
@@ -328,6 +380,21 @@ def test_a_changed_bit_is_found_by_the_pages_where_nothing_vouches_for_a_table(h
     said = named[results.part_name(8, results.RUNS)]
     assert said.startswith("cannot be read (")
     assert "CRC" in said  # the words of the library
+
+
+def test_a_changed_bit_is_found_by_the_pages_also_where_only_some_runs_are_read(tmp_path):
+    folder = tmp_path / "out"
+    run(folder, seeds=range(2), steps=True)
+    (folder / SUMS).unlink()
+    ids = results.load_steps(folder)["run_id"].unique().tolist()
+    content = bytearray((folder / results.STEPS).read_bytes())
+    file = pq.ParquetFile(folder / results.STEPS)
+    column = file.metadata.row_group(0).column(file.schema_arrow.get_field_index("error_norm"))
+    content[column.data_page_offset + column.total_compressed_size - 1] ^= 1  # the last byte of its last page
+    (folder / results.STEPS).write_bytes(content)
+    for runs in (None, ids[:1]):
+        with pytest.raises(DamagedFile, match=r"steps\.parquet cannot be read \(.*CRC"):
+            results.load_steps(folder, runs)
 
 
 def test_a_manifest_of_another_schema_is_not_written_anew(half, tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from kit.command import servobench
+from servobench.harness.batch.results import load_runs
 from servobench.harness.cli.main import command_line
 from servobench.harness.config.describe import plain
 from servobench.harness.config.registry import controller_names
@@ -94,10 +95,7 @@ def test_the_shell_completes_names_also_within_lists(words, wanted):
 def test_a_run_takes_its_controller_first(monkeypatch, capsys, tmp_path):
     short = ("--plant", "kinematic", "--set", "exp2.duration=0.5", "--out", str(tmp_path / "out"))
     assert servobench(monkeypatch, "run", "constant", *short) == 0
-    assert (
-        "kinematic-constant" in (tmp_path / "out" / "manifest.json").read_text()
-        or "constant" in capsys.readouterr().out
-    )
+    assert load_runs(tmp_path / "out")["run_id"].tolist() == ["kinematic-constant-exp2-moderate-0"]
     assert servobench(monkeypatch, "run", "constant", "--controller", "rls") == 2
     assert "two controllers are named, constant and --controller rls; a run has one" in capsys.readouterr().err
 

@@ -149,6 +149,11 @@ BROKEN = {
         WHOLE.replace("self, knowledge", "self, config, knowledge"),
         "mine.py:6: Mine.__init__ must name the dataclass of its settings, such as config: MineConfig",
     ),
+    "settings of an unknown class": (
+        WHOLE.replace("self, knowledge", "self, config: 'Missing', knowledge"),
+        "mine.py:6: Mine.__init__ must name the dataclass of its settings, such as config: MineConfig; "
+        "NameError: name 'Missing' is not defined",
+    ),
     "settings without a default": (
         CONFIGURED.replace("gain: float = 2.0", "gain: float"),
         "mine.py:8: every field of MineConfig needs a default; gain has none",

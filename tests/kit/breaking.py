@@ -1,9 +1,9 @@
 """Breaks every file operation of a batch, or of caches, one after the other and in every way, and goes on each time.
 
-To be run by `start`, which builds the library of `break_files.c` and preloads it. Each point is a child of this
-process, which has all modules in memory, so that it takes a fraction of a second. The child is killed, or its operation
-fails; what was finished must still be readable; a second child resumes, and its tables must be those of an undisturbed
-batch, wall-clock columns aside, bit for bit.
+To be run by `start`, which builds the library of `break_files.c` and preloads it; the command does so for each way, on
+all processors. Each point is a child of a process that has all modules in memory, so that it takes a fraction of a
+second. The child is killed, or its operation fails; what was finished must still be readable; a second child resumes,
+and its tables must be those of an undisturbed batch, wall-clock columns aside, bit for bit.
 
 `python -m kit.breaking`, with the tests and the package on the path, breaks all operations: a part of `make nightly`.
 """
@@ -23,6 +23,7 @@ import time
 import traceback
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -86,6 +87,23 @@ def start(folder: Path, *arguments: str, timeout: float | None = None) -> dict[s
     assert done.returncode == 0, done.stdout + done.stderr
     figures = dict(json.loads(done.stdout.splitlines()[-1]))
     return figures | ({"why": done.stderr[-3000:]} if figures["failed"] else {})
+
+
+def start_each(modes: list[str], arguments: list[str]) -> dict[str, object]:
+    """Break in each way in a process of its own, as many at a time as there are processors; return all figures."""
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
+
+        def of_mode(mode: str) -> dict[str, object]:
+            place = Path(folder, mode)
+            place.mkdir()
+            return start(place, *arguments, "--modes", mode)
+
+        found = list(pool.map(of_mode, modes))
+    added = {name: sum((each[name] for each in found[1:]), found[0][name]) for name in ("points", "failed")}
+    why = "\n".join(str(each["why"]) for each in found if each["failed"])
+    minutes = round((time.monotonic() - begin) / 60.0, 2)
+    return {**found[0], **added, "minutes": minutes, **({"why": why} if why else {})}
 
 
 def campaign(steps: bool, controllers: tuple[str, ...], runs: int) -> Campaign:
@@ -255,20 +273,17 @@ def main() -> None:
     parser.add_argument("--modes", default=",".join(MODES))
     chosen = parser.parse_args()
     if "BREAK_LIBRARY" not in os.environ:
-        with tempfile.TemporaryDirectory() as folder:
-            figures = start(Path(folder), *sys.argv[1:])
+        figures = start_each(chosen.modes.split(","), sys.argv[1:])
         sys.stdout.write(json.dumps(figures, indent=1) + "\n")
         sys.exit(bool(figures["failed"]))
-    begin = time.monotonic()
     folder = Path(os.environ["BREAK_LIBRARY"]).parent
     batch = Batches(campaign(chosen.steps, tuple(chosen.controllers.split(",")), chosen.runs), chosen.block)
     breaker = Breaker(folder, Caches() if chosen.caches else batch)
     total = breaker.operations()
-    for place, mode in enumerate(chosen.modes.split(",")):
-        for number in range(1 + 7 * place % chosen.every, total + 1, chosen.every):
+    for mode in chosen.modes.split(","):
+        for number in range(1 + 7 * list(MODES).index(mode) % chosen.every, total + 1, chosen.every):
             breaker.break_at(number, mode)
-    minutes = round((time.monotonic() - begin) / 60.0, 2)
-    figures = {"operations": total, "points": breaker.points, "failed": breaker.failed, "minutes": minutes}
+    figures = {"operations": total, "points": breaker.points, "failed": breaker.failed}
     sys.stdout.write(json.dumps(figures) + "\n")
 
 

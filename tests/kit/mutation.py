@@ -59,7 +59,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "folders": (
         ("harness/batch/parquet.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
          "harness/batch/manifest_text.py"),
-        ("harness/test_results.py", "harness/test_integrity.py"),
+        ("harness/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
     ),
 }  # fmt: skip
 BROKEN = 77  # exit code of a mutant that could not be put in place
