@@ -22,15 +22,23 @@ TABLE = "analyse.csv"
 
 
 def analyse(
-    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER...", help="Names of controllers.")],
-    mismatch: Annotated[str, typer.Option(help="How far the true robot is from the nominal one.")] = "none",
-    seed: Annotated[int, typer.Option(help="Of the move that warms controllers up, and of the robot.")] = 0,
+    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
+    mismatch: Annotated[
+        str,
+        typer.Option(
+            help="Difference of the true robot from the nominal one: none, factory, moderate, severe, or axes."
+        ),
+    ] = "none",
+    seed: Annotated[int, typer.Option(help="Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
-        str, typer.Option(help="Where estimators are frozen: at the true, nominal or estimated Jacobian.")
+        str, typer.Option(help="Jacobian that estimators are fixed at: true, nominal or estimated.")
     ] = "true",
     identify: Annotated[
-        bool, typer.Option("--identify", help="Identify all loops from logged small motions, estimators learning on.")
+        bool,
+        typer.Option(
+            "--identify", help="Identify all loops from logged small motions, while estimators go on learning."
+        ),
     ] = False,
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Also find the limits of gain and latency by simulation.")

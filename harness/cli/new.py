@@ -21,7 +21,7 @@ NEXT: Final = {  # what to do with a new file, by what it is
 
 
 def new(
-    kind: Annotated[str, typer.Argument(help="What to begin: controller or plant.")],
+    kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
     folder: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
 ) -> None:

@@ -46,7 +46,7 @@ class NewRun:
     robot: Annotated[str | None, _new("robot", completion.robots)] = None
     seed: Annotated[int | None, _new("seed")] = None
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
+        list[str] | None, typer.Option("--set", help="New run: one setting, such as bullet.latency=0.05.")
     ] = None
     config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None
 
@@ -70,17 +70,17 @@ def record(
     run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
     new: NewRun = NewRun(),
     kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
-    begin: Annotated[float, typer.Option(min=0.0, help="Where in the run the film begins [s].")] = 0.0,
+    begin: Annotated[float, typer.Option(min=0.0, help="Time in the run at which the film begins [s].")] = 0.0,
     length: Annotated[
-        float | None, typer.Option(min=0.001, help="How long the film is [s]; default: to the run's end.")
+        float | None, typer.Option(min=0.001, help="Length of the film [s]; default: to the end of the run.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the films; default recordings below the results folder.")
+        Path | None, typer.Option(help="Folder for the films; default: recordings in the results folder.")
     ] = None,
 ) -> None:
-    """Show a run as film (MP4, GIF) and snapshots.
+    """Make a film (MP4, GIF) and snapshots of a run.
 
-    They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
+    They show the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.engines import engine_of, rendered_plant

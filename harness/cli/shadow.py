@@ -28,7 +28,9 @@ def shadow(
     run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    out: Annotated[Path | None, typer.Option(help="CSV file for what it would have commanded at each instant.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV file for what it would have commanded at each instant.")
+    ] = None,
 ) -> None:
     """Show a controller a logged run and compare commands.
 

@@ -200,7 +200,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "-o", "new.fmu", "--platforms", "x86_64-linx"), "x86_64-linx"),
     (("comapre",), "comapre"),
     # a log beside a controller, and exports
-    (("shadow",), "missing argument 'log'"),
+    (("shadow",), "missing argument 'LOG'"),
     (("shadow", "none"), "none does not exist; wanted a results folder or a table"),
     (("shadow", "full"), "full is not a results folder"),
     (("shadow", "file", "--controller", "constant"), "file must be a results folder, or a table in .csv or .parquet"),
