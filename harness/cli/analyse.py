@@ -96,12 +96,9 @@ def _source(jacobian: str) -> Source:
 def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
     """Return a run for each controller on the kinematic plant."""
     from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import check_settings, resolve
 
-    if seed < 0:
-        raise ConfigurationError(f"seed must not be negative, got {seed}")
     names = named.split_controllers(",".join(controllers), robot)
     check_settings(settings, [PLANT, TASK, *names])
     drawn = read_mismatch(mismatch)

@@ -126,7 +126,7 @@ def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
     from servobench.harness.batch.apart import choose_controllers, choose_plants
     from servobench.harness.config.engines import rendered_plant
-    from servobench.harness.config.settings import ConfigurationError, flatten, read_settings
+    from servobench.harness.config.settings import flatten, read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
@@ -137,8 +137,6 @@ def _carried_out(new: NewRun) -> LoggedRun:
     (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
     chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
     request = RunRequest(**asked | chosen)
-    if request.seed < 0:
-        raise ConfigurationError(f"seed must not be negative, got {request.seed}")
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))
