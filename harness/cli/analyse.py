@@ -72,7 +72,10 @@ def analyse(
         chosen = {run.request.controller: run for run in runs}
         with console.status("simulating"):
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"{out} cannot be written: {error.strerror}") from error
     table.to_csv(out / TABLE, index=False)
     text = printed(table)
     page = write_pictures(out, loops, text, LEGEND)[0]

@@ -102,11 +102,18 @@ def main() -> None:
         line = _line_of_system(error)
         if line is None or "--debug" in sys.argv:
             raise
-        sys.stderr.write(f"servobench: {line}; finished runs are kept, --resume continues\n")
+        sys.stderr.write(f"servobench: {line}{_resuming()}\n")
         code = FAILED
     if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that say more end by themselves
         sys.stderr.write("servobench: interrupted\n")
     sys.exit(code)
+
+
+def _resuming() -> str:
+    """Return how the command goes on after an error of the system, if it has finished runs to keep."""
+    command = command_line().commands.get("".join(sys.argv[1:2]))
+    kept = command is not None and any(option.name == "resume" for option in command.params)
+    return "; finished runs are kept, --resume continues" if kept else ""
 
 
 def _say_where_a_signal_strikes() -> None:
