@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 from kit import golden
 from kit.plants import plant_parameters
@@ -13,7 +14,11 @@ from servobench.harness.config.engines import engine_of
 from servobench.harness.config.registry import CONTROLLERS, RENDERED
 
 CHANGELOG = Path(__file__).parents[2] / "CHANGELOG.md"
-MARGIN = 10.0  # times the spread that was measured
+OPENBLAS = {each["architecture"] for each in threadpool_info() if each["internal_api"] == "openblas"}
+SAME = {golden.KERNEL} == OPENBLAS and np.__version__.startswith(golden.NUMPY)  # arithmetic as behind the table
+MARGIN = 10.0 if SAME else 1000.0  # times the spread that was measured
+TRAINED = {"rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid", "rbf_pid:published"}
+OTHER_NETWORKS = 0.05  # [rad/s] by which these may differ if other arithmetic has trained their networks
 RENEW = "if that is meant: make golden, and a line under 'results change' in CHANGELOG.md"
 
 
@@ -32,6 +37,9 @@ def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_th
     found, stored = golden.golden_runs(plant), golden.stored()
     stored = stored[stored["plant"] == plant].reset_index(drop=True)
     assert found["controller"].tolist() == stored["controller"].tolist(), RENEW
+    if not SAME:
+        trained = stored["controller"].isin(TRAINED)
+        stored.loc[trained, "spread"] = stored.loc[trained, "spread"].clip(lower=OTHER_NETWORKS / MARGIN)
     commands, settled = deviations(found, stored)
     changed = found["controller"][(commands > MARGIN) | (settled > 1.0 + 1e-9)].tolist()
     assert not changed, f"{commands.round(1).tolist()} spreads, {settled.tolist()} periods; {RENEW}"

@@ -30,6 +30,7 @@ PERIOD = 0.05  # [s]
 TASK = "exp2"
 DURATIONS = {"kinematic": 4.0, "fmu": 4.0, **dict.fromkeys(RENDERED, PERIODS * PERIOD)}  # [s], short where rendered
 RENDERER = "llvmpipe"  # that drew the images of `mujoco`; those of another one differ by more than rounding
+NUMPY, KERNEL = "2.4.", "Haswell"  # begins the version, and is the kernel of OpenBLAS, by which the table was made
 MIN_SPREAD = 1e-13  # [rad/s], a thousand units in the last place of a slow command
 TABLE = Path(__file__).parents[1] / "closed_loop" / "golden_runs.csv"
 SUMS = [f"u{k:02d}" for k in range(PERIODS)]
