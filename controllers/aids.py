@@ -1,4 +1,4 @@
-"""The aids of a composed controller: what any estimator and any law can have beside what its paper gives it.
+"""The aids of a composed controller: what any estimator and any law can have in addition to what its paper gives it.
 
 An aid is a stage of the chain that can be left out; all of them are off by default, which is a method as published.
 """
@@ -38,7 +38,7 @@ class AidsConfig:
     longest_delay: Annotated[NonNegative, Le(1.0)] = 0.25
     """[s] the longest delay that is considered; for an identified one."""
     latency: NonNegative = 0.0
-    """[s] the camera's; for a given delay. A method that gets the truth gets the true one."""
+    """[s] latency of the camera; for a given delay. A method that gets the truth gets the true one."""
     command_delay: NonNegative = 0.05
     """[s] until a command shows in the joints; for a given response, as the next one."""
     lag: NonNegative = 0.05
@@ -68,7 +68,7 @@ class AidsConfig:
     filter_error: NonNegative = 0.2
     """[1] error of the Jacobian as a share of its size, as the filter sees it."""
     posture_gain: NonNegative = 0.6
-    """[1/s] of the posture."""
+    """[1/s] gain of the posture."""
     damping: Positive = 0.02
     """[m/rad] of the inverse in feedforward, posture and redistribution."""
 

@@ -28,6 +28,7 @@ from servobench.fmus.model_description import (
 )
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.fmus.source import layout_header
+from servobench.plant.files import reason
 
 MACHINERY: Final = "fmi"  # folder of the FMI functions, which know no model
 HEADERS: Final = {
@@ -201,8 +202,15 @@ def _token(contents: Mapping[str, bytes]) -> str:
 
 
 def write_archive(path: Path, contents: Mapping[str, bytes], first: str = "modelDescription.xml") -> None:
-    """Write files by their path in a zip archive, the `first` one first; atomically."""
-    handle, name = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
+    """Write files by their path in a zip archive, the `first` one first; atomically.
+
+    Raises:
+        ValueError: the folder does not exist, or takes no file.
+    """
+    try:
+        handle, name = tempfile.mkstemp(prefix=path.name, suffix=".part", dir=path.parent)
+    except OSError as error:
+        raise ValueError(f"{path} cannot be written: {reason(error)}") from error
     try:
         with os.fdopen(handle, "wb") as file, zipfile.ZipFile(file, "w") as archive:
             for inside in sorted(contents, key=lambda name: (name != first, name)):

@@ -34,9 +34,9 @@ class Ur5FmuConfig:
     fmi_version: Literal[2, 3] = 2
     """Version of FMI."""
     max_joint_speed: Positive = 1.0
-    """[rad/s] limit of every joint, beside its maker's; a cautious share of a UR5's π."""
+    """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
     joint_range: Positive = 2 * math.pi
-    """[rad] largest joint position each way, beside its maker's limits; a UR5's range."""
+    """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
     lag: NonNegative = 0.05
     """[s] τ, time constant of the joints' velocity loops; 0 means none."""
     joint_lags: tuple[NonNegative, ...] = ()

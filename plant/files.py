@@ -43,9 +43,14 @@ def read_toml(what: str, path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{what} {path} cannot be read: {error}") from error
+        raise ValueError(f"{what} {path} cannot be read: {reason(error)}") from error
     except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
         raise ValueError(f"{what} {path} is not valid TOML: {error}") from error
+
+
+def reason(error: Exception) -> str:
+    """Return why a file cannot be read or written, without number and path for an error of the system."""
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def user_path(text: str) -> Path:

@@ -48,7 +48,7 @@ class TrueModel:
 
 
 class Abilities(ABC):
-    """The abilities of plants and worlds beside moving; those that are optional have a default."""
+    """The abilities of plants and worlds in addition to moving; those that are optional have a default."""
 
     spec: PlantSpec
     """Sizes, names, limits and period; set on construction."""

@@ -34,7 +34,7 @@ class SensingConfig:
     frame_period: NonNegative = 0.0
     """[s] between two frames, from the start of the run on; 0: a frame arrives at every control instant."""
     jitter: NonNegative = 0.0
-    """[s] J: each frame is late by U(0, J) beside the latency; frames do not overtake each other."""
+    """[s] J: each frame is late by U(0, J) in addition to the latency; frames do not overtake each other."""
     noise: Family = "white"
     """Family of the noise of each component."""
     noise_share: Share = 0.1

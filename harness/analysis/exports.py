@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Hashable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +16,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.extras import check_installed
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.files import reason
 
 if TYPE_CHECKING:
     from control import TimeResponseData
@@ -51,6 +53,17 @@ def export_folder(folder: Path, out: Path, kind: str) -> list[Path]:
         out.mkdir(parents=True)
     except FileExistsError:
         raise ConfigurationError(f"{out} exists already; name a new folder") from None
+    except OSError as error:
+        raise ConfigurationError(f"{out} cannot be written: {reason(error)}") from error
+    try:
+        return _write_runs(folder, runs, out, kind)
+    except BaseException:
+        shutil.rmtree(out, ignore_errors=True)
+        raise
+
+
+def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[Path]:
+    """Write the steps of `runs`, and for CSV their table, into a new folder and return the files."""
     files = [out / "runs.csv"] if kind == CSV else []
     for file in files:
         runs.to_csv(file, index=False)

@@ -192,7 +192,8 @@ def _speed(runs: pd.DataFrame, names: Sequence[str]) -> str:
         return ""
     clear = table["First", "controller"][table["How sure", "not told apart from the first"] == NOBODY]
     if clear.empty:
-        return ", and none of them is shown to be faster or more precise than the others"
+        none, others = ("neither", "the other") if len(names) == 2 else ("none of them", "the others")
+        return f", and {none} is shown to be faster or more precise than {others}"
     best = clear.value_counts().index[0]
     where = "" if len(table) == 1 else f" in {(clear == best).sum()} of {len(table)} places"
     return f", of which `{best}` is shown to be the best{where}"

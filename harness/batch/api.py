@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import operator
 import pickle
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, SupportsIndex, TypeAlias
 
 import pandas as pd
 
@@ -25,7 +26,7 @@ from servobench.harness.config.registry import Offer, choose_controller, choose_
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
-from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolved import check_settings
 from servobench.plant.eyes.registry import DEFAULT_SENSING
 from servobench.plant.plant import Plant, PlantEntry
@@ -133,9 +134,12 @@ def compare(
     Raises:
         ConfigurationError: something that cannot be used; it is a ValueError.
     """
-    chosen = range(seeds) if isinstance(seeds, int) else tuple(seeds)
-    _check_lengths(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings,
-                   seeds=chosen)  # fmt: skip
+    chosen = _seeds(seeds)
+    _check_lists(controllers=controllers, plants=plants, tasks=tasks, mismatches=mismatches, sensings=sensings,
+                 seeds=chosen)  # fmt: skip
+    _check_limits(workers=workers, run_timeout=run_timeout, run_memory=run_memory)
+    if resume and out is None:
+        raise ConfigurationError("resume needs out, the folder to continue in")
     with offering():
         names = tuple(_name(each) for each in controllers)
         worlds = tuple(_plant_name(each) for each in plants)
@@ -146,9 +150,27 @@ def compare(
         return _rows(batch, Settings(settings or {}), out, how)
 
 
-def _check_lengths(**given: Sequence[Any]) -> None:
-    """Raise a `ConfigurationError` if one of the arguments names nothing."""
+def _seeds(given: object) -> Sequence[int]:
+    """Return the seeds of an argument that counts or lists them."""
+    if isinstance(given, SupportsIndex):
+        return range(operator.index(given))
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ConfigurationError(f"seeds must be a number of seeds or a list of them, got {given!r}")
+    return tuple(read_seed(each) for each in given)
+
+
+def _check_limits(**given: object) -> None:
+    """Raise a `ConfigurationError` if one of the arguments is no positive number; None is no limit."""
+    for what, value in given.items():
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ConfigurationError(f"{what} must be a number above 0, got {value!r}")
+
+
+def _check_lists(**given: object) -> None:
+    """Raise a `ConfigurationError` if one of the arguments is no list, or names nothing."""
     for what, values in given.items():
+        if isinstance(values, str) or not isinstance(values, Sequence):
+            raise ConfigurationError(f"{what} must be a list, such as [{values!r}], got {values!r}")
         if not len(values):
             raise ConfigurationError(f"{what} must name at least one, got none")
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import pandas as pd
 
 from servobench.harness.batch import results
+from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import TIMES, RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
@@ -57,6 +58,8 @@ def logged_in_folder(folder: Path, run_id: str | None, controller: str | None) -
     names = ("plant", "task", "mismatch", "seed", "noise_factor", "robot", "sensing")
     times = {name: float(row[f"{name}_s"]) for name in TIMES if pd.notna(row.get(f"{name}_s"))}
     asked = {name: row[name] for name in names if name in row} | {"seed": int(row["seed"])} | times
+    if asked.get("robot") == OWN_ROBOT:  # it comes with the plant
+        del asked["robot"]
     return resolve(RunRequest(controller=controller or row["controller"], **asked), Settings(sections)), steps
 
 

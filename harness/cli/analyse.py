@@ -22,15 +22,23 @@ TABLE = "analyse.csv"
 
 
 def analyse(
-    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER...", help="Names of controllers.")],
-    mismatch: Annotated[str, typer.Option(help="How far the true robot is from the nominal one.")] = "none",
-    seed: Annotated[int, typer.Option(help="Of the move that warms controllers up, and of the robot.")] = 0,
+    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
+    mismatch: Annotated[
+        str,
+        typer.Option(
+            help="Difference of the true robot from the nominal one: none, factory, moderate, severe, or axes."
+        ),
+    ] = "none",
+    seed: Annotated[int, typer.Option(help="Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
-        str, typer.Option(help="Where estimators are frozen: at the true, nominal or estimated Jacobian.")
+        str, typer.Option(help="Jacobian that estimators are fixed at: true, nominal or estimated.")
     ] = "true",
     identify: Annotated[
-        bool, typer.Option("--identify", help="Identify all loops from logged small motions, estimators learning on.")
+        bool,
+        typer.Option(
+            "--identify", help="Identify all loops from logged small motions, while estimators go on learning."
+        ),
     ] = False,
     simulate: Annotated[
         bool, typer.Option("--simulate", help="Also find the limits of gain and latency by simulation.")
@@ -64,7 +72,10 @@ def analyse(
         chosen = {run.request.controller: run for run in runs}
         with console.status("simulating"):
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"{out} cannot be written: {error.strerror}") from error
     table.to_csv(out / TABLE, index=False)
     text = printed(table)
     page = write_pictures(out, loops, text, LEGEND)[0]
@@ -88,12 +99,9 @@ def _source(jacobian: str) -> Source:
 def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
     """Return a run for each controller on the kinematic plant."""
     from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import check_settings, resolve
 
-    if seed < 0:
-        raise ConfigurationError(f"seed must not be negative, got {seed}")
     names = named.split_controllers(",".join(controllers), robot)
     check_settings(settings, [PLANT, TASK, *names])
     drawn = read_mismatch(mismatch)

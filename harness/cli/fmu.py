@@ -30,12 +30,21 @@ FileArgument = Annotated[Path, typer.Argument(dir_okay=False, help="The .fmu fil
 @fmu_app.command()
 def export(
     output: Annotated[Path, typer.Option("--output", "-o", dir_okay=False, help="The .fmu file to write.")],
-    fmi: Annotated[int, typer.Option(help="2 or 3; an arm has co-simulation and model exchange.")] = 2,
+    fmi: Annotated[
+        int,
+        typer.Option(
+            help="Version of FMI, 2 or 3. An arm has co-simulation and model exchange, a controller co-simulation."
+        ),
+    ] = 2,
     controller: Annotated[
         str | None,
-        typer.Option(help="Export this controller in place of the arm.", autocompletion=completion.controllers),
+        typer.Option(
+            help="Name or file of a controller to export instead of the arm.", autocompletion=completion.controllers
+        ),
     ] = None,
-    mismatch: Annotated[str, typer.Option(help="Start values: none, factory, moderate, severe, or axes.")] = "none",
+    mismatch: Annotated[
+        str, typer.Option(help="Mismatch in the start values: none, factory, moderate, severe, or axes.")
+    ] = "none",
     robot: RobotOption = "ur5",
     sensing: SensingOption = "position",
     seed: SeedOption = 0,
@@ -64,8 +73,12 @@ def export(
 @fmu_app.command()
 def ssp(
     output: Annotated[Path, typer.Option("--output", "-o", dir_okay=False, help="The .ssp file to write.")],
-    controller: Annotated[str, typer.Option(help="The controller.", autocompletion=completion.controllers)],
-    mismatch: Annotated[str, typer.Option(help="Of the arm: none, factory, moderate, severe, or axes.")] = "none",
+    controller: Annotated[
+        str, typer.Option(help="Name or file of the controller.", autocompletion=completion.controllers)
+    ],
+    mismatch: Annotated[
+        str, typer.Option(help="Mismatch of the arm: none, factory, moderate, severe, or axes.")
+    ] = "none",
     robot: RobotOption = "ur5",
     sensing: SensingOption = "position",
     seed: SeedOption = 0,

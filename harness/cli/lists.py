@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from servobench.harness.batch.trial import Tried
 
 DEFAULT_ROBOT = "ur5"
-HELP = "Show the settings of this one."
+HELP = "Name whose settings to show."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 
 

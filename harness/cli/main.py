@@ -12,7 +12,6 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.main
-from rich.markup import escape
 
 from servobench.harness.cli import completion, lists, runs, show, studies
 from servobench.harness.cli.analyse import analyse
@@ -27,6 +26,7 @@ from servobench.harness.cli.record import record
 from servobench.harness.cli.shadow import shadow
 from servobench.harness.cli.sweep import sweep
 from servobench.harness.cli.verify import verify
+from servobench.harness.cli.wording import HELP_NAMES, word
 
 INPUT_ERROR = 2  # exit code
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
@@ -51,12 +51,8 @@ PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in 
     "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
     "Tools": (runs.train, runs.collect, export, verify),
 }
-COMPLETION_HELP = {  # by the option that typer adds
-    "install_completion": "Let this shell complete names.",
-    "show_completion": "Print what that would install.",
-}
 
-app = typer.Typer(context_settings={"help_option_names": ["-h", "--help"]}, pretty_exceptions_enable=False)
+app = typer.Typer(context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False)
 for panel, commands in PANELS.items():
     for command in commands:
         app.command(rich_help_panel=panel)(grouped(command))
@@ -81,14 +77,9 @@ def servobench(
 
 
 def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public name
-    """Return the command with all subcommands; help texts are taken as they stand, `[s]` is a unit and no markup."""
-    root: Any = typer.main.get_command(app)
-    waiting = [root]
-    while waiting:
-        each = waiting.pop()
-        waiting += getattr(each, "commands", {}).values()
-        for option in each.params:
-            option.help = COMPLETION_HELP.get(option.name) or escape(option.help or "")
+    """Return the command with all subcommands."""
+    root = typer.main.get_command(app)
+    word(root)
     return root
 
 
@@ -111,11 +102,18 @@ def main() -> None:
         line = _line_of_system(error)
         if line is None or "--debug" in sys.argv:
             raise
-        sys.stderr.write(f"servobench: {line}; finished runs are kept, --resume continues\n")
+        sys.stderr.write(f"servobench: {line}{_resuming()}\n")
         code = FAILED
     if code == INTERRUPTED:  # typer's word for KeyboardInterrupt; commands that say more end by themselves
         sys.stderr.write("servobench: interrupted\n")
     sys.exit(code)
+
+
+def _resuming() -> str:
+    """Return how the command goes on after an error of the system, if it has finished runs to keep."""
+    command = command_line().commands.get("".join(sys.argv[1:2]))
+    kept = command is not None and any(option.name == "resume" for option in command.params)
+    return "; finished runs are kept, --resume continues" if kept else ""
 
 
 def _say_where_a_signal_strikes() -> None:

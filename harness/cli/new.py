@@ -21,12 +21,13 @@ NEXT: Final = {  # what to do with a new file, by what it is
 
 
 def new(
-    kind: Annotated[str, typer.Argument(help="What to begin: controller or plant.")],
+    kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
     folder: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
 ) -> None:
     """Write a commented controller or plant, and its test."""
     from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.files import reason
 
     if kind not in NEXT:
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
@@ -39,10 +40,13 @@ def new(
     for path in wanted:
         if path.exists():
             raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    for path, template in wanted.items():
-        text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(encoding="utf-8")
-        path.write_text(text.replace("{{module}}", module).replace("{{Class}}", class_name), encoding="utf-8")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, template in wanted.items():
+            text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(encoding="utf-8")
+            path.write_text(text.replace("{{module}}", module).replace("{{Class}}", class_name), encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"{error.filename} cannot be written: {reason(error)}") from error
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
     lines = [f"wrote {file} and {test}; next:", *(f"    servobench {command.format(place)}" for command in NEXT[kind])]

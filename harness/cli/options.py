@@ -18,45 +18,85 @@ if TYPE_CHECKING:
 DEFAULT_PLANT = "the first of bullet, mujoco and kinematic that is installed"
 FAILED = 1  # exit code where a run failed, or a check was not passed
 INTERRUPTED = 130  # exit code after Ctrl-C
+EXECUTION = "Execution"  # title of the options that say how runs are carried out
 
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with settings, a [section] a name.")]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="One setting, such as kinematic.lag=0.1.")
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", help="TOML file with settings; a [section] for each plant, controller or task."),
 ]
-WorkersOption = Annotated[int | None, typer.Option(min=1, help="Worker processes; default: the processors.")]
-SchedulerOption = Annotated[str | None, typer.Option(help="Address of a Dask scheduler that the runs are sent to.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", help="One setting, such as kinematic.lag=0.1; may be repeated.")
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Worker processes; default: one for each processor.", rich_help_panel=EXECUTION),
+]
+SchedulerOption = Annotated[
+    str | None, typer.Option(help="Address of a Dask scheduler to which runs are sent.", rich_help_panel=EXECUTION)
+]
 TimeoutOption = Annotated[
     float | None,
-    typer.Option(min=0.001, help="Time limit of a run [s], or inf; default: 600 for code that is not servobench's."),
+    typer.Option(
+        min=0.001,
+        help="Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
+        rich_help_panel=EXECUTION,
+    ),
 ]
 MemoryOption = Annotated[
     str | None,
     typer.Option(
-        metavar="SIZE",
         help="Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
         "servobench's.",
+        rich_help_panel=EXECUTION,
     ),
 ]
 IsolateOption = Annotated[
     bool,
     typer.Option(
-        "--isolate/--no-isolate", help="Keep plug-ins and foreign FMUs in processes of their own, with limits."
+        "--isolate/--no-isolate",
+        help="Keep plug-ins and foreign FMUs in processes of their own, with limits.",
+        rich_help_panel=EXECUTION,
     ),
 ]
-NAMES = "Comma-separated names, or 'all'."
-PLACES = "Comma-separated names or files, or 'all'."
-PlantsOption = Annotated[str, typer.Option(help=PLACES, autocompletion=completion.listed(completion.plants))]
-ControllersOption = Annotated[str, typer.Option(help=PLACES, autocompletion=completion.listed(completion.controllers))]
-TasksOption = Annotated[str, typer.Option(help=NAMES, autocompletion=completion.listed(completion.tasks))]
-TaskOption = Annotated[str, typer.Option(help="Name of the task.", autocompletion=completion.tasks)]
+PlantsOption = Annotated[
+    str,
+    typer.Option(
+        help="Comma-separated names or files, or 'all'; servobench plants lists them.",
+        autocompletion=completion.listed(completion.plants),
+    ),
+]
+ControllersOption = Annotated[
+    str,
+    typer.Option(
+        help="Comma-separated names or files, or 'all'; servobench controllers lists them.",
+        autocompletion=completion.listed(completion.controllers),
+    ),
+]
+TasksOption = Annotated[
+    str,
+    typer.Option(
+        help="Comma-separated names, or 'all'; servobench tasks lists them.",
+        autocompletion=completion.listed(completion.tasks),
+    ),
+]
+TaskOption = Annotated[
+    str, typer.Option(help="Name of the task; servobench tasks lists them.", autocompletion=completion.tasks)
+]
 MismatchOption = Annotated[
     str,
     typer.Option(
-        help="none, factory, moderate, severe, or axes: links=10%+tool=20mm.", autocompletion=completion.mismatches
+        help="How far the true robot is from the nominal one: none, factory, moderate, severe, or axes, such as "
+        "links=10%+tool=20mm.",
+        autocompletion=completion.mismatches,
     ),
 ]
 MismatchesOption = Annotated[
-    str, typer.Option(help="Comma-separated mismatches.", autocompletion=completion.listed(completion.mismatches))
+    str,
+    typer.Option(
+        metavar="NAMES",
+        help="Comma-separated: none, factory, moderate, severe, or axes, such as links=10%+tool=20mm.",
+        autocompletion=completion.listed(completion.mismatches),
+    ),
 ]
 RobotOption = Annotated[
     str,
@@ -75,14 +115,25 @@ SensingOption = Annotated[
 SensingsOption = Annotated[
     str,
     typer.Option(
-        help="Comma-separated sensing set-ups, or 'all'.", autocompletion=completion.listed(completion.sensings)
+        metavar="NAMES",
+        help="Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the hand.",
+        autocompletion=completion.listed(completion.sensings),
     ),
 ]
 SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Stop at the first crash, in this process, with its trace.")]
-StrictOption = Annotated[bool, typer.Option("--strict", help="End with exit code 1 if a run failed.")]
-ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.")]
+DebugOption = Annotated[
+    bool,
+    typer.Option(
+        "--debug", help="Run in this process, and stop at the first crash with its trace.", rich_help_panel=EXECUTION
+    ),
+]
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="End with exit code 1 if a run failed.", rich_help_panel=EXECUTION)
+]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.", rich_help_panel=EXECUTION)
+]
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class NewRun:
     robot: Annotated[str | None, _new("robot", completion.robots)] = None
     seed: Annotated[int | None, _new("seed")] = None
     set_: Annotated[
-        list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="New run: one setting.")
+        list[str] | None, typer.Option("--set", help="New run: one setting, such as bullet.latency=0.05.")
     ] = None
     config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None
 
@@ -70,17 +70,17 @@ def record(
     run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
     new: NewRun = NewRun(),
     kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
-    begin: Annotated[float, typer.Option(min=0.0, help="Where in the run the film begins [s].")] = 0.0,
+    begin: Annotated[float, typer.Option(min=0.0, help="Time in the run at which the film begins [s].")] = 0.0,
     length: Annotated[
-        float | None, typer.Option(min=0.001, help="How long the film is [s]; default: to the run's end.")
+        float | None, typer.Option(min=0.001, help="Length of the film [s]; default: to the end of the run.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the films; default recordings below the results folder.")
+        Path | None, typer.Option(help="Folder for the films; default: recordings in the results folder.")
     ] = None,
 ) -> None:
-    """Show a run as film (MP4, GIF) and snapshots.
+    """Make a film (MP4, GIF) and snapshots of a run.
 
-    They have the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
+    They show the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
     from servobench.harness.config.engines import engine_of, rendered_plant
@@ -126,7 +126,7 @@ def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
     from servobench.harness.batch.apart import choose_controllers, choose_plants
     from servobench.harness.config.engines import rendered_plant
-    from servobench.harness.config.settings import ConfigurationError, flatten, read_settings
+    from servobench.harness.config.settings import flatten, read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
@@ -137,8 +137,6 @@ def _carried_out(new: NewRun) -> LoggedRun:
     (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
     chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
     request = RunRequest(**asked | chosen)
-    if request.seed < 0:
-        raise ConfigurationError(f"seed must not be negative, got {request.seed}")
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))

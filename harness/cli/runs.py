@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 
-OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default results/<date-time>.")]
+OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default: results/<date-time>.")]
 ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
 
 
@@ -40,13 +40,13 @@ def run(
     plant: Annotated[
         str | None,
         typer.Option(
-            help=f"Name or file of the plant; default {options.DEFAULT_PLANT}.", autocompletion=completion.plants
+            help=f"Name or file of the plant; default: {options.DEFAULT_PLANT}.", autocompletion=completion.plants
         ),
     ] = None,
     controller: Annotated[
         str | None,
         typer.Option(
-            help=f"Name or file of the controller, or a law with --estimator; default {DEFAULT_CONTROLLER}.",
+            help=f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
             autocompletion=completion.controllers,
         ),
     ] = None,
@@ -157,7 +157,7 @@ def train(
 ) -> None:
     """Train the networks of a controller.
 
-    On the nominal model, unless they are kept already; prints their errors.
+    They are trained on the nominal model and kept for later runs. Prints their errors.
     """
     from rich.table import Table
 

@@ -28,7 +28,9 @@ def shadow(
     run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    out: Annotated[Path | None, typer.Option(help="CSV file for what it would have commanded at each instant.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV file for what it would have commanded at each instant.")
+    ] = None,
 ) -> None:
     """Show a controller a logged run and compare commands.
 
@@ -39,6 +41,7 @@ def shadow(
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see
+    from servobench.plant.files import reason
 
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
@@ -52,7 +55,10 @@ def shadow(
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     if out is not None:
-        seen.to_csv(out, index=False)
+        try:
+            seen.to_csv(out, index=False)
+        except OSError as error:
+            raise ConfigurationError(f"{out} cannot be written: {reason(error)}") from error
         say(f"table in {out}")
     elif not has_commands(seen):
         raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")

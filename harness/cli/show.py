@@ -16,10 +16,14 @@ SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 def statistics(
     folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
     metric: Annotated[
-        str | None, typer.Option(help="Column that pairs are compared by; default: settling time, on curves RMS error.")
+        str | None,
+        typer.Option(
+            help="Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error."
+        ),
     ] = None,
     never: Annotated[
-        float | None, typer.Option(help="Stands for the value of a run without one; default: twice the largest.")
+        float | None,
+        typer.Option(help="Value for a run that has none, such as one that never settled; default: twice the largest."),
     ] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
@@ -50,7 +54,9 @@ def statistics(
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
-    out: Annotated[Path | None, typer.Option(help="The page; default report.html in the folder.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The page; default: report.html in the folder.")
+    ] = None,
 ) -> None:
     """Write one page about a results folder.
 

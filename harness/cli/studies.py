@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from servobench.harness.studies.tuning.files import TunedValues
     from servobench.harness.studies.tuning.objective import TuningSet
 
-DEFAULT_CONTROLLERS = "arm_mfac,map_mfac,rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid"
+DEFAULT_CONTROLLERS = "arm_mfac, map_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
 EXIT_DIFFERENT = 1
 
 
@@ -33,7 +33,9 @@ def robustness(
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    axes: Annotated[str, typer.Option(help="Comma-separated axes, such as outliers,jitter; default: seven.")] = "",
+    axes: Annotated[
+        str, typer.Option(help="Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
+    ] = "",
     running: options.Running = options.RUNNING,
     overrides: options.Overrides = options.OVERRIDES,
 ) -> None:
@@ -61,10 +63,19 @@ def robustness(
 def claims(
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[int, typer.Option(help="Robots for each move; two fifths of them for the circle.")] = 500,
-    division: Annotated[str, typer.Option(help="How methods are equipped: equipped, published or both.")] = "both",
+    seeds: Annotated[
+        int, typer.Option(metavar="COUNT", help="Robots for each move; two fifths of them for the circle.")
+    ] = 500,
+    division: Annotated[
+        str, typer.Option(help="Form of the methods: equipped (all aids), published (the law as printed) or both.")
+    ] = "both",
     running: options.Running = options.RUNNING,
-    check: Annotated[Path | None, typer.Option(help="Table of answers that must come out the same.")] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Table of answers that must come out the same; the exit code is 1 if they differ."
+        ),
+    ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
 
@@ -95,15 +106,26 @@ def claims(
 
 def tune(
     controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
-    studies: Annotated[int, typer.Option(help="Studies of each method; the best on a second set is taken.")] = 3,
+    studies: Annotated[
+        int, typer.Option(help="Studies of each method; the one that is best on a second set of robots is taken.")
+    ] = 3,
     trials: Annotated[int, typer.Option(help="Trials of each study, known settings included.")] = 100,
-    search: Annotated[int, typer.Option(help="Most points of the coordinate search that ends a study.")] = 100,
-    robots: Annotated[int, typer.Option(help="Robots under each of the six conditions of a trial.")] = 4,
+    search: Annotated[
+        int, typer.Option(help="Upper limit on the points of the coordinate search that ends a study.")
+    ] = 100,
+    robots: Annotated[int, typer.Option(help="Robots under each condition of a trial.")] = 4,
     plants: options.PlantsOption = "kinematic",
     place: options.Place = options.PLACE,
-    offset: Annotated[int, typer.Option(help="First seed, counted from the begin of the tuning range.")] = 0,
+    offset: Annotated[
+        int, typer.Option(help="First seed, counted from the beginning of the range kept for tuning.")
+    ] = 0,
     study_seed: Annotated[int, typer.Option(help="Seed of the first study's sampler.")] = 0,
-    check: Annotated[bool, typer.Option("--check", help="Judge each change of one value in use instead.")] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Change each tuned value in use one by one instead, and name changes that are better."
+        ),
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),

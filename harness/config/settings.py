@@ -44,10 +44,21 @@ class Settings:
     Attributes:
         sections: section -> nested keys -> plain values as TOML gives them.
         assigned: those of `sections` that came as single assignments.
+
+    Raises:
+        ConfigurationError: something else than sections with keys.
     """
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     assigned: tuple[Assignment, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that there are sections, and keys in them."""
+        given: object = self.sections
+        if not _is_section(given) or not all(_is_section(each) for each in self.sections.values()):
+            raise ConfigurationError(
+                f"settings must be sections with keys, such as {{'kinematic': {{'lag': 0.1}}}}, got {given!r}"
+            )
 
     def check_sections(self, known: Iterable[str]) -> None:
         """Refuse sections that nothing would read.
@@ -84,6 +95,13 @@ class Settings:
             return override(section, default, self.sections.get(section, {}))
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
+
+
+def _is_section(given: object) -> bool:
+    """Return whether this is a mapping from texts, at any depth."""
+    return isinstance(given, Mapping) and all(
+        isinstance(key, str) and (not isinstance(value, Mapping) or _is_section(value)) for key, value in given.items()
+    )
 
 
 def read_settings(path: Path | None, assignments: Iterable[str]) -> Settings:

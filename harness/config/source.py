@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.files import user_path
+from servobench.plant.files import reason, user_path
 from servobench.plant.settings import suggest
 
 PACKAGE = "servobench"
@@ -51,7 +51,7 @@ class SourceFile:
             hint = suggest(path.name, beside) if beside else f"{show(path.parent)} holds no Python file"
             raise ConfigurationError(f"there is no file {given}: {hint}") from error
         except (OSError, ValueError) as error:
-            raise ConfigurationError(f"{given} cannot be read: {error}") from error
+            raise ConfigurationError(f"{given} cannot be read: {reason(error)}") from error
 
     @cached_property
     def digest(self) -> str:

@@ -14,7 +14,7 @@ BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 WIDTH = 100  # characters of a line of comment
 HEAD = """\
 # Settings of servobench, for {use} and other commands.
-# Each line has the value in use; leave away what you do not change. --set SECTION.KEY=VALUE changes one for once.
+# Each line has the value in use; leave out what you do not change. --set SECTION.KEY=VALUE changes one for one call.
 """
 
 

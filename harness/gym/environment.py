@@ -14,7 +14,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.gym.outside import OutsideView
 from servobench.harness.gym.view import Floats32, View
-from servobench.harness.run.experiment import Experiment, build
+from servobench.harness.run.experiment import Experiment, build, check_possible
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
 from servobench.plant.eyes.registry import DEFAULT_SENSING
@@ -36,9 +36,15 @@ def resolve_environment(
         ConfigurationError: a name, setting or mismatch that cannot be used.
     """
     request = RunRequest(plant, PLACEHOLDER, task, read_mismatch(mismatch), 0, robot=robot, sensing=sensing)
-    given = Settings(settings or {})
+    given = Settings({} if settings is None else settings)
     check_settings(given, [plant, task])
     return resolve(request, given)
+
+
+def check_options(options: object) -> None:
+    """Raise a `ConfigurationError` if `reset` is given options: there are none."""
+    if options not in (None, {}):
+        raise ConfigurationError(f"reset has no options, got {options!r}; make another environment for another choice")
 
 
 def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
@@ -90,8 +96,15 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self.render_mode = render_mode
         self.observation: Observation | None = None
         self.resolved: Final = resolve_environment(plant, task, mismatch, robot, sensing, settings)
-        self._experiment: Experiment | None = build(self.resolved)
-        self._view = View(self._experiment.plant.spec, self.resolved.run.preview_rows)
+        experiment = build(self.resolved)
+        try:
+            check_possible(self.resolved, experiment)
+        except ConfigurationError:
+            experiment.plant.close()
+            raise
+        self._experiment: Experiment | None = experiment
+        self._over = True
+        self._view = View(experiment.plant.spec, self.resolved.run.preview_rows)
         self.metadata = self.metadata | {"render_fps": 1.0 / self._view.spec.period}
         self._outside: OutsideView | None = None
         self.natural_size = self._view.spec.feature.scale
@@ -104,11 +117,15 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
 
         Args:
             seed: of the run, with the same robot, target and noise as `servobench run --seed`; None draws one.
-            options: none are known.
+            options: there are none.
 
         Returns:
             What the policy sees; `seed`, `robot` (the drawn values) and, of a run that failed already, `reason`.
+
+        Raises:
+            ConfigurationError: options are given.
         """
+        check_options(options)
         super().reset(seed=seed)
         run_seed = int(self.np_random.integers(SEEDS)) if seed is None else seed
         self.close()
@@ -117,6 +134,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self._desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
         self._k = self._lost = 0
         self._action = np.zeros(self._view.spec.n)
+        self._over = False
         info = {"seed": run_seed, "robot": experiment.drawn.as_record()}
         self._fault: RunFault | None = None
         try:
@@ -139,15 +157,16 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             (true, in natural sizes) and, of a run that failed, `reason`.
 
         Raises:
-            gymnasium.error.ResetNeeded: `reset` has not been called.
+            gymnasium.error.ResetNeeded: `reset` has not been called, or the episode is over.
+            ValueError: an action that is not (n,) finite numbers.
         """
         experiment, reason = self._experiment, None
-        if experiment is None or self.observation is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
+        if experiment is None or self._over:
+            raise gymnasium.error.ResetNeeded("call reset before step: no episode has begun, or it is over")
+        self._action = self._view.action(action)
         plant, loop = experiment.plant, experiment.loop
         if loop.camera_move is not None and self._k == loop.camera_move.period:
             plant.move_camera(loop.camera_move.X_BC)
-        self._action = np.asarray(action, dtype=np.float64)
         try:
             if self._fault is not None:
                 raise self._fault
@@ -162,6 +181,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         periods = 1 if reason is None else experiment.periods - self._k + 1
         info = {"time": self._k * self._view.spec.period, "error": error} | ({"reason": reason} if reason else {})
         ended = reason is None and self._k >= experiment.periods
+        self._over = ended or reason is not None
         return self._see(), -error * periods * self._view.spec.period, reason is not None, ended, info
 
     def _see(self) -> Floats32:

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.gym.environment import SEEDS, ServoEnv, with_seed
+from servobench.harness.gym.environment import SEEDS, ServoEnv, check_options, with_seed
 from servobench.harness.gym.view import Floats32, View
 from servobench.harness.run.together import Together, build_together, side_by_side_key
 from servobench.plant.checks import FloatArray
@@ -45,9 +45,13 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             choice: what the runs have in common, by the arguments of `ServoEnv`.
 
         Raises:
-            ConfigurationError: a name, setting or mismatch that cannot be used, or a plant that carries out one run
-                at a time.
+            ConfigurationError: a number, name, setting or mismatch that cannot be used, or a plant that carries out
+                one run at a time.
         """
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ConfigurationError(f"num_envs must be a whole number from 1 on, got {num_envs!r}")
+        if choice.get("render_mode") is not None:
+            raise ConfigurationError("runs side by side are not rendered; leave render_mode out, or use gymnasium.make")
         single = ServoEnv(**choice)
         single.close()
         self._resolved = single.resolved
@@ -69,13 +73,19 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
 
         Args:
             seed: of the first lane, from which the others count on; None draws one for each.
-            options: none are known.
+            options: there are none.
 
         Returns:
             What the policies see, (num_envs, k), and `seed`, (num_envs,).
+
+        Raises:
+            ConfigurationError: options are given, or a seed above 2⁶³ − num_envs.
         """
+        check_options(options)
         super().reset(seed=seed)
         count = self.num_envs
+        if seed is not None and seed > 2**63 - count:
+            raise ConfigurationError(f"seed must be at most 2**63 - {count}, got {seed}")
         seeds = self.np_random.integers(SEEDS, size=count) if seed is None else seed + np.arange(count)
         self.close_extras()
         self._many = many = build_together([with_seed(self._resolved, each) for each in seeds.tolist()])
@@ -97,6 +107,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
 
         Raises:
             gymnasium.error.ResetNeeded: `reset` has not been called.
+            ValueError: actions that are not (num_envs, n) finite numbers.
         """
         many = self._many
         if many is None:
@@ -105,10 +116,10 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             none = np.zeros(self.num_envs, dtype=np.bool_)
             seen, info = self.reset()
             return seen, np.zeros(self.num_envs), none, none.copy(), info
+        self._action = self._view.action(actions, self.num_envs)
         move = many.loop.camera_move
         if move is not None and self._k == move.period:
             many.bench.move_camera(move.X_BC)
-        self._action = np.asarray(actions, dtype=np.float64)
         self.observation = many.bench.step(Command(self._view.command(self._action)))
         self._lost = np.where(self.observation.feature_valid, 0, self._lost + 1)
         self._k += 1

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.checks import FloatArray, as_array
 from servobench.plant.lanes import norm
 from servobench.plant.signals import Observation, PlantSpec, Truth
 
@@ -46,6 +46,20 @@ class View:
     def command(self, action: npt.ArrayLike) -> FloatArray:
         """Return joint velocities, (..., n) rad/s, for an action, (..., n) shares of the limits; clipped to them."""
         return np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) * self.spec.joint_velocity_limit
+
+    def action(self, given: npt.ArrayLike, *lanes: int) -> FloatArray:
+        """Return an action as an array, (*lanes, n).
+
+        Raises:
+            ValueError: no numbers, another shape, or an entry that is not finite.
+        """
+        try:
+            numbers = np.asarray(given)
+        except ValueError:  # rows of unequal lengths
+            numbers = np.asarray(None)
+        if numbers.dtype.kind not in "fiu":
+            raise ValueError(f"action must be an array of numbers, got {given!r}")
+        return as_array("action", numbers, (*lanes, self.spec.n))
 
     def see(self, observation: Observation, reference: FloatArray, action: npt.ArrayLike) -> Floats32:
         """Return the policy's observation.

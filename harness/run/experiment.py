@@ -145,6 +145,15 @@ def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
         if ends_batch(error):
             raise
         return  # of a plug-in; its run will fail in the same way
+    check_possible(run, experiment)
+
+
+def check_possible(run: ResolvedRun, experiment: Experiment) -> None:
+    """Refuse a start or a target that no true robot of the run's mismatch can reach.
+
+    Raises:
+        ConfigurationError: names it, and how far it is out of reach.
+    """
     if experiment.drawn.true is not None:
         check_joints(run, experiment.scenario, experiment.plant.spec)
         check_reach(run, experiment.scenario, find_robot(run.request.robot), experiment.plant.spec)

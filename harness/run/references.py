@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from servobench.harness.run.log import column_unit
 from servobench.plant.checks import FloatArray, check_number
+from servobench.plant.files import reason
 from servobench.plant.signals import Channel
 
 TaskKind: TypeAlias = Literal["point_to_point", "curve"]
@@ -119,7 +120,7 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"waypoint file {path} cannot be read: {error}") from error
+        raise ValueError(f"waypoint file {path} cannot be read: {reason(error)}") from error
     if not rows or any(name not in rows[0] for name in wanted):
         raise ValueError(f"waypoint file {path} must have a header and rows with the columns {', '.join(wanted)}")
     values = np.empty((len(rows), len(wanted)))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+import operator
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, SupportsIndex
 
 from servobench.harness.config.engines import engine_of
 from servobench.harness.config.registry import FORMER_NAMES
@@ -18,6 +19,7 @@ from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.settings import NonNegative, Positive, ShareBelowOne, settings
 
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
+NAMES = ("plant", "controller", "task", "robot", "sensing")  # fields of a request that are texts
 TIMES = ("latency", "period")  # fields of a request, which are columns with the suffix _s
 
 
@@ -64,7 +66,7 @@ class RunRequest:
     """One cell of a comparison.
 
     Raises:
-        ConfigurationError: a text that is no mismatch.
+        ConfigurationError: a text that is no mismatch, a name that is no text, or a bad seed.
     """
 
     plant: str
@@ -80,6 +82,10 @@ class RunRequest:
 
     def __post_init__(self) -> None:
         """Read a mismatch that came as text, and a former name of a controller."""
+        for name in NAMES:
+            if not isinstance(getattr(self, name), str):
+                raise ConfigurationError(f"{name} must be a name, got {getattr(self, name)!r}")
+        object.__setattr__(self, "seed", read_seed(self.seed))
         object.__setattr__(self, "controller", FORMER_NAMES.get(self.controller, self.controller))
         given: object = self.mismatch
         if isinstance(given, str):
@@ -110,7 +116,20 @@ def read_mismatch(text: str) -> Mismatch:
     Raises:
         ConfigurationError: it cannot be read.
     """
+    if not isinstance(text, str):
+        raise ConfigurationError(f"mismatch must be a text such as 'moderate' or 'links=10%', got {text!r}")
     try:
         return Mismatch.parse(text)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
+
+
+def read_seed(seed: object) -> int:
+    """Return a seed, a whole number from 0 on, as a Python integer, which numpy's integers become.
+
+    Raises:
+        ConfigurationError: it is no such number.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, SupportsIndex) or operator.index(seed) < 0:
+        raise ConfigurationError(f"seed must be a non-negative integer, got {seed!r}")
+    return operator.index(seed)

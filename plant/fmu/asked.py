@@ -1,4 +1,4 @@
-"""What a user asks of an FMU beside the values of its variables."""
+"""What a user asks of an FMU in addition to the values of its variables."""
 
 from __future__ import annotations
 

@@ -26,9 +26,9 @@ class RenderedConfig:
     """Settings of a rendered plant; those of masses, loads and drives are a UR5's, and change with the robot."""
 
     max_joint_speed: Positive = 1.0
-    """[rad/s] limit of every joint, beside its maker's; a cautious share of a UR5's π."""
+    """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""
     joint_range: Positive = 2 * math.pi
-    """[rad] largest joint position each way, beside its maker's limits; a UR5's range."""
+    """[rad] largest joint position each way, in addition to its maker's limits; a UR5's range."""
     lag: NonNegative = 0.05
     """[s] τ, by which the drives smooth the commanded velocity; 0 means none."""
     drives: DriveConfig = nested(DriveConfig)

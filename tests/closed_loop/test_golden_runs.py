@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ def deviations(found, stored):
     return commands / stored["spread"].to_numpy(), late / golden.PERIOD
 
 
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the table is of a kernel of OpenBLAS for x86-64")
 @pytest.mark.parametrize("plant", plant_parameters(golden.DURATIONS))
 def test_the_first_periods_and_the_settling_time_of_every_method_are_those_of_the_table(plant, tmp_path):
     if plant == "mujoco" and golden.RENDERER not in engine_of(plant):

@@ -38,7 +38,7 @@ def test_every_loop_can_be_identified(monkeypatch, capsys, tmp_path):
     [
         (("pdi+true",), "law must be one of"),
         (("pid+true", "--jacobian", "exact"), "--jacobian must be one of true, nominal, estimated, got 'exact'"),
-        (("pid+true", "--seed", "-1"), "seed must not be negative, got -1"),
+        (("pid+true", "--seed", "-1"), "seed must be a non-negative integer, got -1"),
         (("pid+true", "--set", "pid.law.gain=1"), "unknown section 'pid'"),
     ],
 )

@@ -43,7 +43,7 @@ LEFT_OUT = {  # words of a block -> why it is not carried out
 }
 NIGHTLY = "SERVOBENCH_NIGHTLY"  # the environment variable that `make nightly` sets
 LONG = {  # words of a block that only `make nightly` carries out -> processor time [s]
-    "servobench record --robot panda": 250,
+    "servobench record --robot panda": 90,
     "for arm in": 85,
     "nominal_rate,nominal_broyden": 25,
 }

@@ -239,7 +239,7 @@ def test_a_new_run_is_recorded_below_the_results_without_ffmpeg(monkeypatch, cap
         (("FOLDER", "--kinds", "mp4,avi"), "--kinds: unknown 'avi'"),
         (("FOLDER", "--kinds", ","), "--kinds is empty; valid: mp4"),
         (("NONE",), "is not a results folder"),
-        (("--seed", "-1"), "seed must not be negative, got -1"),
+        (("--seed", "-1"), "seed must be a non-negative integer, got -1"),
         (("--task", "exp9"), "unknown task 'exp9'"),
         (("--set", "circel.laps=1"), "unknown section 'circel'"),
     ],

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 
+import numpy as np
+import pandas as pd
 import pytest
 
 import servobench
-from kit.command import PACKAGE
+from kit.command import PACKAGE, judged
 from kit.resting import Resting
 from servobench.harness.config.builds import NoSettings
+from servobench.harness.config.settings import ConfigurationError
 
 SHORT = {"exp1": {"duration": 0.5}}
 
@@ -58,6 +62,57 @@ def test_what_is_no_controller_and_a_name_that_is_taken_are_refused():
         servobench.compare([taken])
     with pytest.raises(ValueError, match="seeds must name at least one"):
         servobench.compare([Resting], seeds=())
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"task": None}, "task must be a name, got None"),
+        ({"task": ["exp2"]}, "task must be a name, got ['exp2']"),
+        ({"mismatch": 0.1}, "mismatch must be a text such as 'moderate'"),
+        ({"robot": 3}, "robot must be a name, got 3"),
+        ({"sensing": None}, "sensing must be a name, got None"),
+        ({"seed": 1.5}, "seed must be a non-negative integer, got 1.5"),
+        ({"seed": "x"}, "seed must be a non-negative integer, got 'x'"),
+        ({"seed": True}, "seed must be a non-negative integer, got True"),
+        ({"settings": [1]}, "settings must be sections with keys, such as {'kinematic': {'lag': 0.1}}, got [1]"),
+        ({"settings": {"kinematic": 3}}, "settings must be sections with keys"),
+        ({"settings": {"kinematic": {3: 1}}}, "settings must be sections with keys"),
+    ],
+    ids=str,
+)
+def test_an_argument_of_the_wrong_type_is_refused_in_a_line(given, words):
+    with pytest.raises(ConfigurationError, match=re.escape(words)):
+        servobench.run("constant", **given)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"controllers": "constant"}, "controllers must be a list, such as ['constant'], got 'constant'"),
+        ({"tasks": None}, "tasks must be a list"),
+        ({"plants": "kinematic"}, "plants must be a list"),
+        ({"seeds": "3"}, "seeds must be a number of seeds or a list of them, got '3'"),
+        ({"seeds": 1.5}, "seeds must be a number of seeds or a list of them, got 1.5"),
+        ({"seeds": ["a"]}, "seed must be a non-negative integer, got 'a'"),
+        ({"workers": 0}, "workers must be a number above 0, got 0"),
+        ({"run_timeout": -1}, "run_timeout must be a number above 0, got -1"),
+        ({"run_memory": "2GB"}, "run_memory must be a number above 0, got '2GB'"),
+        ({"resume": True}, "resume needs out, the folder to continue in"),
+    ],
+    ids=str,
+)
+def test_a_comparison_with_an_argument_of_the_wrong_type_is_refused_in_a_line(given, words):
+    with pytest.raises(ConfigurationError, match=re.escape(words)):
+        servobench.compare(**({"controllers": ["constant"]} | given))
+
+
+def test_a_seed_of_numpy_is_that_seed():
+    (seed,) = np.arange(3, 4)
+    of_numpy, own = (
+        servobench.run("constant", task="exp2", seed=each, settings={"exp2": {"duration": 0.5}}) for each in (seed, 3)
+    )
+    pd.testing.assert_frame_equal(judged(pd.DataFrame([of_numpy.row])), judged(pd.DataFrame([own.row])))
 
 
 def test_every_public_name_has_a_docstring_and_no_other_name_is_there():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
@@ -143,12 +144,99 @@ def test_nothing_is_rendered_unless_it_is_asked_for():
         ServoEnv(render_mode="human")
 
 
-def test_bad_environments_are_refused():
-    with pytest.raises(ConfigurationError, match="unknown plant"):
-        ServoEnv(plant="no such plant")
-    env = ServoEnv()
+@pytest.mark.parametrize("kind", [ServoEnv, ServoVectorEnv])
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ({"plant": "kinematik"}, "unknown plant 'kinematik': did you mean 'kinematic'?"),
+        ({"plant": 3}, "plant must be a name, got 3"),
+        ({"plant": "fmu:none.toml"}, "mapping none.toml cannot be read"),
+        ({"task": None}, "task must be a name, got None"),
+        ({"task": ["exp1"]}, "task must be a name, got ['exp1']"),
+        ({"task": "retreat"}, "task retreat: it needs a target with a pose"),
+        ({"task": "waypoints"}, "task waypoints: a CSV file is needed"),
+        ({"mismatch": 0.1}, "mismatch must be a text such as 'moderate' or 'links=10%', got 0.1"),
+        ({"robot": "ur55"}, "unknown robot 'ur55': did you mean 'ur5'?"),
+        ({"sensing": None}, "sensing must be a name, got None"),
+        ({"settings": ["kinematic.lag=0.1"]}, "settings must be sections with keys, such as"),
+        ({"settings": {"kinematic.lag": 0.1}}, "settings must be sections with keys"),
+        ({"settings": {"kinematic": {"lag": -1}}}, "kinematic.lag must be at least 0, got -1"),
+        ({"task": "target", "settings": {"target": {"target": [9, 9, 9]}}}, "m out of the arm's reach"),
+        ({"task": "circle", "settings": {"circle": {"radius": 30}}}, "a point of its curve,"),
+        ({"render_mode": "human"}, "render"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_choice_that_cannot_be_used_is_refused_in_a_line(kind, choice, words):
+    with pytest.raises(ConfigurationError, match=re.escape(words)) as refused:
+        kind(**choice)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, "2", True])
+def test_lanes_are_counted_and_never_rendered(count):
+    with pytest.raises(ConfigurationError, match="num_envs must be a whole number from 1 on, got"):
+        ServoVectorEnv(count)
+    with pytest.raises(ConfigurationError, match="runs side by side are not rendered"):
+        ServoVectorEnv(2, render_mode="rgb_array")
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (0.0, "action must have shape {shape}, got ()"),
+        (np.zeros((3, 2)), "action must have shape {shape}, got (3, 2)"),
+        (np.full(6, np.nan), "action must be finite, got"),
+        (np.full(6, np.inf), "action must be finite, got"),
+        (np.zeros(6, dtype=complex), "action must be an array of numbers, got"),
+        ([[0, 0], [0]], "action must be an array of numbers, got [[0, 0], [0]]"),
+        ("go", "action must be an array of numbers, got 'go'"),
+        (None, "action must be an array of numbers, got None"),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("lanes", [(), (2,)])
+def test_an_action_that_is_none_is_refused_and_changes_nothing(lanes, action, words):
+    env = ServoVectorEnv(*lanes, task="exp2") if lanes else ServoEnv(task="exp2")
+    if lanes and isinstance(action, np.ndarray) and action.shape == (6,):
+        action = np.stack([action] * 2)
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=re.escape(words.format(shape=(*lanes, 6)))):
+        env.step(action)
+    first = env.step(np.full((*lanes, 6), 0.1))[0]
+    env.reset(seed=1)
+    np.testing.assert_array_equal(env.step(np.full((*lanes, 6), 0.1))[0], first)
+    env.close()
+
+
+@pytest.mark.parametrize("make", [lambda: ServoEnv(task="exp2"), lambda: ServoVectorEnv(2, task="exp2")])
+def test_options_and_seeds_that_cannot_be_used_are_refused(make):
+    env = make()
+    env.reset(seed=1, options={})
+    with pytest.raises(ConfigurationError, match="reset has no options, got {'target': 3}"):
+        env.reset(seed=1, options={"target": 3})
+    for seed in (-1, 1.5, "x"):
+        with pytest.raises(gymnasium.error.Error, match="Seed must be"):
+            env.reset(seed=seed)
+    if isinstance(env, ServoVectorEnv):
+        with pytest.raises(ConfigurationError, match=re.escape("seed must be at most 2**63 - 2, got")):
+            env.reset(seed=2**64)
+    env.close()
     with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros((2, 6)))
+
+
+def test_an_episode_begins_with_reset_and_takes_no_step_after_its_end():
+    env = ServoEnv(task="exp2", settings={"exp2": {"duration": 0.1}})
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
         env.step(np.zeros(6))
+    env.reset(seed=1)
+    env.step(np.zeros(6))
+    assert env.step(np.zeros(6))[3]
+    with pytest.raises(gymnasium.error.ResetNeeded, match="or it is over"):
+        env.step(np.zeros(6))
+    env.reset(seed=1)
+    assert not env.step(np.zeros(6))[3]
     env.close()
 
 

@@ -57,8 +57,15 @@ def test_every_command_explains_itself(monkeypatch, capsys, name, option):
     assert "\\" not in text
 
 
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_values_are_named_by_what_they_are_and_nothing_is_cut(monkeypatch, capsys, name):
+    text = shown(monkeypatch, capsys, *name.split(), "-h")
+    assert not re.search(r"<(?!date-time)|…", text)
+    assert re.search(r"^│ (   )?--help +-h +Show this message and exit\.", text, re.MULTILINE)
+
+
 def test_no_word_in_brackets_is_taken_for_markup(monkeypatch, capsys):
-    assert "a [section] a name" in wide(monkeypatch, capsys, "run", "--help")
+    assert "a [section] for each" in wide(monkeypatch, capsys, "run", "--help")
     written = typer.main.get_command(app).commands
     for name in PANELS["First steps"] + PANELS["Studies"]:
         text = wide(monkeypatch, capsys, name.__name__, "--help")
@@ -80,7 +87,7 @@ def test_version_and_commit_are_told(monkeypatch, capsys):
         (("run", "--sed", "3"), "no such option: --sed (Possible options: --seed, --set); see servobench run --help"),
         (("run", "--seed", "x"), "invalid value for '--seed': "),
         (("sweep",), "missing option '--out'; see servobench sweep --help"),
-        (("fmu", "info"), "missing argument 'file'; see servobench fmu info --help"),
+        (("fmu", "info"), "missing argument 'FILE'; see servobench fmu info --help"),
     ],
 )
 def test_a_call_that_cannot_be_understood_is_one_line(monkeypatch, capsys, arguments, line):

@@ -44,7 +44,9 @@ def test_one_controller_is_told_with_intervals():
 
 def test_with_few_seeds_the_order_is_a_hint():
     verdict = judge(runs_of(5, a=1.0, b=2.0))
-    assert verdict.result.startswith("Both controllers settled in every run, and none of them is shown to be faster")
+    assert verdict.result.startswith(
+        "Both controllers settled in every run, and neither is shown to be faster or more precise than the other."
+    )
     assert verdict.cautions[0].startswith("5 seeds are too few to tell the two controllers apart")
     assert "at least 6)" in verdict.cautions[0]
 

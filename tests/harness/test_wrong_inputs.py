@@ -177,11 +177,11 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("record", "results", "--seed", "3"), "--seed belongs to a new run"),
     (("record", "--run", "some"), "--run names a run of a results folder, and no folder is given"),
     (("record", "--plant", "kinematic", "--set", "bullet.lag=1"), "'bullet' does not run here"),
-    (("record", "--plant", "kinematic", "--seed", "-1"), "seed must not be negative, got -1"),
+    (("record", "--plant", "kinematic", "--seed", "-1"), "seed must be a non-negative integer, got -1"),
     # studies and tools
     (("analyse", "mfac"), "it is a law and makes a pair"),
     (("analyse", "pid+true", "--jacobian", "tru"), "--jacobian must be one of true, nominal, estimated, got 'tru'"),
-    (("analyse", "pid+true", "--seed", "-1"), "seed must not be negative, got -1"),
+    (("analyse", "pid+true", "--seed", "-1"), "seed must be a non-negative integer, got -1"),
     (("analyse", "pid+true", "--set", "bullet.lag=1"), "'bullet' does not run here"),
     (("robustness", "--out", "new", "--plant", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
     (("robustness", "--out", "new", "--plant", "kinematic", "--set", "exp2.duration=3"), "'exp2' does not run here"),
@@ -200,7 +200,7 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     (("fmu", "export", "-o", "new.fmu", "--platforms", "x86_64-linx"), "x86_64-linx"),
     (("comapre",), "comapre"),
     # a log beside a controller, and exports
-    (("shadow",), "missing argument 'log'"),
+    (("shadow",), "missing argument 'LOG'"),
     (("shadow", "none"), "none does not exist; wanted a results folder or a table"),
     (("shadow", "full"), "full is not a results folder"),
     (("shadow", "file", "--controller", "constant"), "file must be a results folder, or a table in .csv or .parquet"),

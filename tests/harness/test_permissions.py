@@ -1,0 +1,100 @@
+"""Files and folders that may not be read or written: each is one right line, and nothing is left half written."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from kit.command import PACKAGE
+from kit.folders import comparison
+from kit.robots import calibration_text
+from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
+
+RUN = "run --plant kinematic --controller constant --set exp2.duration=0.5 --out new"
+LOCKED, HIDDEN = 0o500, 0  # modes of a folder that takes no file, and of what cannot be read
+CASES = {  # call -> (what may not be used, its mode, words of the line)
+    f"{RUN[:-3]}locked/new": ("locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
+    "sweep --controllers constant --tasks exp2 --seeds 1 --out locked/new": (
+        "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
+    "init locked/bench.toml": ("locked", LOCKED, "locked/bench.toml cannot be written: Permission denied"),
+    "new controller law --folder locked": ("locked", LOCKED, "locked/law.py cannot be written: Permission denied"),
+    "export results --out locked/csv": ("locked", LOCKED, "locked/csv cannot be written: Permission denied"),
+    "report results --out locked/page.html": (
+        "locked", LOCKED, "report locked/page.html cannot be written: Permission denied"),
+    "shadow steps.csv --controller constant --out locked/seen.csv": (
+        "locked", LOCKED, "locked/seen.csv cannot be written: Permission denied"),
+    "analyse pid+true --out locked/loops": ("locked", LOCKED, "locked/loops cannot be written: Permission denied"),
+    "fmu export -o locked/arm.fmu": ("locked", LOCKED, "locked/arm.fmu cannot be written: Permission denied"),
+    f"{RUN} --config bench.toml": ("bench.toml", HIDDEN, "path 'bench.toml' is not readable"),
+    f"{RUN} --controller ./law.py --no-isolate": ("law.py", HIDDEN, "./law.py cannot be read: Permission denied"),
+    "run --plant fmu:arm.toml --mismatch none --task target --out new": (
+        "arm.toml", HIDDEN, "mapping arm.toml cannot be read: Permission denied"),
+    "fmu info arm.fmu": ("arm.fmu", HIDDEN, "file 'arm.fmu' is not readable"),
+    f"{RUN} --robot arm.yaml": ("arm.yaml", HIDDEN, "calibration file arm.yaml cannot be read: Permission denied"),
+    "run --plant kinematic --controller constant --task waypoints --set waypoints.file=way.csv --out new": (
+        "way.csv", HIDDEN, "waypoint file way.csv cannot be read: Permission denied"),
+    "statistics results": ("results/runs.parquet", HIDDEN, "results/runs.parquet cannot be read: Permission denied"),
+    "export results --out new": (
+        "results/steps.parquet", HIDDEN, "results/steps.parquet cannot be read: Permission denied"),
+    "report results": ("results", HIDDEN, "path 'results' is not readable"),
+    "collect results": ("results", LOCKED, "results folder results cannot be written: Permission denied"),
+}  # fmt: skip
+SCRIPT = """
+import contextlib, io, json, os, sys
+from servobench.harness.cli.main import main
+told = {}
+for call, (path, mode, _) in json.load(sys.stdin).items():
+    before, usual = sorted(os.walk(".")), os.stat(path).st_mode
+    sys.argv, error = ["servobench", *call.split()], io.StringIO()
+    os.chmod(path, mode)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
+            main()
+    except SystemExit as stop:
+        code = stop.code
+    os.chmod(path, usual)
+    told[call] = code, error.getvalue(), sorted(os.walk(".")) == before
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory):
+    """What each call says, carried out by a user who may not read and write everywhere."""
+    folder = tmp_path_factory.mktemp("permissions")
+    comparison(folder / "results")
+    (folder / "locked").mkdir()
+    for name in ("bench.toml", "law.py", "arm.toml", "arm.fmu", "way.csv"):
+        (folder / name).write_text("")
+    (folder / "arm.yaml").write_text(calibration_text(UNIVERSAL_ROBOTS["UR10e"], seed=1))
+    joints = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+    columns = [f"{what}_{axis}_m" for what in ("feature", "reference") for axis in "xyz"]
+    columns += [f"joint_position_{name}_rad" for name in joints]
+    (folder / "steps.csv").write_text(
+        ",".join(["time_s", *columns]) + "\n0" + ",0.1" * len(columns) + "\n0.05" + ",0.1" * len(columns) + "\n"
+    )
+    without = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"] if os.geteuid() == 0 else []
+    made = subprocess.run(
+        [*without, sys.executable, "-c", SCRIPT], cwd=folder, input=json.dumps(CASES), capture_output=True, text=True,
+        env=os.environ | {"PYTHONPATH": str(PACKAGE)}, check=True,
+    )  # fmt: skip
+    return json.loads(made.stdout)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes of files are those of POSIX")
+@pytest.mark.skipif(
+    os.name == "posix" and os.geteuid() == 0 and shutil.which("setpriv") is None, reason="root may write everywhere"
+)
+@pytest.mark.parametrize("call", CASES)
+def test_what_may_not_be_read_or_written_is_one_right_line(told, call):
+    code, error, unchanged = told[call]
+    assert code == 2, error
+    assert error.startswith("servobench: ")
+    assert error.count("\n") == 1
+    assert CASES[call][2] in error
+    assert unchanged
