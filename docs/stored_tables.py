@@ -23,7 +23,8 @@ import pandas as pd
 FOLDER: Final = Path(__file__).parent / "tables"
 NUMBER: Final = re.compile(r"(?<![\w.])[-−]?\d+(?:\.(\d+))?(?:e([-+]\d+))?(?![\w.])")
 RELATIVE: Final = 0.1  # share by which a number may differ from the stored one
-LAST_DIGITS: Final = 5.1  # units of the last digit by which it may differ: a period of 0.05 s, five robots
+LAST_DIGITS: Final = 5.1  # units of the last digit by which it may differ: a period of 0.05 s
+ONE: Final = 1.0  # by which a whole number may: a robot
 
 
 class Stored(NamedTuple):
@@ -69,7 +70,9 @@ def alike(found: str, wanted: str) -> bool:
         return False
     for ours, theirs in zip(NUMBER.finditer(found), NUMBER.finditer(wanted), strict=True):
         a, b = (float(match[0].replace("−", "-")) for match in (ours, theirs))
-        last_digit = 10.0 ** (int(theirs[2] or 0) - len(theirs[1] or ""))
-        if abs(a - b) > max(RELATIVE * abs(b), LAST_DIGITS * last_digit):
+        least = ONE
+        if theirs[1] or theirs[2]:
+            least = LAST_DIGITS * 10.0 ** (int(theirs[2] or 0) - len(theirs[1] or ""))
+        if abs(a - b) > max(RELATIVE * abs(b), least):
             return False
     return True

@@ -1,6 +1,6 @@
 """How what is seen relates to what a model says: a linear map and a delay, both estimated online.
 
-For each candidate delay d = 0 … D−1 a filter of its own holds a map M, (m, m), and the noise e, (m,), of the last
+For each of D candidate delays d a filter of its own holds a map M, (m, m), and the noise e, (m,), of the last
 frame, with a covariance P, (m+1, m+1), that the rows of [M e] share. x_d is the feature step that the model predicts
 for the joint motion d periods ago. A step Δy holds the noise of both its frames, of the new one e₊ ~ N(0, σ² I):
 

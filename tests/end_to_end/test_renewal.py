@@ -114,6 +114,8 @@ def test_a_check_names_each_figure_that_does_not_come_out_again(toy, capfd):
         ("0.75", "0.86", False),
         ("38 of 40", "36 of 40", True),
         ("38 of 40", "30 of 40", False),
+        ("3 4", "4 4", True),
+        ("2 4", "4 4", False),
         ("1.2e-04", "1.5e-04", True),
         ("1.2e-04", "2.2e-04", False),
         ("−0.45", "−0.50", True),
