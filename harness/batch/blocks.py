@@ -265,7 +265,7 @@ def _carry_out(block: Block, tell: Tell, steps: bool, keep: Path | None, debug: 
             # Where a run cannot even be built, each is carried out by itself, and the row of that run says why.
             with contextlib.suppress(Exception, SystemExit):
                 together = episode.carry_out_together([job.run for job in block.jobs], keep=keep)
-        for job, result in zip(block.jobs, together, strict=bool(together)):
+        for job, result in zip(block.jobs, together, strict=False):
             tell(_with_columns(job.cell, result))
         for job in block.jobs[len(together) :]:
             tell(_carry_out_run(job, steps, keep, debug))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -58,27 +59,19 @@ IsolateOption = Annotated[
         rich_help_panel=EXECUTION,
     ),
 ]
-PlantsOption = Annotated[
-    str,
-    typer.Option(
-        help="Comma-separated names or files, or 'all'; servobench plants lists them.",
-        autocompletion=completion.listed(completion.plants),
-    ),
-]
-ControllersOption = Annotated[
-    str,
-    typer.Option(
-        help="Comma-separated names or files, or 'all'; servobench controllers lists them.",
-        autocompletion=completion.listed(completion.controllers),
-    ),
-]
-TasksOption = Annotated[
-    str,
-    typer.Option(
-        help="Comma-separated names, or 'all'; servobench tasks lists them.",
-        autocompletion=completion.listed(completion.tasks),
-    ),
-]
+
+
+def _listed(what: str, complete: Callable[[str], list[str]], kinds: str = "names or files") -> Any:  # noqa: ANN401
+    """Return the option for several of what a command lists."""
+    return typer.Option(
+        help=f"Comma-separated {kinds}, or 'all'; servobench {what} lists them.",
+        autocompletion=completion.listed(complete),
+    )
+
+
+PlantsOption = Annotated[str, _listed("plants", completion.plants)]
+ControllersOption = Annotated[str, _listed("controllers", completion.controllers)]
+TasksOption = Annotated[str, _listed("tasks", completion.tasks, "names")]
 TaskOption = Annotated[
     str, typer.Option(help="Name of the task; servobench tasks lists them.", autocompletion=completion.tasks)
 ]
