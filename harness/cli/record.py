@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,13 +90,26 @@ def record(
     from servobench.harness.pictures.replay import stretch
 
     wanted = split_names("kinds", kinds, KINDS, find_kind)
+    into = out or (folder or Path("results")) / RECORDINGS
+    _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
         shown = _shown(folder, run, new)
         say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
-        stem = (out or (folder or Path("results")) / RECORDINGS) / str(shown.track.row["run_id"])
+        stem = into / str(shown.track.row["run_id"])
         paths = write_recording(stretch(shown, begin, length), stem, wanted, tell)
     for path in paths:
         say(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse a folder that takes no film before a run is carried out and drawn."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    if not standing.is_dir():
+        raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
+    if not os.access(standing, os.W_OK | os.X_OK):
+        raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
 
 
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:

@@ -26,6 +26,13 @@ CASES = {  # call -> (what may not be used, its mode, words of the line)
     "export results --out locked/csv": ("locked", LOCKED, "locked/csv cannot be written: Permission denied"),
     "report results --out locked/page.html": (
         "locked", LOCKED, "report locked/page.html cannot be written: Permission denied"),
+    "record results --out locked/films": ("locked", LOCKED, "locked/films cannot be written: Permission denied"),
+    "record --plant kinematic --out locked/films": (
+        "locked", LOCKED, "locked/films cannot be written: Permission denied"),
+    "claims --seeds 6 --plants kinematic --out locked/new": (
+        "locked", LOCKED, "results folder locked/new/best_equipped/main cannot be written: Permission denied"),
+    "tune --trials 2 --controllers ukf_mfac --out locked/new": (
+        "locked", LOCKED, "results folder locked/new cannot be written: Permission denied"),
     "shadow steps.csv --controller constant --out locked/seen.csv": (
         "locked", LOCKED, "locked/seen.csv cannot be written: Permission denied"),
     "analyse pid+true --out locked/loops": ("locked", LOCKED, "locked/loops cannot be written: Permission denied"),
