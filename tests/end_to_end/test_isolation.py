@@ -52,13 +52,13 @@ def places(*names: str) -> str:
     return ",".join(f"{HOSTILE}:{name}" for name in names)
 
 
-def left_behind(mark: str) -> list[psutil.Process]:
-    """Return the processes that have the mark of a command in their environment."""
+def left_behind(mark: str) -> list[str]:
+    """Return the command lines of the processes that have the mark of a command in their environment."""
     found = []
     for process in psutil.process_iter():
         try:
             if process.environ().get(MARK) == mark and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(process)
+                found.append(" ".join(process.cmdline()))
         except psutil.Error:
             continue
     return found
@@ -142,7 +142,7 @@ def test_nothing_outlives_a_command_that_is_killed(tmp_path):
     out, mark = tmp_path / "out", "orphans"
     hanging = ("--controllers", places("HangsWithChildren", "Hangs"), "--workers", "2", *SHORT, "--out", str(out))
     process = start("sweep", *hanging, **{MARK: mark})
-    wait_for(lambda: any("time.sleep(300)" in " ".join(each.cmdline()) for each in left_behind(mark)))
+    wait_for(lambda: any("time.sleep(300)" in line for line in left_behind(mark)))
     os.kill(process.pid, signal.SIGKILL)
     finish(process)
     assert_nothing_stays(mark)

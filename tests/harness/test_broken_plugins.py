@@ -76,8 +76,7 @@ class Signature(Mine):
 
 class Hang(Mine):
     def __init__(self, knowledge):
-        while True:
-            pass
+        while True: pass
 
 
 class Ends(Mine):
@@ -147,7 +146,7 @@ WAITS = "no answer after 4 s; is there a loop without an end, or something that 
 HARMFUL = {  # what only a process of its own survives
     "hang": f"controller 'hang' (some_law:Hang) cannot be used: site/some_law.py:62: {WAITS}",
     "ends": f"controller 'ends' (some_law:Ends) cannot be used: it ended the process with exit code 3; {REMEDY}",
-    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:73: it killed the process by "
+    "falls": "controller 'falls' (some_law:Falls) cannot be used: site/some_law.py:72: it killed the process by "
     "SIGSEGV; compiled code wrote or read outside of its memory",
     "import-ends": "controller 'import-ends' (some_end:Mine) cannot be used: it ended the process with exit code 0; "
     f"{REMEDY}",
