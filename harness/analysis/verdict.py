@@ -32,6 +32,9 @@ from servobench.harness.run.outcome import ACHIEVED
 
 LEVEL: Final = 0.05  # of the test by which two controllers are told apart
 NOBODY: Final = "nobody"
+RIVALS: Final = "not shown to be behind the first"  # heading of a column
+BE: Final = ("is", "are")
+BETTER: Final = "faster or more precise"
 NAMED: Final = 3  # controllers that a sentence names
 MOST_PLACES: Final = 24  # of which it is said who came first
 
@@ -128,16 +131,22 @@ def scores(place: pd.DataFrame) -> tuple[pd.DataFrame, str, int]:
     return table.pivot_table(index="seed", columns="controller", values="score", sort=False), unit, digits
 
 
-def told_apart(table: pd.DataFrame) -> dict[frozenset[str], bool]:
-    """Return for each pair of columns whether it is told apart over the rows; an infinite value is larger than any."""
+def shown_smaller(table: pd.DataFrame) -> set[tuple[str, str]]:
+    """Return the pairs of columns of which the first is shown to be smaller; an infinite value is larger than any."""
     known = table.dropna()
     finite = known.to_numpy()[np.isfinite(known.to_numpy())]
     known = known.replace(np.inf, 2.0 * float(finite.max(initial=0.5)))
     pairs = list(combinations([str(name) for name in known.columns], 2))
     if known.empty or not pairs:
-        return {frozenset(pair): False for pair in pairs}
+        return set()
     corrected = holm([signed_rank_p_value(known[a] - known[b]) for a, b in pairs])
-    return {frozenset(pair): p < LEVEL for pair, p in zip(pairs, corrected, strict=True)}
+    apart = [pair for pair, p in zip(pairs, corrected, strict=True) if p < LEVEL]
+    return {(a, b) if _signed_ranks(known[a] - known[b]) < 0.0 else (b, a) for a, b in apart}
+
+
+def _signed_ranks(differences: pd.Series[float]) -> float:
+    """Return the statistic of the signed-rank test: the sum of ranks of sizes, each with the sign of its difference."""
+    return float((np.sign(differences) * differences.abs().rank()).sum())
 
 
 def _of_one_run(runs: pd.DataFrame) -> str:
@@ -190,10 +199,10 @@ def _speed(runs: pd.DataFrame, names: Sequence[str]) -> str:
     table = leaders(runs[runs["controller"].isin(names)]) if len(names) > 1 else pd.DataFrame()
     if table.empty:
         return ""
-    clear = table["First", "controller"][table["How sure", "not told apart from the first"] == NOBODY]
+    clear = table["First", "controller"][table["How sure", RIVALS] == NOBODY]
     if clear.empty:
         none, others = ("neither", "the other") if len(names) == 2 else ("none of them", "the others")
-        return f", and {none} is shown to be faster or more precise than {others}"
+        return f", and {none} is shown to be {BETTER} than {others}"
     best = clear.value_counts().index[0]
     where = "" if len(table) == 1 else f" in {(clear == best).sum()} of {len(table)} places"
     return f", of which `{best}` is shown to be the best{where}"
@@ -213,11 +222,24 @@ def _doubts(runs: pd.DataFrame) -> str:
     achieved = runs.assign(score=outcomes(runs).isin(ACHIEVED).astype(float))
     table = achieved.pivot_table(index="seed", columns="controller", values="score", sort=False)
     best = max((shares := _shares(runs)), key=lambda name: shares[name])
-    apart = [name for name in shares if name != best and told_apart(table)[frozenset((best, name))]]
+    less = shown_smaller(table)
+    apart = [name for name in shares if (name, best) in less]
     if not apart:
-        return "In how often they did so, no controller can be told apart from the first."
+        sentence = "In how often they did so, no controller can be told apart from the first"
+        alone = list(shares.values()).count(shares[best]) == 1
+        faster = _faster(runs, best) if alone else []
+        return f"{sentence}{f', and {_listed(faster)} {_verb(faster, *BE)} shown to be {BETTER}' if faster else ''}."
     others = count - 1 - len(apart)
     return f"Told apart from the first: {_listed(apart, 6)}" + (f"; not so the other {others}." if others else ".")
+
+
+def _faster(runs: pd.DataFrame, best: str) -> list[str]:
+    """Return the controllers that are shown to be faster or more precise than `best` in every place."""
+    places = split_conditions(runs)
+    if len(places) > MOST_PLACES:
+        return []
+    smaller = [{name for name, other in shown_smaller(scores(place)[0]) if other == best} for _, place in places]
+    return [name for name in _shares(runs) if all(name in each for each in smaller)]
 
 
 def _leader(words: str, place: pd.DataFrame) -> dict[tuple[str, str], Any]:
@@ -225,8 +247,8 @@ def _leader(words: str, place: pd.DataFrame) -> dict[tuple[str, str], Any]:
     shares = _shares(place)
     order = sorted(table.columns, key=lambda name: (-shares[name], table[name].median()))
     first, second = order[:2]
-    apart = told_apart(table)
-    rivals = [name for name in order[1:] if not apart[frozenset((first, name))]]
+    smaller = shown_smaller(table)
+    rivals = [name for name in order[1:] if (first, name) not in smaller]
     middle = {name: median_with_interval(table[name].to_numpy()) for name in (first, second)}
     return {
         ("", "where"): words,
@@ -235,7 +257,7 @@ def _leader(words: str, place: pd.DataFrame) -> dict[tuple[str, str], Any]:
         ("First", "median"): _with_unit(middle[first], unit, digits),
         ("Next", "controller"): second,
         ("Next", "median"): _with_unit(middle[second], unit, digits),
-        ("How sure", "not told apart from the first"): _listed(rivals, NAMED).replace("`", "") if rivals else NOBODY,
+        ("How sure", RIVALS): _listed(rivals, NAMED).replace("`", "") if rivals else NOBODY,
     }
 
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from kit.folders import made_up_row
-from servobench.harness.analysis.verdict import judge, knows_truth, leaders, seeds_needed, told_apart
+from servobench.harness.analysis.verdict import judge, knows_truth, leaders, seeds_needed, shown_smaller
 
 
 def runs_of(seeds: int, **times: float) -> pd.DataFrame:
@@ -92,13 +92,25 @@ def test_runs_that_ended_early_are_counted():
     assert "1 of 4 runs ended early." in judge(runs).cautions
 
 
-def test_who_came_first_is_told_with_those_that_cannot_be_told_apart():
+def test_who_came_first_is_told_with_those_that_are_not_shown_to_be_behind():
     runs = pd.concat([runs_of(9, a=1.0, b=2.0), runs_of(9, c=1.0)])
     (row,) = leaders(runs).to_dict("records")
     assert row["First", "controller"] == "a"
     assert row["First", "median"].startswith("1.04 s [")
-    assert row["How sure", "not told apart from the first"] == "c"
+    assert row["How sure", "not shown to be behind the first"] == "c"
     assert leaders(runs[runs["controller"] == "a"]).empty
+
+
+def test_the_first_by_one_run_is_not_said_to_beat_those_that_are_faster():
+    runs = runs_of(30, reliable=2.0, fast=1.0, slow=3.0)
+    runs.loc[(runs["controller"] != "reliable") & (runs["seed"] == 0), ["settling_time_s", "outcome"]] = np.nan, "lost"
+    (row,) = leaders(runs).to_dict("records")
+    assert (row["First", "controller"], row["Next", "controller"]) == ("reliable", "fast")
+    assert row["How sure", "not shown to be behind the first"] == "fast"
+    assert judge(runs).cautions == (
+        "In how often they did so, no controller can be told apart from the first, "
+        "and `fast` is shown to be faster or more precise.",
+    )
 
 
 @pytest.mark.parametrize(("controllers", "seeds"), [(2, 6), (3, 7), (9, 11)])
@@ -109,7 +121,7 @@ def test_the_least_number_of_seeds_is_that_at_which_the_test_can_answer(controll
 
     def first_pair(count: int) -> bool:
         table = pd.DataFrame(rng.random((count, controllers)), columns=names)
-        return told_apart(table.assign(c0=table["c1"] - 1.0 - np.arange(count)))[frozenset(("c0", "c1"))]
+        return ("c0", "c1") in shown_smaller(table.assign(c0=table["c1"] - 1.0 - np.arange(count)))
 
     assert first_pair(seeds)
     assert not first_pair(seeds - 1)
