@@ -262,8 +262,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         ConfigurationError: not a results folder, one of another schema, or the manifest is not what was written.
     """
-    sums = read_sums(folder)
-    if MANIFEST in (sums or {}):
+    if _expected(folder, MANIFEST, read_sums(folder)):
         _refuse_damaged(folder, [MANIFEST])
     try:
         text = (folder / MANIFEST).read_text(encoding="utf-8")
