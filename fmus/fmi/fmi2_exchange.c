@@ -62,7 +62,7 @@ fmi2Status fmi2SetContinuousStates(fmi2Component component, const fmi2Real state
 
 static void copy_values(Instance *instance, size_t offset, fmi2Real values[])
 {
-    for (size_t i = 0; i < N_STATES; i++) model_get(&instance->core.model, offset + i, &values[i]);
+    for (size_t i = 0; i != N_STATES; i++) model_get(&instance->core.model, offset + i, &values[i]);
 }
 
 fmi2Status fmi2GetDerivatives(fmi2Component component, fmi2Real derivatives[], size_t count)
