@@ -33,7 +33,6 @@ from servobench.harness.run.outcome import ACHIEVED
 LEVEL: Final = 0.05  # of the test by which two controllers are told apart
 NOBODY: Final = "nobody"
 RIVALS: Final = "not shown to be behind the first"  # heading of a column
-BE: Final = ("is", "are")
 BETTER: Final = "faster or more precise"
 NAMED: Final = 3  # controllers that a sentence names
 MOST_PLACES: Final = 24  # of which it is said who came first
@@ -228,7 +227,8 @@ def _doubts(runs: pd.DataFrame) -> str:
         sentence = "In how often they did so, no controller can be told apart from the first"
         alone = list(shares.values()).count(shares[best]) == 1
         faster = _faster(runs, best) if alone else []
-        return f"{sentence}{f', and {_listed(faster)} {_verb(faster, *BE)} shown to be {BETTER}' if faster else ''}."
+        tail = f", and {_listed(faster)} {_verb(faster, 'is', 'are')} shown to be {BETTER}" if faster else ""
+        return f"{sentence}{tail}."
     others = count - 1 - len(apart)
     return f"Told apart from the first: {_listed(apart, 6)}" + (f"; not so the other {others}." if others else ".")
 
