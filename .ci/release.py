@@ -22,7 +22,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "servobench"
-NEEDED = ("py.typed", "__main__.py", "plant/signals.py", "harness/cli/main.py", "harness/notebooks/analysis.ipynb")
+NEEDED = (
+    "py.typed",
+    "__main__.py",
+    "plant/contract/signals.py",
+    "harness/cli/main.py",
+    "harness/notebooks/analysis.ipynb",
+)
 UNWANTED = (".pyc", ".fmu", "/.venv/", "/results/", "/tests/")  # in a wheel
 IN_SOURCE = (
     "pyproject.toml",

@@ -14,11 +14,12 @@ import numpy as np
 import pybullet
 
 from measuring import milliseconds, print_periods
-from servobench.plant.bullet.bullet_plant import build_bullet
-from servobench.plant.bullet.mechanics import Mechanics
-from servobench.plant.bullet.scene import BulletScene
-from servobench.plant.checks import FloatArray, whole_steps
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.checks import FloatArray, whole_steps
+from servobench.plant.contract.signals import Command
+from servobench.plant.rendered.bullet.bullet_plant import build_bullet
+from servobench.plant.rendered.bullet.mechanics import Mechanics
+from servobench.plant.rendered.bullet.scene import BulletScene
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
@@ -26,7 +27,6 @@ from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.ur5 import nominal_ur5
-from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]

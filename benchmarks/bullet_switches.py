@@ -21,7 +21,7 @@ from measuring import table
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.robot.mismatch import Mismatch
 

@@ -20,8 +20,8 @@ from servobench.harness.run.controller_fmu import controller_model
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
+from servobench.plant.contract.signals import Command
 from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.signals import Command
 
 METHODS = (
     "ukf_mfac:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac", "ukf_mfac", "rbf_pid", "rbfnn_mfac"

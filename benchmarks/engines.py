@@ -15,14 +15,14 @@ from typing import Final
 import numpy as np
 
 from measuring import asked_to_be_quick, table
-from servobench.plant.bullet.scene import BulletScene
-from servobench.plant.bullet.simulation import BulletSimulation
-from servobench.plant.checks import FloatArray
-from servobench.plant.mujoco.scene import MujocoScene
-from servobench.plant.mujoco.simulation import MujocoSimulation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.bullet.scene import BulletScene
+from servobench.plant.rendered.bullet.simulation import BulletSimulation
 from servobench.plant.rendered.detection import find_ball
 from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.mujoco.scene import MujocoScene
+from servobench.plant.rendered.mujoco.simulation import MujocoSimulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot

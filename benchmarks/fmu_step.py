@@ -18,14 +18,14 @@ from fmpy.fmi2 import FMU2Slave
 
 from measuring import asked_to_be_quick, table
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from servobench.plant.bench import Bench
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.lanes import stack
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.world import FmuWorld
-from servobench.plant.lanes import stack
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.signals import Command
 
 CALLS = 200
 BLOCK = 128

@@ -30,7 +30,7 @@ ROOT: Final = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / ".package")]
 
 from kit.hostile_controllers import harm_of  # noqa: E402
-from servobench.plant.seeds import named_seed  # noqa: E402
+from servobench.plant.contract.seeds import named_seed  # noqa: E402
 
 HOSTILE: Final = ROOT / "tests" / "kit" / "hostile_controllers.py"
 CONTROLLERS: Final = (*(f"{HOSTILE}:{name}" for name in ("Falsifies", "Sometimes", "Quiet")), "constant")

@@ -12,7 +12,7 @@ import numpy as np
 
 from measuring import PERIODS, asked_to_be_quick, microseconds, resolved_runs, table
 from servobench.harness.run.episode import carry_out_together
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 
 PERIOD, KEPT = 0.05, np.exp(-1.0)  # [s]; share of a joint's velocity that is left after a period

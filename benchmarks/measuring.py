@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 if TYPE_CHECKING:
-    from servobench.plant.checks import FloatArray
+    from servobench.plant.contract.checks import FloatArray
     from servobench.plant.rendered.settings import RenderedConfig
 
     MeasurePeriods: TypeAlias = Callable[[RenderedConfig, int], FloatArray]

@@ -18,10 +18,10 @@ from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import Observation, trusted_observation
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import nominal_ur5
-from servobench.plant.signals import Observation, trusted_observation
 
 PROBLEMS, BLOCK, FACTOR, AGREEMENT = 60, 128, 10.0, 5e-4  # IPOPT stops some 1e-4 rad short: its barrier
 CONFIG = MpcConfig()

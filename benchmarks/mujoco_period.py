@@ -14,14 +14,15 @@ from importlib.util import find_spec
 import numpy as np
 
 from measuring import milliseconds, print_periods
-from servobench.plant.checks import FloatArray, whole_steps
-from servobench.plant.mujoco.engine import mujoco
-from servobench.plant.mujoco.mujoco_plant import build_mujoco
-from servobench.plant.mujoco.scene import MujocoScene
-from servobench.plant.mujoco.simulation import MujocoSimulation
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.checks import FloatArray, whole_steps
+from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.mujoco.engine import mujoco
+from servobench.plant.rendered.mujoco.mujoco_plant import build_mujoco
+from servobench.plant.rendered.mujoco.scene import MujocoScene
+from servobench.plant.rendered.mujoco.simulation import MujocoSimulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.window import Window, whole, window_around
@@ -29,7 +30,6 @@ from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.ur5 import BALL_RADIUS, nominal_ur5
-from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]
@@ -90,7 +90,7 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
     plants = [build_mujoco(config, setup)]
     if find_spec("pybullet") is not None:
-        from servobench.plant.bullet.bullet_plant import build_bullet
+        from servobench.plant.rendered.bullet.bullet_plant import build_bullet
 
         plants.append(build_bullet(config, setup))
     for plant in plants:

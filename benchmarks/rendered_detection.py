@@ -15,17 +15,17 @@ from dataclasses import replace
 import numpy as np
 
 from measuring import asked_to_be_quick, table
-from servobench.plant.bullet.scene import BulletScene
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.eyes.registry import Sensing
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.registry import Sensing
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_seed
+from servobench.plant.rendered.bullet.scene import BulletScene
 from servobench.plant.rendered.mark_sight import open_sight
 from servobench.plant.rendered.rig import Rig
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.seeds import named_seed
 
 SET_UPS = ("pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand")
 POSES, ROBOTS = 200, 4

@@ -37,7 +37,7 @@ from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
 from servobench.harness.pictures import style
 from servobench.harness.run.episode import carry_out_together
-from servobench.plant.signals import Observation, PlantSpec, trusted_observation
+from servobench.plant.contract.signals import Observation, PlantSpec, trusted_observation
 
 PERIOD, FEATURES, BLOCK = 0.05, 3, 128
 PREVIEW = 20  # periods

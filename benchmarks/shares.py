@@ -67,7 +67,7 @@ def measure(together: bool, runs: int) -> Costs:
     """Return what each part costs in the checkout that this process imports."""
     from servobench.harness.run import episode, log
     from servobench.harness.run.experiment import build
-    from servobench.plant.bench import Bench
+    from servobench.plant.bench.bench import Bench
 
     clock, costs = Clock(), {}
     for owner, names, part in (

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from annotated_types import Le
 
-from servobench.plant.settings import NonNegative, Positive, Share, settings
+from servobench.plant.contract.settings import NonNegative, Positive, Share, settings
 
 Known: TypeAlias = Literal["ignored", "identified", "given"]
 """Whether a quantity is left out, identified from the motions of the run, or given by a number."""

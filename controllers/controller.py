@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.sight import Sight
-from servobench.plant.checks import FloatArray, is_finite
-from servobench.plant.signals import Command, Observation, PlantSpec
+from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.signals import Command, Observation, PlantSpec
 
 JacobianFunction: TypeAlias = Callable[[FloatArray], FloatArray]
 SymbolicFeature: TypeAlias = Callable[[Any], Any]

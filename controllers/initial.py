@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import ControllerDiverged
-from servobench.plant.lanes import branch, pick, transposed
-from servobench.plant.settings import Count, Number, Periods, Positive, settings
-from servobench.plant.signals import BoolArray, Observation, PlantSpec
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ControllerDiverged
+from servobench.plant.contract.lanes import branch, pick, transposed
+from servobench.plant.contract.settings import Count, Number, Periods, Positive, settings
+from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
 State = TypeVar("State")
 IntArray = npt.NDArray[np.int_]

@@ -20,7 +20,7 @@ from servobench.controllers.networks.fit import obtain_networks
 from servobench.controllers.parts import ESTIMATORS, LAWS, Part
 from servobench.controllers.servo import Servo, ServoController
 from servobench.controllers.units import in_natural_units
-from servobench.plant.settings import did_you_mean
+from servobench.plant.contract.settings import did_you_mean
 
 Kind = TypeVar("Kind")
 PUBLISHED: Final = ":published"  # after the name of a method: without aids, its law as printed

@@ -16,10 +16,10 @@ from servobench.controllers.laws.mpc.limits import joint_bounds
 from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver
 from servobench.controllers.laws.preview import check_preview, sampled
 from servobench.controllers.units import in_natural_units
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import SolverFailed
-from servobench.plant.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
-from servobench.plant.signals import Command, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import SolverFailed
+from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.signals import Command, Observation
 
 _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the iterations
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FilterDiverged
-from servobench.plant.lanes import branch
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import branch
 
 
 def nearest_rotation(M: FloatArray) -> FloatArray:

@@ -23,10 +23,10 @@ from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.controllers.stages.finish import Finish
 from servobench.controllers.stages.pairing import PairState
 from servobench.controllers.stages.prediction import Past, Predictor, shifted
-from servobench.plant.checks import FloatArray, is_finite
-from servobench.plant.faults import ControllerDiverged
-from servobench.plant.lanes import branch
-from servobench.plant.signals import BoolArray, Command, Observation
+from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.faults import ControllerDiverged
+from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.signals import BoolArray, Command, Observation
 
 
 class ServoState(NamedTuple):

@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 Look: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 Interaction: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]

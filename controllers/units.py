@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from servobench.controllers.controller import JacobianFunction, RobotKnowledge, SymbolicFeature
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from servobench.fmus.structure import sampled_sections
 from servobench.fmus.trace.faults import NOT_DEFINITE
 from servobench.fmus.trace.record import Recorded
 from servobench.fmus.variables import INPUT, SAMPLED, Group, Layout
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 MODEL: Final = "controller"
 CORE: Final = "controller"

@@ -18,8 +18,8 @@ from servobench.fmus.product import Product, c_files, check_version, committed, 
 from servobench.fmus.reference import input_csv, output_csv, reference_run
 from servobench.fmus.structure import arm_sections
 from servobench.fmus.variables import Actuation, ArmLayout, arm_groups, parameters_of
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.eyes.registry import Sensing
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm

@@ -9,9 +9,9 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.model import EyeModel, Mount
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.model import EyeModel, Mount
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import rpy_from_rotation
 
 FEATURE: Final = "feature"

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from servobench.fmus.eye_variables import View
 from servobench.fmus.source import generated_source
 from servobench.fmus.variables import ArmLayout
-from servobench.plant.eyes.optics import Optics
-from servobench.plant.eyes.symbolic import EyeGeometry, features, points_in_cameras, seen_features
+from servobench.plant.cameras.optics import Optics
+from servobench.plant.cameras.symbolic import EyeGeometry, features, points_in_cameras, seen_features
 from servobench.plant.robot.symbolic import SX, ArmGeometry, HandEyeGeometry, feature_and_jacobian
 
 

@@ -23,7 +23,7 @@ from servobench.fmus.variables import (
     Group,
     Layout,
 )
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 UNITS: dict[str, dict[str, str]] = {
     "1": {},

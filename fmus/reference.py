@@ -11,11 +11,11 @@ import numpy as np
 
 from servobench.fmus.eye_variables import FEATURE, SEEN
 from servobench.fmus.variables import Actuation, Layout
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_generator
 from servobench.plant.kinematic import discretise_lag
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.seeds import named_generator
 
 STEP = 0.05  # [s]
 STEPS = 200

@@ -11,7 +11,7 @@ import casadi
 import numpy as np
 
 from servobench.fmus.variables import FIXED, INPUT, PARAMETER, STATE, Layout
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 # Generated functions do not use all of their parameters; none of them is exported by the library.
 HEAD = """/* Generated with CasADi's code generator; not meant to be edited. */

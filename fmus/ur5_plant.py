@@ -13,18 +13,18 @@ import numpy as np
 from servobench.fmus.export import export_fmu, fingerprint, nominal_options
 from servobench.fmus.eye_variables import FEATURE, SEEN, View
 from servobench.fmus.variables import Actuation, parameters_of
-from servobench.plant.bench import Bench
-from servobench.plant.cache import cached
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.eyes.registry import Sensing
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import PlantEntry, PlantSetup
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.registry import Sensing
+from servobench.plant.contract.cache import cached
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
+from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.robot import Robot
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import NonNegative, Positive, nested, settings
-from servobench.plant.timing import RENAMED_DELAY
 
 
 @settings

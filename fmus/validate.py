@@ -9,8 +9,8 @@ import numpy as np
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description
 from servobench.plant.fmu.instances import open_instance

@@ -17,8 +17,8 @@ from math import prod
 import numpy as np
 
 from servobench.fmus.eye_variables import SEEN, View, view_parameters
-from servobench.plant.checks import FloatArray, as_array
-from servobench.plant.eyes.model import EyeModel
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.limits import JointLimits, narrowed

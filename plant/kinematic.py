@@ -4,7 +4,7 @@ Each joint follows its velocity command through a first-order lag, discretised e
 
     q̇ = v,   v̇ = (u − v) / τ
 
-Delay, noise, latency and lost frames are those of `servobench.plant.bench`.
+Delay, noise, latency and lost frames are those of `servobench.plant.bench.bench`.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench import Bench, build_bench
-from servobench.plant.checks import FloatArray, is_finite
-from servobench.plant.faults import PlantDiverged
-from servobench.plant.lanes import take, where
-from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.bench.bench import Bench, build_bench
+from servobench.plant.bench.plant import PlantEntry, PlantSetup
+from servobench.plant.bench.world import World
+from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.faults import PlantDiverged
+from servobench.plant.contract.lanes import take, where
+from servobench.plant.contract.seeds import Seeds
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
+from servobench.plant.contract.signals import BoolArray, Truth
+from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.seeds import Seeds
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import NonNegative, Positive, nested, settings
-from servobench.plant.signals import BoolArray, Truth
-from servobench.plant.timing import RENAMED_DELAY
-from servobench.plant.world import World
 
 
 @settings

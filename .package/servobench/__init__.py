@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from servobench.harness.batch.api import Results, compare, load, run
     from servobench.harness.check.controllers import check_controller
     from servobench.harness.check.plants import check_plant
-    from servobench.plant.plant import Plant, PlantEntry, PlantSetup
-    from servobench.plant.signals import Command, Observation, PlantSpec, Truth
-    from servobench.plant.world import World
+    from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup
+    from servobench.plant.bench.world import World
+    from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 __all__ = [
     "Command",
@@ -46,9 +46,9 @@ _HOMES = {
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.check.controllers": ("check_controller",),
     "servobench.harness.check.plants": ("check_plant",),
-    "servobench.plant.plant": ("Plant", "PlantEntry", "PlantSetup"),
-    "servobench.plant.signals": ("Command", "Observation", "PlantSpec", "Truth"),
-    "servobench.plant.world": ("World",),
+    "servobench.plant.bench.plant": ("Plant", "PlantEntry", "PlantSetup"),
+    "servobench.plant.contract.signals": ("Command", "Observation", "PlantSpec", "Truth"),
+    "servobench.plant.bench.world": ("World",),
 }
 
 

@@ -24,10 +24,10 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of, kalman_update
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm
-from servobench.plant.settings import NonNegative, Positive, settings
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm
+from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.signals import BoolArray
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
 SHARES = np.concatenate([[0.0], (1.0 + NODES) / 2.0, [1.0]])  # of the way, both ends included

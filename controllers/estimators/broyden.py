@@ -15,10 +15,10 @@ from annotated_types import Le
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm, outer
-from servobench.plant.settings import Positive, settings
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm, outer
+from servobench.plant.contract.settings import Positive, settings
+from servobench.plant.contract.signals import BoolArray
 
 
 @settings

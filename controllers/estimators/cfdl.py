@@ -16,10 +16,10 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.broyden import projection_update
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm
-from servobench.plant.settings import NonNegative, Positive, settings
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm
+from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.signals import BoolArray
 
 
 @settings

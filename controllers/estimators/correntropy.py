@@ -22,9 +22,9 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import KalmanState, cholesky_of
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm, outer, transposed
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm, outer, transposed
+from servobench.plant.contract.signals import BoolArray
 
 MAX_EXPONENT = 40.0  # a weight of exp(−40) is as good as none, and can be divided by
 

@@ -1,6 +1,6 @@
 """The contract of a Jacobian estimator: what it learns from, and the estimate that it returns.
 
-Estimators are pure: the state goes in and comes out, a tree of arrays with leading axes (`servobench.plant.lanes`), and
+Estimators are pure: the state goes in and comes out, a tree of arrays with leading axes (`plant.contract.lanes`), and
 no array of it is ever changed. One run has no leading axis; a thousand runs have one.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Generic, TypeVar
 
 from servobench.controllers.controller import Diagnostics
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 State = TypeVar("State")
 MOTION_TIME: Final = 0.05  # [s] that a motion lasts at least, whatever the control period: what is learned per second

@@ -8,8 +8,8 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray
-from servobench.plant.settings import settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import settings
 
 
 @settings

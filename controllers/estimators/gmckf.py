@@ -20,8 +20,8 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.correntropy import MAX_EXPONENT, CorrentropyEstimator, fixed_point_update
-from servobench.plant.checks import FloatArray
-from servobench.plant.settings import Count, NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
 MIN_ERROR: Final = 0.1  # [1] in standard deviations
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.correntropy import CorrentropyEstimator, gaussian_weight
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm, outer, transposed
-from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm, outer, transposed
+from servobench.plant.contract.settings import NonNegative, Positive, settings
 
 
 @settings

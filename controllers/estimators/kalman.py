@@ -18,11 +18,11 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.plant.checks import FloatArray, is_finite
-from servobench.plant.faults import FilterDiverged
-from servobench.plant.lanes import branch, norm, outer, plus_diagonal, transposed
-from servobench.plant.settings import NonNegative, Positive, settings
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray, is_finite
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import branch, norm, outer, plus_diagonal, transposed
+from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.signals import BoolArray
 
 
 @settings

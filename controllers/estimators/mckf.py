@@ -15,7 +15,7 @@ from functools import partial
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.correntropy import CorrentropyEstimator, fixed_point_update, gaussian_weight
-from servobench.plant.settings import Count, NonNegative, Positive, settings
+from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
 
 @settings

@@ -13,9 +13,9 @@ from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.latest import LatestFeatures
 from servobench.controllers.networks.rbf import JacobianNetwork
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm
-from servobench.plant.settings import Count, NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
 USUAL_NOISE = 0.001  # [m] at which ε holds
 

@@ -11,9 +11,9 @@ from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.rbf import started_rows
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.latest import LatestFeatures
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm
-from servobench.plant.settings import Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.settings import Positive, settings
 
 
 @settings

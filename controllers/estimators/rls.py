@@ -16,10 +16,10 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm, outer, transposed
-from servobench.plant.settings import NonNegative, Positive, PositiveOrInfinite, settings
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm, outer, transposed
+from servobench.plant.contract.settings import NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.signals import BoolArray
 
 
 @settings

@@ -19,8 +19,8 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.correntropy import CorrentropyEstimator, corrected, gaussian_weight
-from servobench.plant.checks import FloatArray
-from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import NonNegative, Positive, settings
 
 
 @settings

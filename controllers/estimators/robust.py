@@ -33,9 +33,9 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.estimators.kalman import cholesky_of
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm, outer, transposed, where
-from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm, outer, transposed, where
+from servobench.plant.contract.settings import NonNegative, Positive, settings
 
 BISQUARE: Final = 4.685  # [1] c_b: 95 % efficiency under normal noise
 NORMAL_MEDIAN: Final = 0.6745  # [1] median of |N(0, 1)|

@@ -24,9 +24,9 @@ import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator, cholesky_of
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import transposed
-from servobench.plant.settings import NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import transposed
+from servobench.plant.contract.settings import NonNegative, Positive, settings
 
 
 @settings

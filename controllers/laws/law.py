@@ -1,7 +1,7 @@
 """The contract of a control law: estimate, observation and reference in, joint velocity out.
 
 Laws are pure, as estimators are: the state goes in and comes out, a tree of arrays with leading axes
-(`servobench.plant.lanes`), and no array of it is ever changed.
+(`servobench.plant.contract.lanes`), and no array of it is ever changed.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 from servobench.controllers.controller import Diagnostics
 from servobench.controllers.estimate import Estimate
-from servobench.plant.checks import FloatArray
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import BoolArray, Observation
 
 Stage: TypeAlias = Literal["predict", "preview", "limit"]
 State = TypeVar("State")

@@ -17,10 +17,10 @@ import numpy as np
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import plus_diagonal, transposed
-from servobench.plant.settings import Positive, PositiveOrInfinite, settings
-from servobench.plant.signals import Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import plus_diagonal, transposed
+from servobench.plant.contract.settings import Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.signals import Observation
 
 
 @settings

@@ -22,10 +22,10 @@ from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.law import Law
 from servobench.controllers.stages.inverses import damped_inverse
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm
-from servobench.plant.settings import NonNegative, Positive, settings
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm
+from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.signals import BoolArray, Observation
 
 
 @settings

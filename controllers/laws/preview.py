@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servobench.controllers.periods import in_periods
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 
 def check_preview(wanted: float, rows: int, period: float, what: str) -> None:

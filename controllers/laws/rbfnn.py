@@ -19,10 +19,10 @@ from servobench.controllers.periods import in_periods
 from servobench.controllers.stages.inverses import project_to_row_space
 from servobench.controllers.stages.joint_response import pushed
 from servobench.controllers.stages.limit import largest_excess
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm
-from servobench.plant.settings import Count, NonNegative, Positive, settings
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm
+from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
+from servobench.plant.contract.signals import BoolArray, Observation
 
 
 @settings

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from servobench.controllers.networks.rbf import ControllerNetwork, controller_output, information_vector
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import transposed
 
 
 class RollOut(NamedTuple):

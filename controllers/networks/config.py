@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeAlias
 from annotated_types import Ge, Len, Lt
 
 from servobench.controllers.networks.rbf import STEP, Kernel
-from servobench.plant.checks import FloatArray, as_vector
-from servobench.plant.settings import Count, NonNegative, Number, Periods, Positive, nested, settings
+from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.settings import Count, NonNegative, Number, Periods, Positive, nested, settings
 
 Placement = Literal["halton", "sobol", "kmeans"]
 Grid: TypeAlias = Annotated[tuple[Positive, ...], Len(1)]

@@ -13,7 +13,7 @@ from typing import Any, cast
 import numpy as np
 
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork, Kernel
-from servobench.plant.files import write_atomically
+from servobench.plant.contract.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 2

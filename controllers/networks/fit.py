@@ -38,8 +38,8 @@ from servobench.controllers.networks.samples import (
     pool_size,
     unit_points,
 )
-from servobench.plant.checks import FloatArray
-from servobench.plant.signals import PlantSpec
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import PlantSpec
 
 Progress = Callable[[float, str], None]
 JACOBIAN_SHARE = 0.4  # [1] of the work, for the progress bar

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.networks.rbf import JacobianNetwork
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 
 @final

@@ -21,8 +21,8 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import transposed
 
 Kernel = Literal["exponential", "gaussian"]
 KERNELS: tuple[str, ...] = get_args(Kernel)

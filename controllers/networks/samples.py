@@ -10,8 +10,8 @@ from scipy.cluster.vq import kmeans2
 from servobench.controllers.controller import JacobianFunction
 from servobench.controllers.networks.config import Placement, TrainingConfig
 from servobench.controllers.networks.rbf import information_vector
-from servobench.plant.checks import FloatArray
-from servobench.plant.signals import PlantSpec
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import PlantSpec
 
 WEAKEST = 0.1  # singular value of J over its largest below which a direction is left out of the inverse
 CLUSTERING_POOL = 20  # samples a centre when centres come from k-means

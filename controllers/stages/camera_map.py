@@ -12,9 +12,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import map_arrays, pick
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import map_arrays, pick
+from servobench.plant.contract.signals import BoolArray
 
 Bank = TypeVar("Bank")
 

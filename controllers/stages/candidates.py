@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.periods import whole_periods
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import pick
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import pick
 
 RESOLUTION = 0.0125  # [s] between candidate delays, about
 LAST_THREE = np.array([0, 1, 2])

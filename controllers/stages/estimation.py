@@ -30,9 +30,9 @@ from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, 
 from servobench.controllers.periods import whole_periods
 from servobench.controllers.sight import of_points, seen_through, through
 from servobench.controllers.stages.pairing import NO_DEPTH, Paired, Pairing, PairState
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm, transposed
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm, transposed
+from servobench.plant.contract.signals import BoolArray, Observation
 
 
 class Seen(NamedTuple):

@@ -16,9 +16,9 @@ import numpy as np
 
 from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.signals import BoolArray
 
 REST_DRIFT = 4.472136e-4  # [m/√s] process noise of z at rest; r in the formula is that of a period
 RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y

@@ -9,8 +9,8 @@ import numpy as np
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.stages.camera_map import CameraMap, Innovation, Step
 from servobench.controllers.stages.map_bank import fresh_bank, map_update, near_rotation
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 
 
 @final

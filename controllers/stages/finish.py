@@ -18,8 +18,8 @@ from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.stages.inverses import damped_inverse
 from servobench.controllers.stages.limit import largest_excess, redistribute
 from servobench.controllers.stages.posture import step_with_posture
-from servobench.plant.checks import FloatArray
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import BoolArray
 
 
 @final

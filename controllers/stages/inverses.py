@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, plus_diagonal, transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, plus_diagonal, transposed
 
 MAX_DAMPED_RATIO = 1e9  # [1] of ‖J‖²/δ²; above it rounding errors of JJᵀ are not small against δ²
 MIN_SINGULAR_RATIO = 1e-15  # [1] of a singular value to the largest; smaller ones are rounding errors

@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, transposed
 
 WINDOW = 0.05  # [s] over which motions are compared, and no shorter than a period; steps of encoders spoil shorter ones
 PRIOR_WEIGHT = 2e-4  # [rad²/s] ρ_1, of windows of a second; one step of some milliradians outweighs it

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from servobench.controllers.stages.inverses import damped_inverse
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, repeat
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, repeat
+from servobench.plant.contract.signals import BoolArray
 
 MIN_ROOM = 1e-9  # [1] of its limit; a joint with less room is left out
 REMAINDER_TOLERANCE = 1e-6  # [1] of the step that may be left undone

@@ -29,9 +29,9 @@ from __future__ import annotations
 import numpy as np
 
 from servobench.controllers.rotation import nearest_rotation
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FilterDiverged
-from servobench.plant.lanes import outer, plus_diagonal
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import outer, plus_diagonal
 
 
 def fresh_bank(M: FloatArray, P_M: FloatArray, frame: FloatArray | float) -> FloatArray:

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch
 
 GUESS_SAMPLES = 1.0  # [samples] weight of the initial guess
 WARM_UP_SAMPLES = 10.0  # [samples] the guess included

@@ -32,9 +32,9 @@ from servobench.controllers.stages.candidates import Candidates
 from servobench.controllers.stages.feature_map import FeatureMap
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.controllers.stages.sight_map import SightMap
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch, norm, pick
-from servobench.plant.signals import BoolArray, Observation, PlantSpec
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm, pick
+from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
 MAX_GAP = 16  # motions of the least length that one over lost frames may span; from a longer one nothing is learned
 MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm

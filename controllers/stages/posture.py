@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 
 def step_with_posture(

@@ -23,9 +23,9 @@ from servobench.controllers.periods import whole_periods
 from servobench.controllers.stages.feature_filter import FeatureFilter
 from servobench.controllers.stages.joint_response import WINDOW, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import branch
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.signals import BoolArray, Observation
 
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
 

@@ -25,10 +25,10 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.rotation import nearest_rotation
 from servobench.controllers.sight import Sight, through
 from servobench.controllers.stages.camera_map import CameraMap, Innovation, Step
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FilterDiverged
-from servobench.plant.lanes import norm, plus_diagonal, transposed, where
-from servobench.plant.signals import BoolArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import norm, plus_diagonal, transposed, where
+from servobench.plant.contract.signals import BoolArray
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 ENTRIES: Final = 9  # of M

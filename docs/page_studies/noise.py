@@ -41,7 +41,7 @@ from servobench.harness.pictures.style import (
     figure_style,
 )
 from servobench.harness.run.ending import COMPLETED
-from servobench.plant.eyes.registry import Sensing
+from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import find_robot
 
 LAW: Final = "pid"

@@ -1,4 +1,4 @@
-"""Decisions of `servobench.plant.lanes` over arrays of expressions: C takes one of two ways, as the code did."""
+"""Decisions of `plant.contract.lanes` over arrays of expressions: C takes one of two ways, as the code did."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from servobench.fmus.trace.array import NotTraceable, Traced, as_traced
 from servobench.fmus.trace.faults import frame, note_code
-from servobench.plant.lanes import map_arrays, take
+from servobench.plant.contract.lanes import map_arrays, take
 
 Tree = TypeVar("Tree")
 _NUMBERS = count()
@@ -38,7 +38,7 @@ def symbols_like(leaves: list[Any]) -> list[Traced]:
 
 
 def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
-    """Return `function(tree, *arguments)` if `chosen`, else `tree`; see `servobench.plant.lanes.branch`.
+    """Return `function(tree, *arguments)` if `chosen`, else `tree`; see `servobench.plant.contract.lanes.branch`.
 
     Raises:
         NotTraceable: the function uses expressions that are not among its arguments.
@@ -89,7 +89,7 @@ def _side_by_side(chosen: Traced, function: Callable[..., Tree], tree: Tree, *ar
 
 
 def repeat(condition: Callable[[Tree], Any], function: Callable[[Tree], Tree], tree: Tree, at_most: int) -> Tree:
-    """Apply a function for as long as a condition holds; see `servobench.plant.lanes.repeat`.
+    """Apply a function for as long as a condition holds; see `servobench.plant.contract.lanes.repeat`.
 
     One pass is recorded and called `at_most` times.
     """

@@ -1,7 +1,7 @@
 """Lets the modules of this package compute with expressions for a while, by other meanings of a few names.
 
 Most of numpy asks its arguments what to do (`__array_ufunc__`, `__array_function__`). What does not are functions that
-make arrays, the decisions of `servobench.plant.lanes`, and memos: while code is recorded, these names mean others.
+make arrays, the decisions of `plant.contract.lanes`, and memos: while code is recorded, these names mean others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from servobench.fmus.trace import branches, faults, functions, ufuncs
 from servobench.fmus.trace.array import Traced, as_traced, spread
-from servobench.plant import checks, lanes
+from servobench.plant.contract import checks, lanes
 
 PACKAGE: Final = "servobench."
 OWN: Final = "servobench.fmus."

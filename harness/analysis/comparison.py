@@ -31,8 +31,8 @@ from servobench.harness.analysis.statistics import (
 )
 from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.checks import FloatArray
 
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
 CONDITION: Final = ("plant", "sensing", "task", "mismatch", "noise_factor", "latency_s", "period_s")

@@ -16,7 +16,7 @@ import pandas as pd
 from servobench.harness.batch import results
 from servobench.harness.config.extras import check_installed
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.files import reason
+from servobench.plant.contract.files import reason
 
 if TYPE_CHECKING:
     from control import TimeResponseData

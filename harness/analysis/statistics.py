@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 2000

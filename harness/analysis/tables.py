@@ -29,7 +29,7 @@ from servobench.harness.analysis.statistics import (
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED
-from servobench.plant.settings import suggest
+from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
 

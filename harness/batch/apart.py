@@ -29,8 +29,8 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import PACKAGES, is_below, place_in_trace
 from servobench.harness.run.ending import TIMED_OUT, Ending
-from servobench.plant.files import user_path
-from servobench.plant.plant import PlantEntry
+from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.files import user_path
 
 IMPORT_LIMIT = 120.0  # [s] to import what a user names: large libraries are allowed
 LOADING: Final = "loading"  # what a check is at before the first one

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.files import partial_path, sync, write_atomically
+from servobench.plant.contract.files import partial_path, sync, write_atomically
 
 SUMS: Final = "SHA256SUMS"
 LINE: Final = re.compile(r"(?P<digest>[0-9a-f]{64})  (?P<name>[^\s/]+(/[^\s/]+)?)")

@@ -17,7 +17,7 @@ from servobench.harness.batch.grid import Grid
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.robot.mismatch import Mismatch
 
 MAX_SEEDS: Final = 1_000_000  # of a batch

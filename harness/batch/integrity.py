@@ -24,7 +24,7 @@ from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import log_entry
-from servobench.plant.files import PARTIAL
+from servobench.plant.contract.files import PARTIAL
 
 AGAIN: Final = "repeat the command that made the folder with --resume"
 LOGGED: Final = ("run_id", "status", "reason")  # columns of which the log of failures is made

@@ -22,7 +22,7 @@ from typing import Final
 
 from servobench.harness.batch.checksums import SUMS
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.files import PARTIAL
+from servobench.plant.contract.files import PARTIAL
 
 LOCK = ".lock"
 PARTS: Final = "parts"

@@ -13,8 +13,8 @@ from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import TIMES, RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.settings import suggest
 
 READERS: Final[Mapping[str, Callable[..., Any]]] = {".csv": pd.read_csv, ".parquet": pd.read_parquet}
 PLANT: Final = "kinematic"  # for sizes and units of a log whose plant is not known

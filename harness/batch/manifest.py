@@ -18,7 +18,7 @@ from servobench.harness.config.robots import find_robot
 from servobench.harness.config.sensing import find_sensing
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.version import git_commit, installed_version
-from servobench.plant.plant import PlantEntry
+from servobench.plant.bench.plant import PlantEntry
 
 PACKAGES = (
     "servobench",

@@ -12,7 +12,7 @@ from servobench.harness.config.neighbours import neighbours
 from servobench.harness.config.own import PLACE
 from servobench.harness.config.registry import MAPPED, Offer
 from servobench.harness.config.sensing import sensing_file, sensing_place
-from servobench.plant.files import read_toml, user_path
+from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.robot.mismatch import Mismatch
 
 MAPPING: Final = ".toml"

@@ -37,11 +37,11 @@ from servobench.harness.batch.lock import PARTS, check_empty
 from servobench.harness.batch.manifest_text import decode, encode
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import log_entry
-from servobench.plant.files import PARTIAL, write_atomically
+from servobench.plant.contract.files import PARTIAL, write_atomically
 
 if TYPE_CHECKING:
     from servobench.harness.run.episode import RunResult
-    from servobench.plant.plant import ImageArray
+    from servobench.plant.bench.plant import ImageArray
 
 PICTURES = "pictures"
 RUNS = "runs.parquet"

@@ -37,8 +37,8 @@ from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolved import resolve
 from servobench.harness.run.tasks import TASKS
-from servobench.plant.faults import RunFault
-from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.bench.plant import PlantEntry, PlantSetup
+from servobench.plant.contract.faults import RunFault
 
 PLANT: Final = "kinematic"  # on which controllers are tried
 TASK: Final = "exp1"

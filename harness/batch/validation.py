@@ -12,7 +12,7 @@ from servobench.harness.batch.guard import Task
 from servobench.harness.batch.pool import Pool
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
 
 
 def validate_apart(path: Path) -> Validation:

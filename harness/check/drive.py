@@ -19,8 +19,8 @@ from servobench.controllers.controller import Controller
 from servobench.harness.check.report import CheckFailed
 from servobench.harness.check.rig import PREVIEW, Rig
 from servobench.harness.config.source import PACKAGES, show
-from servobench.plant.checks import FloatArray
-from servobench.plant.signals import Command, Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import Command, Observation
 
 
 @dataclass

@@ -13,12 +13,12 @@ from servobench.harness.config.builds import Build, folder_of
 from servobench.harness.config.entries import PLANT
 from servobench.harness.config.own import own_object
 from servobench.harness.config.registry import choose_plant, find_plant, offering
-from servobench.plant.plant import Plant, PlantEntry, PlantSetup
+from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup
+from servobench.plant.bench.world import World
+from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
-from servobench.plant.signals import Command, Observation
-from servobench.plant.world import World
 
 PERIOD: Final = 0.05  # [s]
 MISMATCH: Final = "moderate+gear_ratio=5%"

@@ -10,8 +10,8 @@ import numpy as np
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.plant.checks import FloatArray
-from servobench.plant.signals import Observation, PlantSpec
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import Observation, PlantSpec
 
 PERIOD: Final = 0.05  # [s]
 PREVIEW: Final = 10  # [rows]

@@ -54,7 +54,7 @@ def analyse(
     from servobench.harness.analysis.loops.table import LEGEND, loop_table, printed
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.loops import write_pictures
-    from servobench.plant.faults import RunFault
+    from servobench.plant.contract.faults import RunFault
 
     source, arm = _source(jacobian), named.known_robot(robot)
     runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
@@ -87,7 +87,7 @@ def analyse(
 def _source(jacobian: str) -> Source:
     from servobench.harness.analysis.loops.equilibrium import SOURCES
     from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.settings import did_you_mean
+    from servobench.plant.contract.settings import did_you_mean
 
     for source in SOURCES:
         if source == jacobian:

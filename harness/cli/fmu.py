@@ -110,8 +110,8 @@ def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Produc
     from servobench.fmus.export import ExportOptions, default_actuation, product
     from servobench.harness.config.robots import find_robot
     from servobench.harness.config.sensing import find_sensing
+    from servobench.plant.contract.seeds import named_seed
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-    from servobench.plant.seeds import named_seed
 
     described, differs, drawn = find_robot(robot), Mismatch.parse(mismatch), named_seed(seed, "mismatch")
     arm, sample = sample_mismatch(differs, described, drawn)

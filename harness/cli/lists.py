@@ -27,7 +27,7 @@ def plants(
     from servobench.harness.batch.apart import choose_plants
     from servobench.harness.batch.trial import try_plants
     from servobench.harness.config.registry import find_plant, unused_points
-    from servobench.plant.plant import PlantEntry
+    from servobench.plant.bench.plant import PlantEntry
 
     if name:
         (name,) = choose_plants([name])
@@ -79,7 +79,7 @@ def tasks(
 
 def sensing(as_json: JsonOption = False) -> None:
     """List the sensing set-ups: what cameras measure of the arm."""
-    from servobench.plant.eyes.registry import EYES
+    from servobench.plant.cameras.registry import EYES
 
     _show_names([_described(name, entry.summary) for name, entry in EYES.items()], as_json=as_json)
     if not as_json:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from servobench.controllers.controller import ControllerEntry
     from servobench.harness.batch.trial import Tried
-    from servobench.plant.plant import PlantEntry
+    from servobench.plant.bench.plant import PlantEntry
 
 
 def known_robot(name: str) -> str:
@@ -108,7 +108,7 @@ def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple
     from servobench.harness.batch.apart import choose_plants
     from servobench.harness.batch.trial import try_plants
     from servobench.harness.config.registry import ALL, find_plant, plant_names
-    from servobench.plant.plant import PlantEntry
+    from servobench.plant.bench.plant import PlantEntry
 
     known, names = plant_names(), list[str]()
     for word in split_words(text):

@@ -27,7 +27,7 @@ def new(
 ) -> None:
     """Write a commented controller or plant, and its test."""
     from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.files import reason
+    from servobench.plant.contract.files import reason
 
     if kind not in NEXT:
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)

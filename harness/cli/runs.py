@@ -91,7 +91,7 @@ def _one_plant(plant: str | None, *, view: bool) -> str:
     """Return the name of the plant of a run."""
     from servobench.harness.batch.apart import choose_plants
     from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.plant import PlantEntry
+    from servobench.plant.bench.plant import PlantEntry
 
     (name,) = [named.default_plant()] if plant is None else choose_plants([plant])
     if view and name != "bullet":
@@ -166,7 +166,7 @@ def train(
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.network_cache import NETWORKS
     from servobench.harness.run.resolved import check_settings
-    from servobench.plant.cache import cache_folder
+    from servobench.plant.contract.cache import cache_folder
 
     settings, (controller,) = overrides.settings(), choose_controllers([controller])
     check_settings(settings, [controller])
@@ -228,7 +228,7 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
     from servobench.harness.config.extras import missing_extra
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.draw import draw_figures
-    from servobench.plant.files import point_latest
+    from servobench.plant.contract.files import point_latest
 
     runs = results.load_runs(folder)
     print_tables(summary_tables(runs), summary_legend(runs))

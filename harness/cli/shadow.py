@@ -41,7 +41,7 @@ def shadow(
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see
-    from servobench.plant.files import reason
+    from servobench.plant.contract.files import reason
 
     if not log.exists():
         raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")

@@ -14,13 +14,13 @@ from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at
 from servobench.harness.config.watched import WatchedWorld, missing_spec
-from servobench.plant.bench import Bench, build_bench
-from servobench.plant.faults import RunFault
-from servobench.plant.plant import Plant, PlantSetup
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import NonNegative, nested, settings
-from servobench.plant.signals import PlantSpec
-from servobench.plant.world import World
+from servobench.plant.bench.bench import Bench, build_bench
+from servobench.plant.bench.plant import Plant, PlantSetup
+from servobench.plant.bench.world import World
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import NonNegative, nested, settings
+from servobench.plant.contract.signals import PlantSpec
 
 
 @settings

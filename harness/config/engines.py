@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from servobench.harness.config.extras import has_no_wheel
 from servobench.harness.config.registry import RENDERED, UNRENDERED, find_plant, installed_plant
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.plant import PlantEntry
+from servobench.plant.bench.plant import PlantEntry
 
 if TYPE_CHECKING:
     from servobench.plant.rendered.engine import OpenScene
@@ -46,10 +46,10 @@ def default_plant() -> tuple[str, str]:
 def scene_of(plant: str) -> OpenScene:
     """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
     if plant == "mujoco":
-        from servobench.plant.mujoco.scene import MujocoScene  # noqa: PLC0415
+        from servobench.plant.rendered.mujoco.scene import MujocoScene  # noqa: PLC0415
 
         return MujocoScene
-    from servobench.plant.bullet.scene import BulletScene  # noqa: PLC0415
+    from servobench.plant.rendered.bullet.scene import BulletScene  # noqa: PLC0415
 
     return BulletScene
 

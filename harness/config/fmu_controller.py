@@ -23,17 +23,17 @@ from annotated_types import MinLen
 
 from servobench.controllers.controller import Controller, ControllerEntry, RobotKnowledge
 from servobench.harness.config.builds import NoSettings
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FmuError
-from servobench.plant.files import read_toml
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.settings import File, Names, Positive, Values, nested, override, settings
+from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description, total_size
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.fmu.port import Port
-from servobench.plant.settings import File, Names, Positive, Values, nested, override, settings
-from servobench.plant.signals import Command, Observation
 
 CONVENTION: Final[Mapping[str, str]] = {
     "outputs": "joint_velocity_command",

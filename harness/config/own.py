@@ -23,8 +23,8 @@ from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import SourceFile, describe_at, make_importable
-from servobench.plant.plant import PlantEntry
-from servobench.plant.settings import suggest
+from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.settings import suggest
 
 PLACE: Final = re.compile(
     r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.py)(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"

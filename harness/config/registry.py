@@ -21,17 +21,17 @@ from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, ma
 from servobench.harness.config.extras import check_installed
 from servobench.harness.config.own import Own, describe_import, is_place, read_own
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.files import user_path
-from servobench.plant.plant import PlantEntry
-from servobench.plant.settings import suggest
+from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.files import user_path
+from servobench.plant.contract.settings import suggest
 
 PLANT_GROUP = "servobench.plants"
 CONTROLLER_GROUP = "servobench.controllers"
 
 PLANTS = {
     "kinematic": "servobench.plant.kinematic:ENTRY",
-    "bullet": "servobench.plant.bullet.bullet_plant:ENTRY",
-    "mujoco": "servobench.plant.mujoco.mujoco_plant:ENTRY",
+    "bullet": "servobench.plant.rendered.bullet.bullet_plant:ENTRY",
+    "mujoco": "servobench.plant.rendered.mujoco.mujoco_plant:ENTRY",
     "fmu": "servobench.fmus.ur5_plant:ENTRY",
 }
 RENDERED = ("bullet", "mujoco")  # a run without a named plant is on the first one that is installed

@@ -8,8 +8,8 @@ from functools import lru_cache
 from servobench.harness.config.own import PLACE
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import SourceFile
-from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.registry import EYES, FIXED, HAND, Sensing
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
 
 
 def sensing_names() -> list[str]:
@@ -63,7 +63,7 @@ def _pick(source: SourceFile, file: str, name: str | None) -> Eye:
     if name in found:
         return found[name]
     if not found:
-        raise ConfigurationError(f"{file} defines no sensing set-up: no object of servobench.plant.eyes.eye.Eye")
+        raise ConfigurationError(f"{file} defines no sensing set-up: no object of servobench.plant.cameras.eye.Eye")
     first, *_ = found
     wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
     raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")

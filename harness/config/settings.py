@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from servobench.plant.files import read_toml
-from servobench.plant.settings import listed, override, suggest
+from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.settings import listed, override, suggest
 
 Config = TypeVar("Config")
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from types import ModuleType
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.files import reason, user_path
-from servobench.plant.settings import suggest
+from servobench.plant.contract.files import reason, user_path
+from servobench.plant.contract.settings import suggest
 
 PACKAGE = "servobench"
 PACKAGES = "site-packages"  # folder of installed packages, which may lie below that of a user's file

@@ -8,11 +8,11 @@ from typing import Any, final
 import numpy as np
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import PlantDiverged
-from servobench.plant.plant import ImageArray, TrueModel
-from servobench.plant.signals import PlantSpec, Truth
-from servobench.plant.world import World
+from servobench.plant.bench.plant import ImageArray, TrueModel
+from servobench.plant.bench.world import World
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import PlantDiverged
+from servobench.plant.contract.signals import PlantSpec, Truth
 
 
 @final

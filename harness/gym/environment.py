@@ -17,11 +17,11 @@ from servobench.harness.gym.view import Floats32, View
 from servobench.harness.run.experiment import Experiment, build, check_possible
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
-from servobench.plant.eyes.registry import DEFAULT_SENSING
-from servobench.plant.faults import FeatureLost, RunFault
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.faults import FeatureLost, RunFault
+from servobench.plant.contract.seeds import named_seed
+from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.seeds import named_seed
-from servobench.plant.signals import Command, Observation
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none
 PLACEHOLDER: Final = "constant"  # the harness builds every run with a controller; this one costs least

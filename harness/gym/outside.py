@@ -12,7 +12,7 @@ from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.drawn import Drawn
 from servobench.harness.run.request import RunRequest
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.overview import Overview
 from servobench.plant.rendered.room import Room

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
 
-from servobench.plant.checks import FloatArray, as_array
-from servobench.plant.lanes import norm
-from servobench.plant.signals import Observation, PlantSpec, Truth
+from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.signals import Observation, PlantSpec, Truth
 
 Floats32: TypeAlias = npt.NDArray[np.float32]
 FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors are clipped

@@ -24,10 +24,10 @@ from servobench.harness.pictures.encoder import GIF, MP4, encoding, find_ffmpeg
 from servobench.harness.pictures.panels import mark_settling_band, plain_logarithms
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
 from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import suggest
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.robot.ur5 import BALL_RADIUS
-from servobench.plant.settings import suggest
 
 SNAPSHOTS = "snapshots"
 KINDS = (MP4, GIF, SNAPSHOTS)

@@ -17,7 +17,7 @@ from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.style import MethodStyle, method_styles
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, longest
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 MOST_POINTS = 150  # of a path; more cannot be told apart
 MOST_VIEWS = 24  # plant, mismatch and task

@@ -18,8 +18,8 @@ from servobench.harness.analysis.loops.margins import loci
 from servobench.harness.pictures.draw import picture_of, save_figure
 from servobench.harness.pictures.panels import Styles, add_legend, plain_logarithms
 from servobench.harness.pictures.style import figure_style, method_styles
-from servobench.plant.checks import FloatArray
-from servobench.plant.files import write_atomically
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.files import write_atomically
 
 PAGE = "analyse.html"
 FIGURES = "figures"

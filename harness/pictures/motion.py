@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from servobench.harness.pictures.panels import add_legend
 from servobench.harness.pictures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, TEXT, VERMILION, WIDE, Layout
 from servobench.harness.pictures.tracks import Track, Tracks, each, longest
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 COMMAND: Final = "joint_velocity_command_"
 JOINTS: Final = (

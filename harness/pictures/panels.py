@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from servobench.harness.pictures.ensembles import BAND, Ensemble, quantile
 from servobench.harness.pictures.style import TEXT, WIDE, Layout, MethodStyle, fitted
 from servobench.harness.pictures.tracks import Track, Tracks, label_of, longest
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 ENDED, END = "run ended early", "|"  # and its marker, which no method has
 SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from servobench.harness.pictures.panels import DESIRED, END_MARK, LETTER, Styles, add_legend
 from servobench.harness.pictures.style import WIDE, Layout, divisions
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 COLUMNS: Final = 2
 SINGLE: Final = 3.6  # [in] width of the only view of a wide figure

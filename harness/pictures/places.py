@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from servobench.harness.analysis.statistics import Estimate
 from servobench.harness.pictures.style import TEXT, MethodStyle
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
 UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands

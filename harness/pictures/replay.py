@@ -21,8 +21,9 @@ from servobench.harness.config.engines import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
 from servobench.plant.rendered.overview import Overview
 from servobench.plant.rendered.room import Room
@@ -30,7 +31,6 @@ from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.robot import Robot
-from servobench.plant.seeds import named_seed
 
 JOINT = re.compile(r"joint_position_.+_rad")  # a column of steps
 SEEN_DEPTH = 0.05  # m behind a surface that still counts as seen: the trail begins within the ball

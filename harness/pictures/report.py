@@ -34,8 +34,8 @@ from servobench.harness.pictures.interactive import error_curves, path_views, ro
 from servobench.harness.pictures.sheet import breakable, marked, sheet
 from servobench.harness.pictures.style import NARROW, TEXT, WIDE, Layout, figure_style, method_styles
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
-from servobench.plant.eyes.registry import DEFAULT_SENSING
-from servobench.plant.files import write_atomically
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.files import write_atomically
 
 NAME: Final = "report.html"
 TEMPLATE: Final = "report.html.j2"

@@ -12,7 +12,7 @@ import matplotlib as mpl
 import numpy as np
 
 from servobench.controllers.methods import METHODS, PUBLISHED
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 # Okabe and Ito's palette, distinguishable with every kind of colour vision.
 BLUE, ORANGE, GREEN, VERMILION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"

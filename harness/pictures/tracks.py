@@ -15,7 +15,7 @@ from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.ending import COMPLETED
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 FEATURE = "feature_"
 LONG = 6000  # [rows] of a run that is not drawn row by row

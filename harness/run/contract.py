@@ -15,10 +15,10 @@ import numpy as np
 from servobench.controllers.controller import Controller, Diagnostics
 from servobench.controllers.servo import ServoController
 from servobench.harness.run.ending import WrongAnswer
-from servobench.plant.bench import Bench
-from servobench.plant.checks import FloatArray
-from servobench.plant.plant import Plant
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import Plant
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second look
 

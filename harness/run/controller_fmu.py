@@ -28,9 +28,9 @@ from servobench.harness.config.settings import ConfigurationError, Settings, fla
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import RunFault
-from servobench.plant.signals import Observation, trusted_observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.signals import Observation, trusted_observation
 
 REFERENCE_PERIODS: Final = 200  # of the run inside the FMU, at most
 TOLERANCE: Final = 1e-9

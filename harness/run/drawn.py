@@ -10,10 +10,10 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.plausible import check_times
 from servobench.harness.run.resolved import ResolvedRun
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
-from servobench.plant.eyes.draws import CameraDraws
+from servobench.plant.cameras.draws import CameraDraws
+from servobench.plant.contract.seeds import named_seed
 from servobench.plant.robot.mismatch import MismatchSample, sample_mismatch
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.seeds import named_seed
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple
 
 from servobench.harness.config.registry import plugin_packages
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.faults import RunFault
+from servobench.plant.contract.faults import RunFault
 
 COMPLETED = "completed"
 NUMERICAL_ERROR = "numerical_error"

@@ -28,8 +28,8 @@ from servobench.harness.run.side_by_side import AllEnded, Ends, ManyBenches, Man
 from servobench.harness.run.tasks import Scenario
 from servobench.harness.run.threads import careful
 from servobench.harness.run.together import Together, build_together
-from servobench.plant.checks import FloatArray
-from servobench.plant.plant import ImageArray
+from servobench.plant.bench.plant import ImageArray
+from servobench.plant.contract.checks import FloatArray
 
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
 

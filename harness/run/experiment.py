@@ -24,15 +24,15 @@ from servobench.harness.run.plausible import check_joints, check_reach
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import Scenario, TaskSetting
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.registry import DEFAULT_SENSING
-from servobench.plant.faults import RunFault
+from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.seeds import named_seed
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.seeds import named_seed
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +230,7 @@ def _equations(model: SensedArm | None) -> TrueModel:
         raise ValueError("model must be given for a controller that needs the truth, got None")
 
     def symbolic(joint_position: Any) -> Any:  # noqa: ANN401 - expressions of CasADi
-        from servobench.plant.eyes.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
+        from servobench.plant.cameras.symbolic import symbolic_feature  # noqa: PLC0415 - only the extra mpc brings CasADi
 
         return symbolic_feature(model)(joint_position)
 

@@ -14,10 +14,10 @@ from servobench.controllers.sight import Sight
 from servobench.controllers.units import in_natural_units
 from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.request import RunSettings
-from servobench.plant.eyes.model import EyeModel
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.signals import PlantSpec
 
 
 def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:

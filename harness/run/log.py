@@ -16,10 +16,10 @@ import numpy.typing as npt
 import pandas as pd
 
 from servobench.controllers.controller import Diagnostics
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import RunFault
-from servobench.plant.lanes import norm
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 JOINT_UNIT = "rad"
 

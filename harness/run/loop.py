@@ -18,10 +18,10 @@ import numpy as np
 
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import StepLog
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FeatureLost
-from servobench.plant.plant import Plant
-from servobench.plant.seeds import Seeds, named_seed
+from servobench.plant.bench.plant import Plant
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FeatureLost
+from servobench.plant.contract.seeds import Seeds, named_seed
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,8 +31,8 @@ import numpy.typing as npt
 
 from servobench.harness.run.log import Steps
 from servobench.harness.run.references import TaskKind
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm, transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm, transposed
 
 SETTLING_SHARE = 0.05  # band as a share of the initial error
 DWELL = 0.5  # [s] least time within the band at the end of a run

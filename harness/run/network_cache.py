@@ -11,8 +11,8 @@ from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.harness.run.threads import one_thread
-from servobench.plant.cache import cache_folder, cached
-from servobench.plant.signals import PlantSpec
+from servobench.plant.contract.cache import cache_folder, cached
+from servobench.plant.contract.signals import PlantSpec
 
 NETWORKS = "networks"
 FILE = "networks.npz"

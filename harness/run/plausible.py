@@ -17,14 +17,14 @@ from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolved import ResolvedRun
 from servobench.harness.run.task_settings import PointTask
 from servobench.harness.run.tasks import TASKS, Scenario, find_task
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.robot import Robot
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.signals import PlantSpec
 
 ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be whatever the mismatch
 POINTS: Final = 12  # of a curve that are looked at

@@ -9,9 +9,9 @@ from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
 from servobench.harness.run.references import Reference
 from servobench.harness.run.views import View
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.lanes import norm
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.sensed import SensedArm
 
 

@@ -25,11 +25,11 @@ import numpy as np
 from annotated_types import Gt, Le
 from scipy.spatial.transform import Rotation
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import Positive, settings
 from servobench.plant.robot.pose_inverse import reach_pose
 from servobench.plant.robot.robot import Robot
-from servobench.plant.settings import Positive, settings
 
 REACHED: Final = 1e-6  # of the error that `reach_pose` returns
 SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)  # of D that are tried

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.harness.run.log import column_unit
-from servobench.plant.checks import FloatArray, check_number
-from servobench.plant.files import reason
-from servobench.plant.signals import Channel
+from servobench.plant.contract.checks import FloatArray, check_number
+from servobench.plant.contract.files import reason
+from servobench.plant.contract.signals import Channel
 
 TaskKind: TypeAlias = Literal["point_to_point", "curve"]
 """Whether a task's reference is a fixed target or moves."""

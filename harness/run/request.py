@@ -14,9 +14,9 @@ from servobench.harness.config.engines import engine_of
 from servobench.harness.config.registry import FORMER_NAMES
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.eyes.registry import DEFAULT_SENSING, FIXED
+from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
+from servobench.plant.contract.settings import NonNegative, Positive, ShareBelowOne, settings
 from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.settings import NonNegative, Positive, ShareBelowOne, settings
 
 UNFIT_FOR_FILES = re.compile(r"[^A-Za-z0-9.=+_-]")
 NAMES = ("plant", "controller", "task", "robot", "sensing")  # fields of a request that are texts

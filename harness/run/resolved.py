@@ -21,9 +21,9 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS, find_task
 from servobench.harness.run.teaching import taught
-from servobench.plant.plant import PlantEntry
+from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.sensing import change_sensing, vary_sensing
 from servobench.plant.robot.robot import Robot
-from servobench.plant.sensing import change_sensing, vary_sensing
 
 
 @dataclass(frozen=True)

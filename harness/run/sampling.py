@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.lanes import norm
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.robot import Robot
 
 DRAWN_AT_ONCE: Final = 256

@@ -18,10 +18,10 @@ from servobench.harness.run.log import JOINT_UNIT, StepLog, column_name
 from servobench.harness.run.loop import LoopSettings, run_loop
 from servobench.harness.run.resolved import ResolvedRun
 from servobench.harness.run.threads import careful
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import RunFault
-from servobench.plant.plant import Plant
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.bench.plant import Plant
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 COMMAND: Final = "joint_velocity_command"
 LOGGED: Final = "logged_"  # before the name of a column with what was commanded when the log was made

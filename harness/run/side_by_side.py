@@ -15,11 +15,11 @@ import numpy.typing as npt
 from servobench.controllers.controller import Controller, Diagnostics
 from servobench.controllers.servo import Servo, ServoState
 from servobench.harness.run.log import StepLog, Steps
-from servobench.plant.bench import Bench
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import take
-from servobench.plant.plant import Plant
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth, trusted_observation
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import Plant
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import take
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
 
 LaneIndex = npt.NDArray[np.intp]
 

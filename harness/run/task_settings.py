@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
+from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER
-from servobench.plant.settings import Count, NonNegative, Number, Positive, settings
 
 Vector: TypeAlias = tuple[float, ...]
 

@@ -32,17 +32,17 @@ from servobench.harness.run.task_settings import (
     WaypointTask,
 )
 from servobench.harness.run.views import TaughtView, in_space
-from servobench.plant.checks import FloatArray, as_vector, check_number
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.files import user_path
-from servobench.plant.lanes import norm
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray, as_vector, check_number
+from servobench.plant.contract.files import user_path
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.seeds import named_generator
+from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.robot.ur5 import MOVES, STRETCHED
-from servobench.plant.seeds import named_generator
-from servobench.plant.settings import suggest
-from servobench.plant.signals import Channel
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
 

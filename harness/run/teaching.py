@@ -12,7 +12,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.run.pose_tasks import PoseTask
 from servobench.harness.run.task_settings import CircleTask, LineTask, PointTask, RandomTask, TargetTask, Vector
 from servobench.harness.run.tasks import TaskEntry
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import Workspace
 

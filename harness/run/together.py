@@ -15,9 +15,9 @@ from servobench.harness.run.drawn import Drawn, draw
 from servobench.harness.run.experiment import assemble, loop_settings
 from servobench.harness.run.loop import LoopSettings
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.plant.bench import Bench
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import stack
+from servobench.plant.bench.bench import Bench
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import stack
 
 
 @dataclass(frozen=True, eq=False)

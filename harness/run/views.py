@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.harness.run.references import Reference
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.robot import Robot
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import parse_magnitudes
 from servobench.plant.robot.mismatch_axes import Magnitude
-from servobench.plant.settings import suggest
 
 MOVE: Final = "camera_move"
 LATENCY: Final = "latency"

@@ -39,7 +39,7 @@ from servobench.harness.pictures.style import TEXT, WIDTH, figure_style, method_
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import check_settings
 from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, NOISE, Line
-from servobench.plant.eyes.registry import DEFAULT_SENSING
+from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.kinematic import KinematicConfig
 
 BASE: Final = "moderate"

@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Final
 
-from servobench.plant.cache import cached
+from servobench.plant.contract.cache import cached
 
 DESCRIPTION: Final = "modelDescription.xml"
 MAX_FILES: Final = 20_000  # in an archive

@@ -17,8 +17,8 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any, Final
 
+from servobench.plant.contract.settings import suggest
 from servobench.plant.fmu.archive import DESCRIPTION
-from servobench.plant.settings import suggest
 
 REAL_TYPES: Final = ("Real", "Float64", "Float32")
 MAX_NUMBERS: Final = 1_000_000  # that a variable holds

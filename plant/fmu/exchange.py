@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Final, Protocol
 
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import FmuDescription
 

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
-from servobench.plant.bench import Bench, build_bench
-from servobench.plant.faults import FmuError
+from servobench.plant.bench.bench import Bench, build_bench
+from servobench.plant.bench.plant import PlantEntry, PlantSetup
+from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import NonNegative, nested, settings
+from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
-from servobench.plant.plant import PlantEntry, PlantSetup
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import NonNegative, nested, settings
-from servobench.plant.timing import RENAMED_DELAY
 
 
 @settings

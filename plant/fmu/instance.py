@@ -17,8 +17,8 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.asked import NOTHING, Asked
 from servobench.plant.fmu.description import FmuDescription, Variable
 from servobench.plant.fmu.exchange import Integrator

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.instance import OK, WARNING, Instance, Kinds, RawCall
 from servobench.plant.fmu.port import Port
 

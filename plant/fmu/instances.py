@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.asked import NOTHING, Asked
 from servobench.plant.fmu.description import FmuDescription
 from servobench.plant.fmu.instance import OK, Instance, RawCall

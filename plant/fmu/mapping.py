@@ -19,11 +19,11 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import MinLen
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.files import read_toml
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.settings import File, Names, Numbers, Positive, Values, nested, override, settings
+from servobench.plant.contract.signals import PlantSpec
 from servobench.plant.fmu.description import FmuDescription, total_size
-from servobench.plant.settings import File, Names, Numbers, Positive, Values, nested, override, settings
-from servobench.plant.signals import PlantSpec
 
 STEP_TOLERANCE: Final = 1e-6  # share of a step by which it may differ from a multiple of the FMU's own
 

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
 
 logger = logging.getLogger("servobench.fmu")
 

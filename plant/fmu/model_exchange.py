@@ -16,7 +16,7 @@ import casadi
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping

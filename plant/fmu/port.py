@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.fmu.description import Variable, total_size
 
 

@@ -6,7 +6,7 @@ import ctypes
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, final
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray, as_array, is_finite, whole_steps
-from servobench.plant.faults import FmuError
+from servobench.plant.bench.plant import TrueModel
+from servobench.plant.bench.world import World
+from servobench.plant.contract.checks import FloatArray, as_array, is_finite, whole_steps
+from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.seeds import Seeds
+from servobench.plant.contract.settings import Names
+from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import Variable, read_description
@@ -28,13 +33,8 @@ from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.fmu.port import Port
 from servobench.plant.fmu.states import FmuState
-from servobench.plant.plant import TrueModel
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.seeds import Seeds
-from servobench.plant.settings import Names
-from servobench.plant.signals import BoolArray, Truth
-from servobench.plant.world import World
 
 SEEN_ABOVE = 0.5  # a number that says whether a feature is seen
 

@@ -7,7 +7,9 @@ from typing import TypeAlias, final
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_generator
+from servobench.plant.contract.signals import Truth
 from servobench.plant.rendered.detection import ByteArray, Detection, Patch, add_colour_noise, draw_detection, find_ball
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.settings import RenderedConfig
@@ -15,8 +17,6 @@ from servobench.plant.rendered.sight import Sight
 from servobench.plant.rendered.window import window_around
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.seeds import named_generator
-from servobench.plant.signals import Truth
 
 Generators: TypeAlias = tuple[np.random.Generator, np.random.Generator]
 """Of the depth and of the colour noise."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.engine import Overlap
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import UR5

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.camera import IntArray, PinholeCamera
 
 ByteArray = npt.NDArray[np.uint8]

@@ -25,10 +25,10 @@ import casadi
 import numpy as np
 from scipy.linalg.lapack import dposv
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import NonNegative, Positive, Share, settings
 from servobench.plant.robot import ur5
 from servobench.plant.robot.robot import Robot
-from servobench.plant.settings import NonNegative, Positive, Share, settings
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera

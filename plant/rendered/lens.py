@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.optics import Optics, ideal_optics, locate
+from servobench.plant.cameras.optics import Optics, ideal_optics, locate
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.robot.camera import PinholeCamera

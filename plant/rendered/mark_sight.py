@@ -12,11 +12,13 @@ from typing import Any, Final, final
 import cv2
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.eyes.optics import Optics, ideal_optics, locate
-from servobench.plant.eyes.placing import CAMERA
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.optics import Optics, ideal_optics, locate
+from servobench.plant.cameras.placing import CAMERA
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_generator
+from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.ball_sight import BallSight, DepthCamera
 from servobench.plant.rendered.detection import OUTLINE, ByteArray, add_colour_noise
 from servobench.plant.rendered.engine import Scene
@@ -27,8 +29,6 @@ from servobench.plant.rendered.sight import Sight
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.seeds import named_generator
-from servobench.plant.signals import BoolArray, Truth
 
 NOWHERE: Final = (0.0, 0.0, 1.0)  # stands for a point that is not found, whose features are not valid
 CROSS: Final = 5  # [px] half size of what marks a point that is found

@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, Patch, largest_patch
 from servobench.plant.rendered.urdf import RED
 from servobench.plant.rendered.urdf_elements import Colour

@@ -7,7 +7,7 @@ from typing import Final, Self
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.camera import PinholeCamera
 
 EYE: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right

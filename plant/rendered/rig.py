@@ -12,8 +12,8 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.eyes.model import EyeModel
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.marks import MARK_COLOURS
 from servobench.plant.rendered.meshes import BALL_MESH
 from servobench.plant.rendered.urdf import BALL_LINK, BASE_PART, DARK_GREY, RED, arm_tree, arm_urdf

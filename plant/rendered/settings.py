@@ -9,14 +9,14 @@ from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Len
 
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, nested, settings
+from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
 from servobench.plant.robot.catalogue import UR5
 from servobench.plant.robot.robot import Robot
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import Count, NonNegative, Number, Positive, nested, settings
-from servobench.plant.timing import RENAMED_DELAY
 
 BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Generic, TypeVar
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.signals import BoolArray, Truth
 
 Model = TypeVar("Model", bound=SensedArm)
 

@@ -14,7 +14,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.meshes import BALL_MESH, rectangles_obj
 from servobench.plant.rendered.urdf_elements import (
     add_joint,

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import rpy_from_rotation
 
 Colour = tuple[float, float, float, float]

@@ -5,7 +5,7 @@ A physics engine (`servobench.plant.rendered.engine`) moves the arm under the dr
 are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link that meets another one, the table, the floor
 or an obstacle ends the run. What is measured, and when it is missing, is in `servobench.plant.rendered.ball_sight` for
 the ball in 3-D and in `servobench.plant.rendered.mark_sight` for other sensing set-ups. Delay, latency and lost frames
-are those of `servobench.plant.bench`.
+are those of `servobench.plant.bench.bench`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from servobench.plant.bench import Bench, build_bench
-from servobench.plant.checks import FloatArray, as_vector, whole_steps
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.faults import Collision, PlantDiverged
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.bench import Bench, build_bench
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.bench.world import World
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
+from servobench.plant.contract.faults import Collision, PlantDiverged
+from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.contact import Contacts
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.rendered.drives import PHYSICS_STEP
@@ -32,8 +34,6 @@ from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import UR5, find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.signals import BoolArray, Truth
-from servobench.plant.world import World
 
 CONTACT_STEPS = 10  # physics steps between two looks for contact, 10 mm at 1 m/s; and at the end of a period
 

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from servobench.plant.checks import FloatArray, as_array, as_vector
+from servobench.plant.contract.checks import FloatArray, as_array, as_vector
 
 CALIBRATION_BLOCKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 

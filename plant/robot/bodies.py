@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
 from servobench.plant.robot.robot import Links
 

@@ -21,8 +21,8 @@ import numpy.typing as npt
 from annotated_types import Gt, Lt
 from scipy.ndimage import convolve1d
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.settings import Count, NonNegative, Positive, settings
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
 PIXEL_CENTRE = (0.0, 1.0)  # [px] sampling point of TinyRenderer, from the pixel's upper left corner
 IntArray: TypeAlias = npt.NDArray[np.intp]

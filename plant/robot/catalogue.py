@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from functools import cache, partial
 from typing import Final
 
-from servobench.plant.files import user_path
+from servobench.plant.contract.files import user_path
+from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.random_arm import MAX_NUMBER, RANDOM_ARM, random_robot
 from servobench.plant.robot.robot import Robot
-from servobench.plant.settings import suggest
 
 UR5: Final = "ur5"
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {

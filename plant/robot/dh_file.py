@@ -20,14 +20,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from servobench.plant.checks import FloatArray, as_vector
-from servobench.plant.files import read_toml
+from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.files import read_toml
+from servobench.plant.contract.settings import Number, Positive, override, settings
 from servobench.plant.robot.arm import SerialArm, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.bodies import estimate_links
 from servobench.plant.robot.limits import JointLimits
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.teaching import find_workspace, with_ball
-from servobench.plant.settings import Number, Positive, override, settings
 
 Column = tuple[Number, ...]
 

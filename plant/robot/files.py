@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.plant.files import user_path
+from servobench.plant.contract.files import user_path
 from servobench.plant.robot.dh_file import read_dh_robot
 from servobench.plant.robot.makers import universal_robot
 from servobench.plant.robot.measured import MAX_DEVIATION, nearest_title, read_calibration

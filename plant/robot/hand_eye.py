@@ -2,7 +2,7 @@
 
 y = R_BCᵀ (p_B(q) − p_BC),          ẏ = J q̇,          J = ∂y/∂q = R_BCᵀ ∂p_B/∂q
 
-The robots of many runs side by side are one model, whose arrays have leading axes (`servobench.plant.lanes.stack`).
+The robots of many runs side by side are one model, whose arrays have leading axes (`plant.contract.lanes.stack`).
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.signals import Channel, PlantSpec
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.limits import JointLimits, narrowed
 from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.signals import Channel, PlantSpec
 
 FEATURE_NAMES = ("x", "y", "z")
 FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
@@ -96,7 +96,7 @@ class HandEyeModel(SensedArm):
 
 @dataclass(frozen=True, eq=False)
 class TrueJacobian:
-    """The Jacobian of a model as a function, of which `servobench.plant.lanes.take` can choose lanes.
+    """The Jacobian of a model as a function, of which `servobench.plant.contract.lanes.take` can choose lanes.
 
     Attributes:
         model: arm and camera.

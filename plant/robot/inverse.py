@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm, plus_diagonal, transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm, plus_diagonal, transposed
 from servobench.plant.robot.arm import SerialArm
 
 STARTS: Final = 16

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray, as_vector
+from servobench.plant.contract.checks import FloatArray, as_vector
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.bodies import at_far_end, cylinder_inertia

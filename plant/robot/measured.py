@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.files import user_path
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.files import user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm, arm_from_calibration
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS

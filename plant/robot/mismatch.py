@@ -5,7 +5,7 @@ magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20m
 `camera_move=90deg`; of cameras that see pixels `focal=10%`, `centre=10px`, `distortion=10%`; of cameras on the hand
 `mount=5deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file (`factory=FILE`;
 without a file, that of one real UR5).
-Words for the sensor (`outliers=40%`; see `servobench.plant.noise.axes`) stand among the axes; they change settings of
+Words for the sensor (`outliers=40%`; see `plant.contract.sensing`) stand among the axes; they change settings of
 the plant and draw no robot.
 
 Links, joint offsets, gear ratios and the three components of the tool offset are each drawn uniformly from plus or
@@ -15,7 +15,7 @@ which therefore stays where it was in the image, and the axis is drawn among tho
 most 45°: a camera tilted further would look from below the table. `camera_move` turns the camera in the same way, by
 exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a random
 stream of its own, so the same seed gives the same directions at all magnitudes. The axes of cameras that see pixels are
-drawn by `servobench.plant.eyes.draws`.
+drawn by `servobench.plant.cameras.draws`.
 """
 
 from __future__ import annotations
@@ -28,16 +28,15 @@ from typing import Self
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray, check_number
-from servobench.plant.noise.axes import SENSOR_AXES, disturbed
+from servobench.plant.contract.checks import FloatArray, check_number
+from servobench.plant.contract.seeds import named_generator
+from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, disturbed
+from servobench.plant.contract.settings import nearest, suggest
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.measured import measured_arm
 from servobench.plant.robot.mismatch_axes import AXES, MAX_SIZE, PROFILES, RANGES, SHARE, Magnitude
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.sensed import SensedArm, turn_about
-from servobench.plant.seeds import named_generator
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import nearest, suggest
 
 MAX_TILT = radians(45.0)
 MAX_MOVE_TILT = radians(30.0)

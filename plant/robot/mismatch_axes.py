@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from math import radians
 from typing import Self
 
-from servobench.plant.noise.axes import SENSOR_AXES
+from servobench.plant.contract.sensing import SENSOR_AXES
 
 ANGLE = {"deg": math.pi / 180.0, "rad": 1.0}
 LENGTH = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}

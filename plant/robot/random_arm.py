@@ -13,12 +13,12 @@ from typing import Final
 
 import numpy as np
 
+from servobench.plant.contract.seeds import named_generator
 from servobench.plant.robot.arm import SerialArm, arm_from_dh
 from servobench.plant.robot.bodies import estimate_links
 from servobench.plant.robot.limits import JointLimits
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.teaching import find_workspace, with_ball
-from servobench.plant.seeds import named_generator
 
 RANDOM_ARM: Final = "random_arm"  # before a colon and the number
 MAX_NUMBER: Final = 1_000_000

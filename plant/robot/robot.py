@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray, as_array
+from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.limits import JointLimits

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import BoolArray, Channel
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.signals import BoolArray, Channel
 
 WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are looked for
 
@@ -19,7 +19,7 @@ WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a postu
 class SensedArm(ABC):
     """An arm and its cameras, y = h(q) and J = ∂h/∂q; pure, over leading axes.
 
-    The robots of many runs side by side are one model, whose arrays have leading axes (`servobench.plant.lanes.stack`).
+    The robots of many runs side by side are one model, whose arrays have leading axes (`plant.contract.lanes.stack`).
     """
 
     arm: SerialArm

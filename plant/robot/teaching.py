@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import norm
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.clearance import Clearance, link_tubes, watched_pairs
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for

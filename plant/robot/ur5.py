@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm, arm_from_calibration, arm_from_dh
 from servobench.plant.robot.hand_eye import HandEyeModel
 

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm, rpy_from_rotation
 from servobench.plant.robot.bodies import at_far_end, estimate_links
 from servobench.plant.robot.limits import JointLimits

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 CENTRE: Final = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
 CAMERA_DISTANCE: Final = 1.3  # [m] from the camera to the workspace's centre, for a UR5

@@ -16,9 +16,9 @@ from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.fit import train
 from servobench.controllers.stages.limit import scale_to_limit
+from servobench.plant.contract.signals import Observation
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
-from servobench.plant.signals import Observation
 
 MODEL = nominal_ur5()
 SLOW, FAST = 0.05, 0.008  # [s] control periods

@@ -10,8 +10,8 @@ from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.defaults import default_config
+from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.arm import arm_from_dh, rotation_from_rpy
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, nominal_ur5

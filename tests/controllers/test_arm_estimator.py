@@ -12,9 +12,9 @@ from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmState
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.sight import Sight
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import FilterDiverged
-from servobench.plant.lanes import stack, take
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import stack, take
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
 from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
 

@@ -10,8 +10,8 @@ from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.methods import METHODS, compose
-from servobench.plant.lanes import take
-from servobench.plant.signals import trusted_observation
+from servobench.plant.contract.lanes import take
+from servobench.plant.contract.signals import trusted_observation
 
 LANES, PERIODS = 3, 50
 KNOWING = dataclasses.replace(

@@ -25,7 +25,7 @@ from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.controllers.servo import ServoController
 from servobench.harness.check.controllers import ControllerChecks
 from servobench.harness.config.defaults import default_config
-from servobench.plant.signals import Observation
+from servobench.plant.contract.signals import Observation
 
 PAIRS = [compose("pid", estimator) for estimator in ESTIMATORS] + [compose(law, "kalman") for law in LAWS]
 COMPOSED = [pytest.param(entry, id=entry.name) for entry in dict.fromkeys([*METHODS.values(), *PAIRS])]

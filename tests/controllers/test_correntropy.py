@@ -10,7 +10,7 @@ from servobench.controllers.estimators.imcckf import ImcckfConfig, imcckf_estima
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
 from servobench.controllers.estimators.mckf import MckfConfig, mckf_estimator
 from servobench.controllers.estimators.rmckf import RmckfConfig, rmckf_estimator
-from servobench.plant.faults import FilterDiverged
+from servobench.plant.contract.faults import FilterDiverged
 
 M, N, WALK, NOISE = 3, 4, 0.09, 0.001
 FILTERS = {

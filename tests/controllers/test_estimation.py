@@ -12,7 +12,7 @@ from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.stages.estimation import Estimation
-from servobench.plant.signals import Observation
+from servobench.plant.contract.signals import Observation
 
 TURN = Rotation.from_rotvec(np.radians(120.0) * np.array([0.36, 0.48, 0.8])).as_matrix()
 NONE = Delays(0.0, 0.0, 0.0)

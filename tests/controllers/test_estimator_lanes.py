@@ -9,8 +9,8 @@ from kit.toy import KNOWLEDGE, PERIOD, M, N, jacobian_network, only_jacobian
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.parts import ESTIMATORS
-from servobench.plant.lanes import branch
-from servobench.plant.signals import trusted_observation
+from servobench.plant.contract.lanes import branch
+from servobench.plant.contract.signals import trusted_observation
 
 LANES, PERIODS = 3, 70
 NETWORK = jacobian_network(N, M, units=5)

@@ -20,7 +20,7 @@ from servobench.controllers.estimators.kalman import (
 )
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
 from servobench.controllers.estimators.ukf import UkfConfig, sigma_weights, ukf_estimator, unscented_update
-from servobench.plant.faults import FilterDiverged
+from servobench.plant.contract.faults import FilterDiverged
 
 LEARNING = [
     BroydenEstimator(BroydenConfig(step_factor=1.0)),

@@ -10,11 +10,11 @@ from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig, initial_jacobian
 from servobench.controllers.methods import compose
-from servobench.plant.faults import ControllerDiverged
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.faults import ControllerDiverged
+from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import nominal_ur5
-from servobench.plant.signals import Command, Observation
 
 START = np.array([0.35, -1.69, -2.34, 0.89, 1.22, 0.0])
 

@@ -6,7 +6,7 @@ import pytest
 from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, Commanding, M, N, networks
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.parts import LAWS
-from servobench.plant.signals import trusted_observation
+from servobench.plant.contract.signals import trusted_observation
 
 LANES, PERIODS = 3, 60
 TIGHT = {"joint_acceleration_limit": 6.0, "view_tangent": (0.5, 0.4)}

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from servobench.controllers.rotation import nearest_rotation
 from servobench.controllers.stages.map_bank import fresh_bank, map_update, near_rotation
-from servobench.plant.faults import FilterDiverged
+from servobench.plant.contract.faults import FilterDiverged
 
 FRAME = 0.49  # σ²
 

@@ -14,8 +14,8 @@ from servobench.controllers.laws.mpc.closed_form import UnlimitedPlan, horizon_i
 from servobench.controllers.laws.mpc.limits import exceeds, view_rows
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape
-from servobench.plant.faults import SolverFailed
-from servobench.plant.lanes import stack
+from servobench.plant.contract.faults import SolverFailed
+from servobench.plant.contract.lanes import stack
 
 
 def make_spec(n=6, m=3, **limits):

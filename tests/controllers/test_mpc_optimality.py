@@ -10,7 +10,7 @@ from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimate import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
-from servobench.plant.signals import trusted_observation
+from servobench.plant.contract.signals import trusted_observation
 
 LANES, N, M, PREVIEW = 6, 4, 3, 40
 BLOCK = 0.05  # [s]

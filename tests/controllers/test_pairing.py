@@ -12,7 +12,7 @@ from servobench.controllers.controller import Delays
 from servobench.controllers.estimators.fixed import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.pairing import Pairing
-from servobench.plant.signals import Observation
+from servobench.plant.contract.signals import Observation
 
 TURN = Rotation.from_rotvec(np.radians(120.0) * np.array([0.36, 0.48, 0.8])).as_matrix()
 NETWORK = dataclasses.replace(jacobian_network(N, M, units=6), weights=0.3 * jacobian_network(N, M, units=6).weights)

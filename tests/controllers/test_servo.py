@@ -15,7 +15,7 @@ from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.servo import Servo, ServoController
-from servobench.plant.faults import ControllerDiverged
+from servobench.plant.contract.faults import ControllerDiverged
 
 J0 = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])
 KNOWLEDGE = RobotKnowledge(plant_spec(3, 2, reach=1.0), 1, nominal_jacobian=lambda q: J0)

@@ -1,4 +1,4 @@
-"""Every bound of a setting is kept; how a bad value is refused is tested with `servobench.plant.settings`."""
+"""Every bound of a setting is kept; how a bad value is refused is tested with `servobench.plant.contract.settings`."""
 
 import math
 
@@ -24,7 +24,7 @@ from servobench.controllers.laws.pid import PidConfig
 from servobench.controllers.laws.rbfnn import RbfnnConfig
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.nmpc_calibrated import NmpcCalibratedConfig
-from servobench.plant.settings import override
+from servobench.plant.contract.settings import override
 
 
 def bad(config, **values):

@@ -15,12 +15,12 @@ from servobench.controllers.sight import Sight, of_points, seen_through, through
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.sight_map import ENTRIES, SightBank, near_turn, sight_update, turn_deviation
 from servobench.controllers.units import in_natural_units
-from servobench.plant.eyes.registry import Sensing
-from servobench.plant.faults import FilterDiverged
+from servobench.plant.cameras.registry import Sensing
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.signals import Observation
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.signals import Observation
 
 FRAME = 0.3  # σ²
 K = 4

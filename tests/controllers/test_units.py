@@ -10,7 +10,7 @@ import pytest
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.networks.samples import WEAKEST
 from servobench.controllers.units import in_natural_units
-from servobench.plant.signals import Channel, PlantSpec
+from servobench.plant.contract.signals import Channel, PlantSpec
 
 
 def knowledge(scale, **more):

@@ -13,12 +13,12 @@ import pytest
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL
-from servobench.plant.bullet.bullet_plant import build_bullet
-from servobench.plant.bullet.mechanics import Mechanics
-from servobench.plant.faults import PlantDiverged
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.faults import PlantDiverged
+from servobench.plant.contract.signals import Command
+from servobench.plant.rendered.bullet.bullet_plant import build_bullet
+from servobench.plant.rendered.bullet.mechanics import Mechanics
 from servobench.plant.rendered.drives import PHYSICS_STEP
-from servobench.plant.signals import Command
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_closing_disconnects_and_may_be_repeated():
 
 
 def test_naming_the_plant_does_not_load_pybullet():
-    code = "import sys, servobench.plant.bullet.bullet_plant; sys.exit('pybullet' in sys.modules)"
+    code = "import sys, servobench.plant.rendered.bullet.bullet_plant; sys.exit('pybullet' in sys.modules)"
     root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 

@@ -22,7 +22,7 @@ from servobench.harness.run.ending import STATUSES
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS
-from servobench.plant.faults import RunFault
+from servobench.plant.contract.faults import RunFault
 from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.robot.mismatch import Mismatch

@@ -12,7 +12,7 @@ import pytest
 
 from kit.foreign_fmu import build_crane, describe_exchange
 from servobench.fmus.ur5_plant import cached_fmu
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.fmu.world import FmuWorld
 

@@ -15,17 +15,17 @@ import pytest
 from kit.foreign_fmu import build_crane, describe_with
 from servobench.fmus.compile import this_platform
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
-from servobench.plant.bench import Bench
-from servobench.plant.cache import cache_folder
-from servobench.plant.faults import FmuError
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.cache import cache_folder
+from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.fmu_plant import FmuConfig, mapped_entry
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.fmu.world import FmuWorld
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.signals import Command
 
 QUIET = FmuConfig(0.0, SensingConfig(0.0))
 START = np.array([0.3, 1.2])

@@ -25,11 +25,11 @@ from kit.plants import configure, mismatched
 from servobench.fmus.export import arm_layout, default_actuation
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.fmus.variables import parameters_of
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.ur5 import HOME
-from servobench.plant.signals import Command
 
 PERIOD = 0.05
 STEPS = 1000

@@ -77,7 +77,7 @@ def test_a_wheel_that_lacks_a_file_or_holds_others_is_refused(files, tmp_path):
         for name in wheel.namelist():
             if name != "servobench/py.typed":
                 made.writestr(name, wheel.read(name).replace(b"text/markdown", b"text/plain"))
-        made.writestr("plant/signals.py", "")
+        made.writestr("plant/contract/signals.py", "")
         made.writestr("servobench/tests/test_it.py", "")
     assert release.faults_of_wheel(broken) == [
         f"{broken.name} lacks servobench/py.typed",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kit.rendered import HOME, IDEAL, MODEL, geared_ur5, wiggle
-from servobench.plant.signals import Command
+from servobench.plant.contract.signals import Command
 
 
 def test_another_process_sees_the_same_bits(open_plant, engine):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL, geared_ur5
-from servobench.plant.faults import Collision, FeatureLost
+from servobench.plant.contract.faults import Collision, FeatureLost
+from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
-from servobench.plant.signals import Command
 
 
 def turn(plant, joint_velocity, periods) -> None:

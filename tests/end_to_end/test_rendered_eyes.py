@@ -8,17 +8,17 @@ import pytest
 from kit.rendered import IDEAL
 from servobench.harness.config.engines import scene_of
 from servobench.harness.config.registry import find_plant
-from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.registry import Sensing
-from servobench.plant.faults import FeatureLost
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.registry import Sensing
+from servobench.plant.contract.faults import FeatureLost
+from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.mark_sight import open_sight
 from servobench.plant.rendered.rig import Rig
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import rendered_config
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.signals import Command
 
 UR5 = find_robot("ur5")
 HOME = UR5.workspace.home

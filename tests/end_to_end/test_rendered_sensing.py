@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
-from servobench.plant.faults import FeatureLost
+from servobench.plant.contract.faults import FeatureLost
+from servobench.plant.contract.signals import Command
 from servobench.plant.rendered import ball_sight
 from servobench.plant.rendered.ball_sight import DepthCamera
 from servobench.plant.rendered.detection import RED_RANGE, find_patch, locate_ball
@@ -13,7 +14,6 @@ from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.window import MARGIN, whole, window_around
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
-from servobench.plant.signals import Command
 
 BOXED = RenderedConfig(obstacles=((0.45, 0.05, 0.5, 0.1, 0.1, 0.1),))
 FLANGE_DOWN = np.array([np.pi, -1.6, 1.9, -1.87, -np.pi / 2, 0.0])

@@ -9,14 +9,14 @@ import pytest
 from servobench.fmus.export import ExportOptions, default_actuation, export_fmu
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
 from servobench.fmus.validate import validate_fmu
-from servobench.plant.eyes.registry import Sensing
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.registry import Sensing
+from servobench.plant.contract.lanes import stack
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.lanes import stack
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.signals import Command
 
 UR5 = find_robot("ur5")
 HOME = UR5.workspace.home

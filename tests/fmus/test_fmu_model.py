@@ -19,14 +19,14 @@ from servobench.fmus.export import default_actuation
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
-from servobench.plant.faults import FmuError
+from servobench.plant.contract.faults import FmuError
+from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description
 from servobench.plant.fmu.instances import open_instance
 from servobench.plant.fmu.port import Port
 from servobench.plant.kinematic import ENTRY as KINEMATIC
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.signals import Command
 
 VERSIONS = [2, 3]
 
@@ -227,9 +227,9 @@ CONTINUE = """
 import pickle, sys
 import numpy as np
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.plant import PlantSetup
-from servobench.plant.signals import Command
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.signals import Command
 version, setup, state = pickle.load(sys.stdin.buffer)
 sensing = SensingConfig(latency=0.1, drop_probability=0.1)
 plant = ENTRY.build(Ur5FmuConfig(fmi_version=version, sensing=sensing), setup)

@@ -17,7 +17,7 @@ from servobench.fmus.trace.array import NotTraceable, Traced
 from servobench.fmus.trace.faults import NOT_DEFINITE, NOT_FINITE, frame
 from servobench.fmus.trace.namespace import recording
 from servobench.fmus.trace.record import record
-from servobench.plant import lanes
+from servobench.plant.contract import lanes
 
 GENERATOR = np.random.default_rng(0)
 

@@ -13,9 +13,9 @@ from kit.broken_controllers import BROKEN, NOTED
 from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
 from servobench.harness.check.controllers import check_controller
+from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import ENTRY as KINEMATIC
-from servobench.plant.plant import PlantEntry
-from servobench.plant.signals import Command
 
 COUNT = itertools.count()
 

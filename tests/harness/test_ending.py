@@ -14,8 +14,8 @@ from servobench.controllers.controller import Controller
 from servobench.harness.batch import results
 from servobench.harness.run.ending import Ending, log_entry
 from servobench.harness.run.episode import RunResult
-from servobench.plant.faults import FilterDiverged, RunFault
-from servobench.plant.signals import Command
+from servobench.plant.contract.faults import FilterDiverged, RunFault
+from servobench.plant.contract.signals import Command
 
 SHORT = {"exp2": {"duration": 0.5}, "random": {"duration": 0.5}}
 

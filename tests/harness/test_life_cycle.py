@@ -24,10 +24,10 @@ from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
-from servobench.plant import lanes
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract import lanes
+from servobench.plant.contract.signals import Command
 from servobench.plant.robot.ur5 import HOME
-from servobench.plant.signals import Command
 
 LANES = 3
 MODELS = [mismatched("severe+gear_ratio=5%", seed) for seed in range(LANES)]

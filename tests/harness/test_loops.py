@@ -19,9 +19,9 @@ from servobench.harness.analysis.loops.matrices import StateSpace, closed_loop, 
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.signals import Command
 
 PERIOD = 0.05
 JACOBIAN = np.random.default_rng(0).normal(size=(3, 6))

@@ -10,7 +10,7 @@ import pytest
 
 from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import judge_run
-from servobench.plant.signals import PlantSpec
+from servobench.plant.contract.signals import PlantSpec
 
 PERIOD, LIMITS, BAND = 0.1, (1.0, 2.0), 0.005
 EVALUATED, LAP = 2.5, 1.1  # [s]; laps end between two rows

@@ -10,8 +10,8 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.controllers.networks.fit import train
 from servobench.harness.run import network_cache
 from servobench.harness.run.network_cache import NETWORKS, network_source
-from servobench.plant import cache
-from servobench.plant.cache import cache_folder
+from servobench.plant.contract import cache
+from servobench.plant.contract.cache import cache_folder
 
 SPEC = plant_spec(2, 2)
 CONFIG = TrainingConfig(

@@ -12,9 +12,9 @@ from servobench.harness.run.references import FixedPoint
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.tasks import SINGULAR, Scenario
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), np.full(2, 2.0), np.full(2, -3.0), np.full(2, 3.0), period=0.1)
 STOP, FREE, FAR, NEAR = 3.0, 2.9, 1.0, 0.001

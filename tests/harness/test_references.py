@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from servobench.harness.run.references import FixedPoint, Laps, Waypoints, line, read_waypoints
+from servobench.plant.contract.signals import Channel
 from servobench.plant.robot.hand_eye import FEATURE
-from servobench.plant.signals import Channel
 
 CENTRE = np.array([0.1, -0.2, 1.2])
 

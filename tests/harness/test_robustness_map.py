@@ -22,7 +22,7 @@ from servobench.harness.studies.robustness import (
     predicted_limits,
     settling_median,
 )
-from servobench.plant.noise.axes import SENSOR_AXES
+from servobench.plant.contract.sensing import SENSOR_AXES
 from servobench.plant.robot.mismatch_axes import Magnitude
 
 

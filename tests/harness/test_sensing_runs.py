@@ -27,13 +27,13 @@ from servobench.harness.run.pose_tasks import PoseTask, displaced, pose_start
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
 from servobench.harness.run.views import View
-from servobench.plant.bench import Bench
-from servobench.plant.eyes.model import EyeModel
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.pose_inverse import reach_pose
-from servobench.plant.signals import Command
 
 PIXEL_WORDS = ["pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand"]
 
@@ -280,7 +280,7 @@ def test_an_arm_of_four_joints_sees_with_the_others(tmp_path):
 
 OWN = """
 import numpy as np
-from servobench.plant.eyes.eye import Eye
+from servobench.plant.cameras.eye import Eye
 
 
 def measure(points, optics):

@@ -6,8 +6,8 @@ from typing import Literal
 import pytest
 
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
-from servobench.plant.checks import check_number
-from servobench.plant.settings import Positive, nested, settings
+from servobench.plant.contract.checks import check_number
+from servobench.plant.contract.settings import Positive, nested, settings
 
 
 @settings

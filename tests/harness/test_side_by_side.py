@@ -12,7 +12,7 @@ from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
 from servobench.harness.run.together import side_by_side_key
-from servobench.plant.faults import FilterDiverged
+from servobench.plant.contract.faults import FilterDiverged
 
 ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}}, "random": {"duration": 2.5}}
 PROBED = {"mfac+rls": {"initial": {"source": "probe", "settle_periods": 3, "average_periods": 1}}}

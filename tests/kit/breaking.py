@@ -46,7 +46,7 @@ from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import network_cache
 from servobench.harness.run.network_cache import NETWORKS, network_source
-from servobench.plant import cache
+from servobench.plant.contract import cache
 from servobench.plant.fmu.archive import extract_fmu
 
 SOURCE = Path(__file__).with_name("break_files.c")

@@ -18,7 +18,7 @@ from servobench.harness.run.controller_fmu import controller_model
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
-from servobench.plant.signals import Command, Observation
+from servobench.plant.contract.signals import Command, Observation
 
 PERIODS = 120
 TASKS = {"rbfnn_mfac:published": "random"}

@@ -24,7 +24,7 @@ from servobench.harness.batch.lock import LOCK, current_holder, locked
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.episode import RunResult
 from servobench.harness.studies.tuning.ledger import Ledger
-from servobench.plant import cache as entries
+from servobench.plant.contract import cache as entries
 
 SCORES = {"objective": 3, "robots": 2}
 LEDGER = json.dumps(SCORES) + '\n{"settings": {"law": {"gain": 1.5}}, "costs": [0.5, 2]}\n'

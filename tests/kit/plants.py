@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from servobench.harness.config.registry import plant_names
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
-from servobench.plant.sensing import SensingConfig
 
 NEEDS_BULLET = pytest.mark.skipif(
     find_spec("pybullet") is None, reason="PyBullet is not installed; from Python 3.12 on it has no wheel"

@@ -4,13 +4,13 @@ import numpy as np
 
 from kit.plants import configure
 from servobench.harness.config.registry import find_plant
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.signals import Command
 
 HOME = np.array(ur5.HOME)
 BARE = RenderedConfig(scenery=False)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from servobench.harness.run.log import StepLog
-from servobench.plant.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x", "y"), np.full(2, 2.0), np.full(2, -9.0), np.full(2, 9.0), period=1.0)
 X = (0.0, 0.5, 1.0, 1.0)

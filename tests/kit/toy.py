@@ -12,7 +12,7 @@ from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 from servobench.controllers.stages.finish import Finish
-from servobench.plant.signals import Observation, PlantSpec
+from servobench.plant.contract.signals import Observation, PlantSpec
 
 N, M, PERIOD, PREVIEW, LIMIT = 5, 3, 0.05, 10, 1.0
 

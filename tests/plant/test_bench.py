@@ -7,12 +7,12 @@ import pickle
 import numpy as np
 import pytest
 
-from servobench.plant.bench import Bench
-from servobench.plant.faults import FeatureLost
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.world import World
+from servobench.plant.contract.faults import FeatureLost
+from servobench.plant.contract.sensing import SensingConfig, can_vary_sensing, vary_sensing
+from servobench.plant.contract.signals import Command, PlantSpec, Truth
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.sensing import SensingConfig, can_vary_sensing, vary_sensing
-from servobench.plant.signals import Command, PlantSpec, Truth
-from servobench.plant.world import World
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), [1.0, 0.5], [-9.0, -9.0], [9.0, 9.0], 0.1)
 QUIET = SensingConfig(0.0)

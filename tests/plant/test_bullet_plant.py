@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kit.plants import NEEDS_BULLET, configure
-from servobench.plant.bullet.bullet_plant import build_bullet
-from servobench.plant.plant import PlantSetup
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.rendered.bullet.bullet_plant import build_bullet
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm

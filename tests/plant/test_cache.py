@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from servobench.plant import cache
-from servobench.plant.cache import MAX_AGE, MAX_ENTRIES, MIN_AGE, cache_folder, cached, is_whole
+from servobench.plant.contract import cache
+from servobench.plant.contract.cache import MAX_AGE, MAX_ENTRIES, MIN_AGE, cache_folder, cached, is_whole
 
 
 @pytest.fixture(autouse=True)

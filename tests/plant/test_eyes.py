@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS
-from servobench.plant.eyes.draws import draw_cameras
-from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.model import NEAREST, EyeModel
-from servobench.plant.eyes.optics import Optics, in_image, locate, project
-from servobench.plant.eyes.placing import CAMERA, HAND_DISTANCE
-from servobench.plant.eyes.registry import EYES, FIXED, HAND, Sensing
-from servobench.plant.eyes.symbolic import symbolic_feature
-from servobench.plant.lanes import stack
+from servobench.plant.cameras.draws import draw_cameras
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.model import NEAREST, EyeModel
+from servobench.plant.cameras.optics import Optics, in_image, locate, project
+from servobench.plant.cameras.placing import CAMERA, HAND_DISTANCE
+from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
+from servobench.plant.cameras.symbolic import symbolic_feature
+from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from servobench.plant.cache import cache_folder
+from servobench.plant.contract.cache import cache_folder
 from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description

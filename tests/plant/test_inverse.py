@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from servobench.plant.lanes import stack
+from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.inverse import CLOSE_ENOUGH, closest_distance

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.eyes.eye import Eye
-from servobench.plant.eyes.optics import Optics, ideal_optics, locate, project
-from servobench.plant.eyes.placing import CAMERA
-from servobench.plant.eyes.registry import EYES
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.optics import Optics, ideal_optics, locate, project
+from servobench.plant.cameras.placing import CAMERA
+from servobench.plant.cameras.registry import EYES
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.lens import Lens, as_planned
 from servobench.plant.rendered.mark_sight import needs_depth

@@ -11,13 +11,12 @@ import pytest
 from scipy import stats
 
 from kit.plants import configure, mismatched, setup
+from servobench.plant.bench import noise_families as families
+from servobench.plant.bench.spells import Spell, begin_probability
+from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, without_disturbance
+from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.noise import families
-from servobench.plant.noise.axes import SENSOR_AXES
-from servobench.plant.noise.spells import Spell, begin_probability
 from servobench.plant.robot.mismatch import Mismatch, parse_magnitudes
-from servobench.plant.sensing import SensingConfig, without_disturbance
-from servobench.plant.signals import Command
 
 COUNT = 20_000
 LEVEL = 1e-3  # of a Kolmogorov-Smirnov test: the seeds are fixed, so it passes for ever or never

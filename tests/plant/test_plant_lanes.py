@@ -10,13 +10,13 @@ import pytest
 
 from kit.plants import configure, mismatched
 from servobench.harness.config.registry import find_plant
-from servobench.plant import lanes
-from servobench.plant.faults import PlantDiverged
+from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.contract import lanes
+from servobench.plant.contract.faults import PlantDiverged
+from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
-from servobench.plant.plant import PlantSetup
 from servobench.plant.robot.hand_eye import TrueJacobian
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
-from servobench.plant.signals import Command
 
 SEEDS = (11, 4, 7)
 MODELS = [mismatched("severe+gear_ratio=5%", seed) for seed in SEEDS]

@@ -8,12 +8,12 @@ import pytest
 from kit.plants import ALL_PLANTS
 from servobench.harness.check.plants import check_plant
 from servobench.harness.config.registry import find_plant
-from servobench.plant.plant import PlantEntry, PlantSetup
+from servobench.plant.bench.plant import PlantEntry, PlantSetup
+from servobench.plant.contract.sensing import vary_sensing
+from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
-from servobench.plant.sensing import vary_sensing
-from servobench.plant.signals import Command
 
 PERIOD = 0.05
 COMMANDS = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 6))

@@ -10,11 +10,11 @@ from typing import ClassVar, Literal
 
 import pytest
 
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import Count, Number, Periods, Positive, Share, nested, override, settings
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.settings import Count, Number, Periods, Positive, Share, nested, override, settings
 
 
 @settings

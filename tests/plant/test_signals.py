@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.checks import check_number, whole_steps
-from servobench.plant.signals import Channel, Command, Observation, PlantSpec
+from servobench.plant.contract.checks import check_number, whole_steps
+from servobench.plant.contract.signals import Channel, Command, Observation, PlantSpec
 
 
 def test_messages_keep_read_only_copies():

@@ -10,11 +10,11 @@ import pytest
 
 from kit.plants import NEEDS_BULLET, configure, setup
 from servobench.harness.config.registry import find_plant
-from servobench.plant.bench import Bench
+from servobench.plant.bench.bench import Bench
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import Command
+from servobench.plant.contract.timing import common_step
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
-from servobench.plant.sensing import SensingConfig
-from servobench.plant.signals import Command
-from servobench.plant.timing import common_step
 
 RATES = (10, 20, 50, 125, 250)  # [Hz]
 DURATION = 1.0  # [s]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servobench.controllers.periods import in_periods
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 WEIGHED_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
 

@@ -23,8 +23,8 @@ from typing import final
 
 import numpy as np
 
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import transposed
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import transposed
 
 _SERIES_BELOW = 0.5  # under it the series of 18 terms is exact to rounding, above it the closed form is
 _SERIES_TERMS = 18

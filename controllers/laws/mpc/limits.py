@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from servobench.controllers.laws.mpc.qp import QpBounds, QpShape
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import transposed
-from servobench.plant.signals import BoolArray, PlantSpec
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import transposed
+from servobench.plant.contract.signals import BoolArray, PlantSpec
 
 _any = np.logical_or.reduce  # the method `any` of an array takes twice as long
 

@@ -25,11 +25,11 @@ from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Sol
 from servobench.controllers.laws.mpc.state import MpcState, Plan
 from servobench.controllers.laws.preview import check_preview, sampled
 from servobench.controllers.stages.limit import scale_to_limit
-from servobench.plant.checks import FloatArray, as_vector
-from servobench.plant.faults import SolverFailed
-from servobench.plant.lanes import branch, lane_by_lane, norm, transposed, where
-from servobench.plant.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
-from servobench.plant.signals import BoolArray, Observation
+from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.faults import SolverFailed
+from servobench.plant.contract.lanes import branch, lane_by_lane, norm, transposed, where
+from servobench.plant.contract.settings import Count, NonNegative, Positive, PositiveOrInfinite, settings
+from servobench.plant.contract.signals import BoolArray, Observation
 
 _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier counts as active
 

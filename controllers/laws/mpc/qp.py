@@ -28,7 +28,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias, final
 import daqp
 import numpy as np
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 Solver: TypeAlias = Literal["daqp", "qpoases"]
 # Tolerances are those of the constraints in rad: far below an encoder step, far above rounding.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 
 class Plan(NamedTuple):

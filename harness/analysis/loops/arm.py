@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servobench.harness.analysis.loops.matrices import ComplexArray, StateSpace
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.kinematic import discretise_lag
 
 WHOLE = 1e-9  # [1] a share of a period below which a delay is a whole number of periods

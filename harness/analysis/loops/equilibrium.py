@@ -13,10 +13,10 @@ from servobench.harness.analysis.loops.matrices import StateSpace
 from servobench.harness.config.robots import find_robot
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.signals import Observation
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.signals import Observation
 
 Source: TypeAlias = Literal["true", "nominal", "estimated"]
 SOURCES: tuple[Source, ...] = ("true", "nominal", "estimated")

@@ -21,9 +21,9 @@ from servobench.controllers.controller import Controller
 from servobench.harness.analysis.loops.arm import ArmModel
 from servobench.harness.analysis.loops.linearise import Rest
 from servobench.harness.analysis.loops.matrices import ComplexArray, StateSpace
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import ControllerDiverged
-from servobench.plant.signals import Observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import ControllerDiverged
+from servobench.plant.contract.signals import Observation
 
 LENGTH = 256  # [periods] of the multisine
 AMPLITUDE = 2e-4  # [m] and [rad] root mean square of the multisine

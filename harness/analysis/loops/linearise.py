@@ -22,9 +22,9 @@ from servobench.controllers.controller import JacobianFunction
 from servobench.controllers.servo import Servo, ServoState
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.harness.analysis.loops.matrices import StateSpace
-from servobench.plant.checks import FloatArray
-from servobench.plant.lanes import map_arrays
-from servobench.plant.signals import Observation, trusted_observation
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import map_arrays
+from servobench.plant.contract.signals import Observation, trusted_observation
 
 STEP = 1e-6  # of a difference, in the unit of each number: a micrometre, a microradian
 RANK_TOLERANCE = 1e-6  # [1] a direction that is reached less than this counts as not reached

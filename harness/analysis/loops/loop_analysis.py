@@ -26,8 +26,8 @@ from servobench.harness.run.resolved import ResolvedRun
 from servobench.harness.run.tasks import find_task
 from servobench.harness.run.teaching import taught
 from servobench.harness.run.threads import one_thread
-from servobench.plant.checks import FloatArray
-from servobench.plant.faults import RunFault
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.robot.mismatch import Mismatch
 

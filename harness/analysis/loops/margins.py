@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 
 from servobench.harness.analysis.loops.arm import ArmModel
 from servobench.harness.analysis.loops.matrices import ComplexArray
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 LOWEST = 1e-3  # [1] lowest frequency, as a share of the Nyquist frequency
 POINTS = 400  # of the frequency axis

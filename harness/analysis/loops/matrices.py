@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.checks import FloatArray
+from servobench.plant.contract.checks import FloatArray
 
 ComplexArray = npt.NDArray[np.complex128]
 STABILITY_TOLERANCE = 1e-4  # [1] of a pole's modulus above 1, which neutral modes have by rounding of differences

@@ -12,12 +12,12 @@ import numpy as np
 
 from servobench.harness.analysis.loops.equilibrium import Warm, at_rest
 from servobench.harness.analysis.loops.linearise import frozen
-from servobench.plant.checks import FloatArray
+from servobench.plant.bench.plant import Plant, PlantSetup
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.sensing import without_disturbance
+from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.plant import Plant, PlantSetup
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.sensing import without_disturbance
-from servobench.plant.signals import Command
 
 OFFSET = 1e-4  # [m] of the desired feature in each axis, from which the motions begin
 WINDOWS = 4  # of the run; a stable one has a smaller error in the last than in the second, and than at the begin

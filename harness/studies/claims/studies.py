@@ -10,7 +10,7 @@ from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.plant.settings import did_you_mean
+from servobench.plant.contract.settings import did_you_mean
 
 PROPOSED: Final = "rbfnn_mfac"
 MPC: Final = "ukf_mpc"

@@ -24,7 +24,7 @@ from servobench.harness.studies.tuning.objective import TuningSet, score
 from servobench.harness.studies.tuning.scoring import SECOND, Wanted, fill, open_ledger, refuse_broken_defaults
 from servobench.harness.studies.tuning.spaces import Point, default_values, find_space, find_tunable, nested_settings
 from servobench.harness.studies.tuning.study import StudyOutcome, first_points, study
-from servobench.plant.settings import Count, Periods, settings
+from servobench.plant.contract.settings import Count, Periods, settings
 
 
 @settings

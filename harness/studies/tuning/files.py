@@ -12,7 +12,7 @@ from typing import Any
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.objective import TuningSet
-from servobench.plant.files import write_atomically
+from servobench.plant.contract.files import write_atomically
 
 HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
 

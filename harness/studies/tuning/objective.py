@@ -38,8 +38,8 @@ from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
 from servobench.harness.run.together import side_by_side_key
-from servobench.plant.sensing import can_vary_sensing
-from servobench.plant.settings import Periods, settings
+from servobench.plant.contract.sensing import can_vary_sensing
+from servobench.plant.contract.settings import Periods, settings
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from servobench.harness.studies.tuning import objective
 from servobench.harness.studies.tuning.ledger import LEDGER, Ledger
 from servobench.harness.studies.tuning.objective import WEIGHTS, WORST, Trial, TuningSet, evaluate
 from servobench.harness.studies.tuning.spaces import Point, find_tunable, nested_settings
-from servobench.plant.faults import RunFault
+from servobench.plant.contract.faults import RunFault
 
 SECOND: Final = ".second"  # of the name of the ledger of the second set
 Wanted: TypeAlias = tuple["Ledger", str, Point]

@@ -24,7 +24,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
-from servobench.plant.settings import suggest
+from servobench.plant.contract.settings import suggest
 
 Distribution: TypeAlias = CategoricalDistribution | FloatDistribution | IntDistribution
 Space: TypeAlias = Mapping[str, Distribution]

@@ -34,7 +34,7 @@ from servobench.harness.studies.tuning.spaces import (
     nested_settings,
     values_of,
 )
-from servobench.plant.seeds import named_seed
+from servobench.plant.contract.seeds import named_seed
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""The shell around every plant: clipping, command delay, sub-steps, sensor noise, latency and lost frames."""

@@ -1,0 +1,299 @@
+"""The bench around a robot: clipped and delayed commands, noisy, late and lost features, for every world alike.
+
+    u(k) = clip(command(k), limits),        the world advances under u(k − d)
+    frame(k) = see(k) + σ N(0, 1),          the observation at k holds frame(k − l), or the last valid one if it is lost
+
+with the command delay d and the latency l; where they are no multiples of the control period, the world advances in
+sub-steps (`plant.contract.timing`). What else may happen to a frame is in `plant.bench.sensor`. Many runs side
+by side share one bench: their arrays have a leading axis, and each run has random streams of its own.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel
+from servobench.plant.bench.sensor import Sensor
+from servobench.plant.bench.world import World
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FeatureLost, RunFault
+from servobench.plant.contract.lanes import take
+from servobench.plant.contract.seeds import Seeds
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import BoolArray, Command, Observation, Truth, trusted_observation
+from servobench.plant.contract.timing import Timing, common_step
+
+
+class Frame(NamedTuple):
+    """A frame on its way to the controller.
+
+    Attributes:
+        due: number of the sub-step after which it is delivered; with jitter, (...) and no whole number.
+        feature: (..., m).
+        valid: (..., m), which features are measured and will arrive.
+    """
+
+    due: int | FloatArray
+    feature: FloatArray
+    valid: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class BenchState:
+    """A saved state of a bench; it can be pickled if that of its world can.
+
+    Attributes:
+        period: number of control periods since the reset.
+        commands: commands under way, oldest first, one a control period.
+        frames: frames under way, oldest first.
+        held: (..., m), the last valid feature.
+        sensor: its random streams, and the outliers and occlusions that last.
+        world: what the world saved.
+    """
+
+    period: int
+    commands: tuple[FloatArray, ...]
+    frames: tuple[Frame, ...]
+    held: FloatArray
+    sensor: Sensor
+    world: Any
+
+
+@final
+class Bench(Plant):
+    """A plant: a world under clipped and delayed commands, seen through noise, latency and lost frames."""
+
+    def __init__(self, world: World, command_delay: float, sensing: SensingConfig, period: float | None = None) -> None:
+        """Put a world on the bench, which closes it; `reset` begins a run. `build_bench` also builds the world.
+
+        Args:
+            world: the robot and its camera.
+            command_delay: between a command and its first effect, s, 0 or above.
+            sensing: noise, latency, frame period and lost frames.
+            period: control period, s; None: that of the world.
+
+        Raises:
+            ValueError: the control period, the delay, the latency or the frame period is no multiple of the world's
+                period.
+        """
+        self.world = world
+        self._sensing, self._command_delay = sensing, command_delay
+        spec = world.spec
+        self._period = spec.period if period is None else period
+        self._step = spec.period
+        self._timing = Timing.of(self._period, spec.period, command_delay, sensing)
+        self.spec = spec if self._timing.steps == 1 else replace(spec, period=self._period)
+        self._lower, self._upper = spec.command.lower, spec.command.upper
+        self._k = -1
+        self._size_masks()
+
+    def _size_masks(self) -> None:
+        """Take the leading axis from the world."""
+        self._shape = (*self.world.lead, self.spec.n)
+        self._whole = np.ones(self.world.lead, dtype=np.bool_)[()]
+        self._all_valid = np.ones((*self.world.lead, self.spec.m), dtype=np.bool_)
+        self._none_valid = np.logical_not(self._all_valid)
+        for mask in (self._whole, self._all_valid, self._none_valid):
+            mask.setflags(write=False)
+
+    def reset(self, seed: Seeds) -> Observation:
+        """Return to the start; all that the sensor draws gets random streams of its own. See `Plant.reset`.
+
+        Args:
+            seed: non-negative; a sequence of one for each of the runs side by side.
+
+        Raises:
+            ValueError: a negative seed, or not one for each run.
+        """
+        if np.shape(seed) != self.world.lead:
+            raise ValueError(f"seed must have shape {self.world.lead}, got {np.shape(seed)}")
+        interval = self._timing.frames * self._step
+        self._sensor = Sensor(self._sensing, self.spec.m, interval, seed, self.world.lead)
+        joints = self.world.reset(seed)
+        first = self._expose()
+        if first is None:
+            raise FeatureLost(self.world.why_unseen())
+        unseen = self._unseen()
+        if unseen is not None:
+            for lane in np.flatnonzero(unseen.any(axis=-1)).tolist():
+                self.world.fail(lane, FeatureLost(self.world.why_unseen()))
+        rest = np.zeros(self._shape)
+        rest.setflags(write=False)
+        self._commands = deque([rest] * self._timing.delays[0])
+        self._frames = deque(Frame(due, first, self._all_valid) for due in self._timing.under_way())
+        self._held, self._k = first, 0
+        return self._observation(joints, first, self._all_valid)
+
+    def step(self, command: Command) -> Observation:
+        """Apply `command` for one period; see `Plant.step`."""
+        wanted = command.joint_velocity
+        if wanted.shape != self._shape:
+            raise ValueError(f"joint_velocity must have shape {self._shape}, got {wanted.shape}")
+        if self._k < 0:
+            raise ValueError("reset must be called before the first step")
+        u: FloatArray = np.minimum(wanted, self._upper)
+        np.maximum(u, self._lower, out=u)
+        self._commands.append(u)
+        timing = self._timing
+        for i, delay in enumerate(timing.delays, self._k * timing.steps + 1):
+            joints = self.world.advance(self._commands[-1 - delay])
+            if timing.exposes(i):
+                self._frames.append(self._sent(i))
+        self._commands.popleft()
+        self._k += 1
+        return self._observation(joints, *self._delivered(self._k * timing.steps))
+
+    def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
+        """Return the newest features that arrived since the last control instant, and which ones did, (..., m)."""
+        if self._sensor.jitters:
+            return self._delivered_by_lane(now)
+        feature, valid = self._held, self._none_valid
+        while self._frames and self._frames[0].due <= now:
+            _, newer, own = self._frames.popleft()
+            if own is self._all_valid:
+                feature, valid = newer, own
+            else:
+                feature, valid = np.where(own, newer, feature), np.logical_or(valid, own)
+        return feature, valid
+
+    def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
+        """Return the same where a frame is due at another time in each lane."""
+        feature, valid, before = self._held, self._none_valid, now - self._timing.steps
+        for due, newer, own in self._frames:
+            fresh = np.logical_and(own, np.asarray(np.logical_and(before < due, due <= now))[..., None])
+            feature, valid = np.where(fresh, newer, feature), np.logical_or(valid, fresh)
+        while self._frames and np.all(self._frames[0].due <= now):
+            self._frames.popleft()
+        return feature, valid
+
+    def _observation(self, joints: FloatArray, feature: FloatArray, valid: BoolArray) -> Observation:
+        """Return what is seen at the present period, of features that are held where they do not arrive."""
+        time, whole = self._k * self._period, self._whole
+        if valid is not self._all_valid:
+            whole = np.logical_and.reduce(valid, axis=-1)
+            valid.setflags(write=False)
+        joints.setflags(write=False)
+        feature.setflags(write=False)
+        self._held = feature
+        return trusted_observation(time, joints, feature, whole, valid)
+
+    def _expose(self) -> FloatArray | None:
+        """Return the feature as seen now, (..., m), with what the sensor adds; None if it is not found."""
+        feature, unit = self.world.see(), self.world.noise_unit
+        if feature is None or unit == 1.0:
+            return None if feature is None else self._sensor.measured(feature)
+        return unit * self._sensor.measured(feature / unit)
+
+    def _unseen(self) -> BoolArray | None:
+        """Return which features cannot be seen now, (..., m); None for none of them."""
+        seen = self.world.visible()
+        return None if seen is None or seen.all() else np.logical_not(seen)
+
+    def _sent(self, step: int) -> Frame:
+        """Return the frame that is exposed after a sub-step, with which of its features will arrive."""
+        feature, missing, valid = self._expose(), self._sensor.missing(step * self._step), self._all_valid
+        if feature is None:
+            feature, valid = self._held, self._none_valid
+        if missing is not None:
+            valid = np.logical_and(valid, np.logical_not(missing)[..., None])
+        if (unseen := self._unseen()) is not None:
+            valid = np.logical_and(valid, np.logical_not(unseen))
+        due: int | FloatArray = step + self._timing.latency
+        if self._sensor.jitters:
+            due = self._sensor.due(step + self._timing.latency, self._step)
+        return Frame(due, feature, valid)
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        return self.world.truth()
+
+    def save(self) -> BenchState:
+        """See `Plant.save`."""
+        sensor = copy.deepcopy(self._sensor)
+        return BenchState(self._k, tuple(self._commands), tuple(self._frames), self._held, sensor, self.world.save())
+
+    def restore(self, state: BenchState) -> None:
+        """See `Plant.restore`.
+
+        Raises:
+            ValueError: a state of another number of runs side by side.
+        """
+        if state.held.shape != self._all_valid.shape:
+            raise ValueError(f"state must be of runs of shape {self.world.lead}, got {state.held.shape[:-1]}")
+        self.world.restore(state.world)
+        self._k, self._held = state.period, state.held
+        self._commands, self._frames = deque(state.commands), deque(state.frames)
+        self._sensor = copy.deepcopy(state.sensor)
+
+    @property
+    def faults(self) -> Mapping[int, RunFault]:  # type: ignore[override]
+        """See `Plant.faults`."""
+        return self.world.faults
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """See `Plant.keep`."""
+        if not self.world.lead:
+            super().keep(lanes)
+        self.world.keep(lanes)
+        self._size_masks()
+        self._sensor.keep(lanes)
+        commands, frames, self._held = take((tuple(self._commands), tuple(self._frames), self._held), lanes)
+        self._commands, self._frames = deque(commands), deque(frames)
+
+    def true_model(self) -> TrueModel:
+        """See `Plant.true_model`."""
+        return self.with_delays(self.world.true_model())
+
+    def with_delays(self, model: TrueModel) -> TrueModel:
+        """See `Plant.with_delays`."""
+        return replace(model, latency=self._sensing.latency, command_delay=self._command_delay, lag=self.world.lag)
+
+    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+        """See `Plant.nominal_jacobian`."""
+        return self.world.nominal_jacobian()
+
+    def picture(self) -> ImageArray | None:
+        """See `Plant.picture`."""
+        return self.world.picture()
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """See `Plant.move_camera`."""
+        shape = (*self.world.lead, 4, 4)
+        if X_BC.shape not in (shape, (4, 4)):
+            raise ValueError(f"X_BC must have shape {shape}, got {X_BC.shape}")
+        self.world.move_camera(np.broadcast_to(X_BC, shape))
+
+    def close(self) -> None:
+        """See `Plant.close`."""
+        self.world.close()
+
+
+def build_bench(
+    make: Callable[[PlantSetup], World], setup: PlantSetup, command_delay: float, sensing: SensingConfig
+) -> Bench:
+    """Return a bench around a world that is as fine as the delays need.
+
+    Args:
+        make: builds the world from a setup whose period is the sub-step.
+        setup: of the plant, with the control period.
+        command_delay: between a command and its first effect, s.
+        sensing: noise, latency, frame period and lost frames.
+
+    Raises:
+        ValueError: times without a common sub-step, or whatever `make` refuses.
+    """
+    step = common_step(setup.period, command_delay, sensing)
+    try:
+        world = make(replace(setup, period=step))
+    except ValueError as error:
+        if step == setup.period:
+            raise
+        raise ValueError(f"in sub-steps of {step:g} s, which the delays and the period need: {error}") from error
+    return Bench(world, command_delay, sensing, setup.period)

@@ -1,0 +1,234 @@
+"""The contract of a plant: a spec, reset, step, save and restore, close, and the truth for the log.
+
+A plant never sees a target. A plant that is added is a `World` on the `Bench` of `plant.bench.bench`, or a class
+of its own below `Plant`; a settings class beside it; and a `PlantEntry` that is named in `harness.config.registry` or
+published under the entry-point group `servobench.plants`.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.contract.checks import FloatArray, as_array
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
+from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.limits import JointLimits
+from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.sensed import SensedArm
+
+ImageArray: TypeAlias = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class TrueModel:
+    """The kinematics of the true robot and how late commands and features are; for upper bounds only.
+
+    Attributes:
+        jacobian: (..., n) rad -> (..., m, n), unit of the feature per rad.
+        symbolic: from a CasADi expression (MX) of the joint positions, (n, 1) rad, to that of the feature, (m, 1).
+        latency: between exposure and delivery of a frame, s.
+        command_delay: between a command and its first effect, s.
+        lag: time constant of the joints' velocity loops, s; None where it is unknown.
+    """
+
+    jacobian: Callable[[FloatArray], FloatArray]
+    symbolic: Callable[[Any], Any]
+    latency: float = 0.0
+    command_delay: float = 0.0
+    lag: float | None = None
+
+
+class Abilities(ABC):
+    """The abilities of plants and worlds in addition to moving; those that are optional have a default."""
+
+    spec: PlantSpec
+    """Sizes, names, limits and period; set on construction."""
+    own_robot: ClassVar[bool] = False
+    """Whether it brings a robot and a start of its own, of a class that is given without a `PlantEntry`."""
+    faults: Mapping[int, RunFault] = MappingProxyType({})
+    """Of runs side by side: the lanes that failed, which `keep` has to drop. A single run raises instead."""
+
+    @abstractmethod
+    def truth(self) -> Truth:
+        """Return the present true feature and Jacobian; for evaluation only."""
+
+    def save(self) -> Any:  # noqa: ANN401 - each plant has a state of its own
+        """Return the present state as a value; after `restore` the run continues from it with the same bits.
+
+        By default it is a deep copy of the attributes; a plant that holds handles overrides both methods.
+
+        Raises:
+            ValueError: the plant cannot save its state.
+        """
+        return copy.deepcopy(vars(self))
+
+    def restore(self, state: Any) -> None:  # noqa: ANN401 - what `save` returned
+        """Return to a state that `save` of a plant with the same robot and settings returned, as often as wanted."""
+        vars(self).update(copy.deepcopy(state))
+
+    def true_model(self) -> TrueModel:
+        """Return the kinematics of a robot that the plant brings itself; for upper bounds only.
+
+        The model lives as long as the plant.
+
+        Raises:
+            ValueError: the plant does not know them; says why.
+        """
+        raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
+
+    def with_delays(self, model: TrueModel) -> TrueModel:
+        """Return the kinematics of the plant's robot with the plant's own delays, as far as it knows them."""
+        return model
+
+    def nominal_jacobian(self) -> Callable[[FloatArray], FloatArray] | None:
+        """Return the public nominal Jacobian of a robot that the plant brings, (..., n) -> (..., m, n); or None."""
+        return None
+
+    def picture(self) -> ImageArray | None:
+        """Return the present image of the camera, (h, w, 3) RGB with the detection drawn in; None without a camera.
+
+        Taking it disturbs neither the run nor its random streams.
+        """
+        return None
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """Put the camera elsewhere from the next measurement on, until `reset`: a camera displaced during the run.
+
+        Args:
+            X_BC: (4, 4), the camera's new pose in the base frame; (..., 4, 4) for runs side by side.
+
+        Raises:
+            ValueError: a plant without a camera that could be moved.
+        """
+        raise ValueError("the plant has no camera that could be moved")
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """Drop all other runs for good, of runs side by side.
+
+        Args:
+            lanes: (k,), indices of the lanes that stay, in their new order.
+
+        Raises:
+            ValueError: a plant that carries out one run only.
+        """
+        raise ValueError("the plant carries out one run only, so none can be dropped")
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free all resources of the plant; calling it twice is allowed."""
+
+
+class Plant(Abilities):
+    """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
+
+    @abstractmethod
+    def reset(self, seed: int) -> Observation:
+        """Return to the start at time 0 and draw all randomness from `seed`.
+
+        Args:
+            seed: non-negative; the same seed gives the same run, bit for bit.
+
+        Returns:
+            The observation at time 0.
+
+        Raises:
+            FeatureLost: the feature cannot be seen from the start.
+        """
+
+    @abstractmethod
+    def step(self, command: Command) -> Observation:
+        """Apply `command` for one period.
+
+        Args:
+            command: joint velocities, shape (n,), rad/s; beyond the limit they are clipped.
+
+        Returns:
+            The observation at the end of the period.
+
+        Raises:
+            ValueError: a command of the wrong size.
+            PlantDiverged: the state is no longer finite.
+        """
+
+
+@dataclass(frozen=True)
+class PlantSetup:
+    """The arguments with which the harness builds a plant.
+
+    Attributes:
+        model: the true arm and cameras, mismatch included; None for a plant that brings a robot of its own. For runs
+            side by side its arrays have a leading axis.
+        start: (..., n), rad, reported joint positions at time 0; None for a plant that brings its own start.
+        period: control period, s.
+        nominal: the robot by its maker's description: limits, links and bench; None for a plant that brings its own,
+            or where only the model is known.
+    """
+
+    model: SensedArm | None
+    start: FloatArray | None
+    period: float
+    nominal: Robot | None = None
+
+    @property
+    def limits(self) -> JointLimits | None:
+        """The maker's joint limits, where they are known."""
+        return None if self.nominal is None else self.nominal.limits
+
+    def robot(self) -> tuple[SensedArm, FloatArray]:
+        """Return model and start, (..., n), for a plant that needs them.
+
+        Raises:
+            ValueError: there are none, or a start of the wrong shape.
+        """
+        if self.model is None or self.start is None:
+            raise ValueError("model and start must be given for this plant, got None")
+        return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
+
+    def ball_robot(self) -> tuple[HandEyeModel, FloatArray]:
+        """Return model and start for a plant that sees the ball in 3-D by a fixed camera only; errors as in `robot`."""
+        model, start = self.robot()
+        if not isinstance(model, HandEyeModel):
+            raise ValueError("model must be of a ball that is seen in 3-D by a fixed camera for this plant")  # noqa: TRY004
+        return model, start
+
+
+@dataclass(frozen=True)
+class PlantEntry:
+    """A plant as the registry knows it.
+
+    Attributes:
+        name: the word on the command line.
+        summary: one line for `servobench plants`.
+        config: settings class with a default for every field; its noise and latency can be varied if it has a field
+            `sensing` of class `servobench.plant.bench.bench.SensingConfig`.
+        build: makes the plant from its settings and the setup.
+        own_robot: it brings a robot and a start of its own: taught tasks, `--robot` and mismatches do not apply, and
+            no nominal model is known.
+        config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
+        side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
+        needs: top-level modules that only an extra brings.
+        lacking: returns one line about what this machine lacks beside packages; empty if nothing.
+        engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
+        any_sensing: it takes every sensing set-up; else only the ball that a fixed camera sees in 3-D.
+    """
+
+    name: str
+    summary: str
+    config: type[Any]
+    build: Callable[[Any, PlantSetup], Plant]
+    own_robot: bool = False
+    side_by_side: bool = False
+    needs: tuple[str, ...] = ()
+    lacking: Callable[[], str] | None = None
+    engine: Callable[[], str] | None = None
+    config_for: Callable[[Robot], Any] | None = None
+    any_sensing: bool = False

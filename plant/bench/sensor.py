@@ -1,0 +1,111 @@
+"""What one sensor does to its frames in a run: noise, outliers, quantisation, occlusion, loss and jitter of latency.
+
+    y = round_Δ(h(q) + σ·family + outlier)        what a frame shows, round_Δ to multiples of the quantum
+    hidden(t) or lost                             a frame that arrives without the feature, or not at all
+    latency + U(0, jitter)                        between exposure and delivery; frames do not overtake each other
+
+Each part draws from a random stream of its own, frame by frame, so that switching one on changes no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.bench.noise_families import directions, family_of, quantised
+from servobench.plant.bench.spells import Spell, begin_probability
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import take, where
+from servobench.plant.contract.seeds import Seeds, Stream
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.signals import BoolArray
+
+TIME_TOLERANCE: Final = 1e-9  # [s] by which a frame may be earlier than a window that begins with it
+
+
+class Sensor:
+    """The random side of a sensor over a run, or over runs side by side; it can be copied and pickled.
+
+    Attributes:
+        jitters: whether frames are late by different times.
+    """
+
+    def __init__(self, config: SensingConfig, m: int, interval: float, seed: Seeds, lead: tuple[int, ...]) -> None:
+        """Begin all streams.
+
+        Args:
+            config: the settings.
+            m: number of features.
+            interval: between two frames, s.
+            seed: one, or one for each of the runs side by side.
+            lead: shape of the leading axis, () for a single run.
+
+        Raises:
+            ValueError: a negative seed.
+        """
+        self._config, self.jitters = config, config.jitter > 0.0
+        self._scale = config.noise_factor * config.feature_noise
+        offset = config.noise_offset / config.feature_noise if config.feature_noise > 0.0 else 0.0
+        family = family_of(
+            config.noise, share=config.noise_share, offset=offset, spread=config.noise_spread,
+            stability=config.stability, skewness=config.skewness,
+        )  # fmt: skip
+        stream: Callable[..., Stream] = partial(Stream, seed)
+        self._noise = stream("feature_noise", family, (m,), self._scale)
+        self._losses, self._lateness = stream("dropped_frames", "random"), stream("late_frames", "random")
+        self._outlier_begins, self._occlusion_begins = stream("outliers", "random"), stream("occlusions", "random")
+        self._outlier_values = stream("outlier_values", directions, (m,), config.outlier_size)
+        frames = [max(1, round(time / interval)) for time in (config.outlier_duration, config.occlusion_duration)]
+        self._frames = frames[0], frames[1]
+        self._outlier, self._occlusion = Spell.none(lead, np.zeros((*lead, m))), Spell.none(lead, np.zeros(lead)[()])
+        self._due: FloatArray = np.zeros(lead)[()]
+
+    def measured(self, feature: FloatArray) -> FloatArray:
+        """Return what the next frame shows of a true feature, (..., m)."""
+        config = self._config
+        if self._scale > 0.0:
+            feature = feature + self._noise.next()
+        if config.outliers > 0.0:
+            frames = self._frames[0]
+            begins = self._outlier_begins.next() < begin_probability(config.outliers, frames)
+            self._outlier = self._outlier.next(begins, frames, self._outlier_values.next())
+            feature = where(self._outlier.inside, feature + self._outlier.value, feature)
+        return quantised(feature, config.quantum) if config.quantum > 0.0 else feature
+
+    def missing(self, time: float) -> BoolArray | None:
+        """Return where the frame that is exposed at `time` [s] arrives without the feature, (...); None for nowhere."""
+        config, absent = self._config, None
+        if config.drop_probability > 0.0:
+            absent = self._losses.next() < config.drop_probability
+        if config.occlusions > 0.0:
+            frames = self._frames[1]
+            begins = self._occlusion_begins.next() < begin_probability(config.occlusions, frames)
+            self._occlusion = self._occlusion.next(begins, frames, self._occlusion.value)
+            absent = self._occlusion.inside if absent is None else np.logical_or(absent, self._occlusion.inside)
+        if any(begin <= time + TIME_TOLERANCE < end for begin, end in config.occlusion_windows):
+            absent = np.ones_like(self._occlusion.inside)[()]
+        return absent if absent is not None and absent.any() else None
+
+    def due(self, step: int, size: float) -> FloatArray:
+        """Return after which sub-step the frame is delivered that is due at `step` without jitter, (...).
+
+        Args:
+            step: number of the sub-step.
+            size: of a sub-step, s.
+        """
+        self._due = np.maximum(self._due, step + self._config.jitter / size * self._lateness.next())
+        return self._due
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """Drop all other lanes."""
+        for stream in (
+            self._noise, self._losses, self._lateness, self._outlier_begins, self._outlier_values,
+            self._occlusion_begins,
+        ):  # fmt: skip
+            stream.keep(lanes)
+        state = self._outlier, self._occlusion, self._due
+        self._outlier, self._occlusion, self._due = take(state, lanes)

@@ -1,0 +1,200 @@
+"""An arm seen by cameras, or with cameras on its hand, under any sensing set-up.
+
+A camera is mounted on the base B (`fixed`) or on the flange F (`hand`); the target is on the flange or in the world:
+
+    fixed   p = p_B(q) = p_F + R_F t           ∂p/∂q_i = g_i z_i × (p_B − o_i)
+    hand    p = R_Fᵀ (t − p_F)                 ∂p/∂q_i = −R_Fᵀ (g_i z_i × (t − o_i))
+    in camera c, p_c = R_cᵀ (p − p_0c);        y = h(p_c),   J = ∂h/∂p_c R_cᵀ ∂p/∂q
+
+with points t of the target in the flange frame or in the base frame, and the joints' axes z_i, origins o_i and gear
+ratios g_i.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final, Literal, Self, TypeAlias, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.optics import Optics, in_image
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.signals import BoolArray, Channel
+from servobench.plant.robot.arm import YZX, ZXY, SerialArm
+from servobench.plant.robot.sensed import SensedArm
+
+Mount: TypeAlias = Literal["fixed", "hand"]
+"""Whether the cameras are beside the arm and the target on it, or the reverse."""
+NEAREST: Final = 0.25  # of the planned distance, the least depth that an interaction matrix takes
+MIN_FACING: Final = 0.2  # cosine of the angle beyond which discs on a plate are not seen
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class EyeModel(SensedArm):
+    """An arm and its cameras under a sensing set-up; arrays have the leading axes of the arm's.
+
+    Attributes:
+        arm: the arm.
+        eye: the set-up.
+        mount: of the cameras.
+        cameras: (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
+        optics: their intrinsics.
+        target: (..., p, 3) [m], points in the flange frame, or with cameras on the hand in the base frame.
+        distance: from the cameras to the target in the middle of the workspace, as planned [m].
+        focal: of a camera as planned, which decides the natural size of a feature [px].
+        far: distance of the ball's fixed camera as planned, at which the noise of pixels is that of the ball [m].
+    """
+
+    arm: SerialArm
+    eye: Eye
+    mount: Mount
+    cameras: FloatArray
+    optics: Optics
+    target: FloatArray
+    distance: float
+    focal: float
+    far: float
+
+    @cached_property
+    def channel(self) -> Channel:
+        """Names, unit and natural size of the features."""
+        return self.eye.channel(self.focal, self.distance)
+
+    @property
+    def noise_unit(self) -> float:
+        """What a metre of noise is in the unit of the features: pixels have the same noise from everywhere."""
+        return self.eye.scale(self.focal, self.far)
+
+    @property
+    def camera(self) -> FloatArray:
+        """The pose of the first camera, (..., 4, 4)."""
+        return self.cameras[..., 0, :, :]
+
+    def with_camera(self, pose: FloatArray) -> Self:
+        """Return this model with its first camera at another pose, (..., 4, 4)."""
+        cameras = self.cameras.copy()
+        cameras[..., 0, :, :] = pose
+        return replace(self, cameras=cameras)
+
+    def pivot(self, centre: npt.ArrayLike) -> FloatArray:
+        """Return the point that the first camera looks at, about which it turns: for a fixed one the given `centre`."""
+        if self.mount == "fixed":
+            return np.asarray(centre, dtype=np.float64)
+        return np.asarray(self.camera[..., :3, 3] + self.distance * self.camera[..., :3, 2])
+
+    def points(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the target in the frame that the cameras are mounted on, (..., p, 3) m."""
+        flange = self.arm.frames(joint_position)[..., -1, :, :]
+        return self._mounted(flange, self._in_base(flange))
+
+    def seen(self, points: FloatArray) -> FloatArray:
+        """Return the features, (..., m), of a target at `points` (..., p, 3) m in the frame of the cameras' mount."""
+        return self.eye.measure(self._in_cameras(points), self.optics)
+
+    def in_view(self, points: FloatArray, share: float = 1.0) -> BoolArray:
+        """Return which features are seen, (..., m), of such a target, within a share of the images' half sides."""
+        return self._valid(self._in_cameras(points), share)
+
+    def facing(self, points: FloatArray) -> FloatArray:
+        """Return the cosine of the angle between the first camera's sight and a plate's normal, (...); 1 of a point."""
+        return _facing(self._in_cameras(points)[..., 0, :, :])
+
+    def visible(self, joint_position: npt.ArrayLike) -> BoolArray | None:
+        """Return which features a camera sees, (..., m)."""
+        return self.in_view(self.points(joint_position))
+
+    def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
+        """Return the true features, (..., m), for joint positions (..., n) in rad."""
+        return self.seen(self.points(joint_position))
+
+    def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return `feature` and `jacobian`, both read-only, at the cost of one forward kinematics."""
+        y, J, _ = self.look(joint_position)
+        return y, J
+
+    def look(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return features (..., m), Jacobian (..., m, n) and which features are seen (..., m), all read-only."""
+        points, motions = self.point_motions(joint_position)
+        y = self.eye.measure(points, self.optics)
+        J = self.eye.change(points, motions, self.optics)
+        seen = self._valid(points)
+        for array in (y, J, seen):
+            array.setflags(write=False)
+        return y, J, seen
+
+    def point_motions(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return the target in each camera, (..., c, p, 3) m, and its motion with the joints, (..., c, p, 3, n)."""
+        frames = self.arm.frames(joint_position)
+        flange = frames[..., -1, :, :]
+        at = self._in_base(flange)
+        motions = self._motions(frames, at)
+        if self.mount == "hand":
+            motions = -np.vecmat(motions, flange[..., None, None, :3, :3])
+        points = self._in_cameras(self._mounted(flange, at))
+        # (..., p, n, 3) to (..., c, p, 3, n), turned into each camera
+        turned = np.vecmat(motions[..., None, :, :, :], self.cameras[..., None, None, :3, :3])
+        return points, np.swapaxes(turned, -1, -2)
+
+    def interaction(self, feature: FloatArray, depth: FloatArray) -> FloatArray:
+        """Return L, (..., c, p, k, 3): how the k features of each point change with its place in the camera.
+
+        Args:
+            feature: (..., m), where the points are seen.
+            depth: (..., c, p) [m], of the points; at least `NEAREST` of the planned distance is taken.
+
+        Raises:
+            ValueError: the set-up has no such matrix.
+        """
+        eye = self.eye
+        if eye.locate is None or not eye.single:
+            raise ValueError(f"sensing {eye.name} has no interaction matrix: single and locate must be given")
+        points = eye.locate(feature, np.maximum(depth, NEAREST * self.distance), self.optics)
+        along = np.broadcast_to(np.eye(3), (*points.shape, 3))
+        rates = eye.change(points, along, self.optics)
+        return rates.reshape(*points.shape[:-1], -1, 3)
+
+    def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
+        """Return which features are seen, (..., m), of points in the frame of each camera, (..., c, p, 3) m."""
+        front = _facing(points) > MIN_FACING
+        return self.eye.valid(np.logical_and(in_image(points, self.optics, share), front[..., None]))
+
+    def _in_base(self, flange: FloatArray) -> FloatArray:
+        """Return the target in the base frame, (..., p, 3) m."""
+        if self.mount == "hand":
+            return self.target
+        return np.asarray(np.matvec(flange[..., None, :3, :3], self.target) + flange[..., None, :3, 3])
+
+    def _mounted(self, flange: FloatArray, at: FloatArray) -> FloatArray:
+        """Return points of the base frame, (..., p, 3) m, in the frame that the cameras are mounted on."""
+        if self.mount == "fixed":
+            return at
+        return np.asarray(np.vecmat(at - flange[..., None, :3, 3], flange[..., None, :3, :3]))
+
+    def _in_cameras(self, points: FloatArray) -> FloatArray:
+        """Return points of the frame of the mount, (..., p, 3), in each camera, (..., c, p, 3) m."""
+        cameras = self.cameras[..., None, :, :]
+        return np.asarray(np.vecmat(points[..., None, :, :] - cameras[..., :3, 3], cameras[..., :3, :3]))
+
+    def _motions(self, frames: FloatArray, points: FloatArray) -> FloatArray:
+        """Return g_i z_i × (p − o_i) of points (..., p, 3) m in the base frame, (..., p, n, 3) m/rad."""
+        n = self.arm.n
+        axis = frames[..., None, :n, :3, 2]
+        lever = points[..., :, None, :] - frames[..., None, :n, :3, 3]
+        motions = axis.take(YZX, axis=-1) * lever.take(ZXY, axis=-1)
+        motions -= axis.take(ZXY, axis=-1) * lever.take(YZX, axis=-1)
+        motions *= self.arm.gear_ratio[..., None, :, None]
+        return np.asarray(motions)
+
+
+def _facing(points: FloatArray) -> FloatArray:
+    """Return the cosine of the angle between the line of sight and a target's normal, (...), for (..., p, 3) m."""
+    if points.shape[-2] < 3:
+        return np.ones(points.shape[:-2])
+    first, second = points[..., 1, :] - points[..., 0, :], points[..., 2, :] - points[..., 0, :]
+    normal, sight = np.cross(first, second), points.mean(axis=-2)
+    return np.asarray(np.vecdot(normal, sight) / np.maximum(norm(normal) * norm(sight), 1e-12))

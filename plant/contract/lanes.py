@@ -1,0 +1,186 @@
+"""Many runs side by side: arrays with leading axes, a lane a run; a single run has no leading axis.
+
+Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. What is to happen in some lanes
+only goes through `branch`, so that no part writes a mask. A state is a tree of arrays: named tuples, tuples and
+dataclasses, of which every array has the leading axes; whatever else is in them is shared by all lanes. A number of a
+single run is a scalar of numpy, which costs a tenth of an array without axes: `array[()]` makes the one of the other.
+
+A lane has the same bits whatever its neighbours are, as long as no leading axis becomes an axis of a matrix: products
+are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over the last, contiguous axes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from functools import cache, wraps
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.contract.checks import FloatArray
+
+Tree = TypeVar("Tree")
+Lanes = Any  # an index of the leading axes
+
+
+def map_arrays(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  # noqa: ANN401 - any tree
+    """Return the tree with `function` applied to its arrays, and to those at the same place of the other trees."""
+    if isinstance(tree, (np.ndarray, np.generic)):  # numpy makes numbers of arrays without axes
+        return function(tree, *others)
+    if isinstance(tree, tuple):
+        entries = [map_arrays(function, *each) for each in zip(tree, *others, strict=True)]
+        return type(tree)(*entries) if hasattr(tree, "_fields") else tuple(entries)
+    if is_dataclass(tree) and not isinstance(tree, type):
+        new = object.__new__(type(tree))
+        for name in (field.name for field in fields(tree)):
+            object.__setattr__(new, name, map_arrays(function, *(getattr(each, name) for each in (tree, *others))))
+        return new
+    return tree
+
+
+def take(tree: Tree, lanes: Lanes) -> Tree:
+    """Return a tree with the lanes that an index names; a single number gives the tree of a single run."""
+    taken: Tree = map_arrays(lambda array: array[lanes], tree)
+    return taken
+
+
+def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
+    """Return a tree in which the lanes that an index names are those of `part`; they were those of `before`."""
+
+    def replaced(array: FloatArray, values: FloatArray, old: FloatArray) -> FloatArray:
+        if values is old:
+            return array
+        new = array.copy()
+        new[lanes] = values
+        return new
+
+    changed: Tree = map_arrays(replaced, tree, part, before)
+    return changed
+
+
+def stack(trees: Sequence[Tree]) -> Tree:
+    """Return the trees of single runs as one tree with a leading axis; what is no array is that of the first one."""
+    stacked: Tree = map_arrays(lambda *arrays: np.stack(arrays), *trees)
+    return stacked
+
+
+def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
+    """Return `function(tree, *arguments)` in the lanes that are chosen and `tree` in all others.
+
+    Args:
+        chosen: (...), bool.
+        function: returns a tree like its first argument; it sees only lanes that are chosen, along one axis.
+        tree: what may change.
+        arguments: further trees that the function needs.
+    """
+    mask = np.asarray(chosen)
+    if mask.ndim == 0:
+        return function(tree, *arguments) if chosen else tree
+    count = np.count_nonzero(mask)
+    if count == 0:
+        return tree
+    if count == mask.size:
+        return function(tree, *arguments)
+    lanes = np.nonzero(mask)
+    before = take(tree, lanes)
+    return put(tree, lanes, function(before, *(take(each, lanes) for each in arguments)), before)
+
+
+def repeat(
+    condition: Callable[[Tree], npt.ArrayLike], function: Callable[[Tree], Tree], tree: Tree, at_most: int
+) -> Tree:
+    """Return a tree after `function` was applied, `at_most` so often, in the lanes in which a condition still holds.
+
+    Args:
+        condition: of a tree, (...), bool.
+        function: as in `branch`.
+        tree: at the beginning.
+        at_most: times after which it certainly holds no more.
+    """
+    for _ in range(at_most):
+        chosen = np.asarray(condition(tree))
+        if not chosen.any():
+            break
+        tree = branch(chosen, function, tree)
+    return tree
+
+
+def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Mark a function that is written for single runs: it is called for one lane after the other.
+
+    Args:
+        signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
+    """
+    ranks = [len(part.strip("() ").split(",")) if part.strip("() ") else 0
+             for part in signature.split("->", maxsplit=1)[0].replace("),(", ")|(").split("|")]  # fmt: skip
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        over_lanes = np.vectorize(function, signature=signature)
+
+        @wraps(function)
+        def call(*arguments: Any) -> Any:  # noqa: ANN401 - those of the function
+            if all(np.ndim(each) == rank for each, rank in zip(arguments, ranks, strict=True)):
+                return function(*arguments)
+            return over_lanes(*arguments)
+
+        return call
+
+    return decorate
+
+
+def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:
+    """Return the entries that an index of each lane names along the first axis after the leading ones.
+
+    Args:
+        array: (..., k, *).
+        index: (..., †), from 0 to k − 1.
+        axes: how many axes of `index`, †, are no leading axes.
+
+    Returns:
+        (..., †, *).
+    """
+    leading = np.ndim(index) - axes
+    if leading == 0:
+        entry: npt.NDArray[Any] = array[index]
+        return entry
+    lead, (length, *rest) = array.shape[:leading], array.shape[leading:]
+    first = length * np.arange(math.prod(lead)).reshape(lead + (1,) * axes)
+    return np.asarray(array.reshape(-1, *rest).take(first + index, axis=0))
+
+
+def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return `one` in the lanes that are chosen, (...), and `other` elsewhere; both may have further axes."""
+    mask = np.asarray(chosen)
+    return np.where(mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)), one, other)
+
+
+def outer(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a bᵀ, (..., m, n), for a (..., m) and b (..., n)."""
+    return np.asarray(a[..., :, None] * b[..., None, :])
+
+
+def norm(x: FloatArray) -> FloatArray:
+    """Return ‖x‖, (...), for x (..., n)."""
+    length: FloatArray = np.sqrt(np.vecdot(x, x))
+    return length
+
+
+def plus_diagonal(A: FloatArray, value: npt.ArrayLike) -> FloatArray:
+    """Return A + diag(value), (..., n, n), for A (..., n, n) and one number, (n,) or (..., n)."""
+    rows = value if isinstance(value, float) else np.atleast_1d(value)[..., None, :]
+    return np.asarray(A + _identity(A.shape[-1]) * rows)
+
+
+@cache
+def _identity(size: int) -> FloatArray:
+    identity = np.eye(size)
+    identity.flags.writeable = False
+    return identity
+
+
+def transposed(A: npt.NDArray[Any]) -> FloatArray:
+    """Return Aᵀ, (..., n, m), for A (..., m, n)."""
+    return A.mT

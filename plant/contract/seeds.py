@@ -1,0 +1,107 @@
+"""One seed a run; every part draws from a stream of its own, spawned by name."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.contract.checks import FloatArray
+
+Seeds: TypeAlias = int | Sequence[int]
+"""The seed of a single run, or one for each of the runs side by side."""
+
+BLOCK = 64  # draws of a stream that are made at once
+
+
+def check_seed(seed: int) -> None:
+    """Check a seed.
+
+    Raises:
+        ValueError: it is negative.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must be a non-negative integer, got {seed}")
+
+
+def named_sequence(seed: int, name: str) -> np.random.SeedSequence:
+    """Return the seed sequence of the part called `name` below the run's `seed`.
+
+    Raises:
+        ValueError: a negative seed.
+    """
+    check_seed(seed)
+    return np.random.SeedSequence(seed, spawn_key=(zlib.crc32(name.encode()),))
+
+
+def named_generator(seed: int, name: str) -> np.random.Generator:
+    """Return the random generator of the part called `name` below the run's `seed`."""
+    return np.random.default_rng(named_sequence(seed, name))
+
+
+def named_seed(seed: int, name: str) -> int:
+    """Return a 32-bit seed for the part called `name` below the run's `seed`."""
+    return int(named_sequence(seed, name).generate_state(1)[0])
+
+
+class Stream:
+    """Random numbers of a part, drawn ahead: each run has the numbers of its own named generator, one after the other.
+
+    It can be copied and pickled.
+    """
+
+    def __init__(
+        self,
+        seeds: Seeds,
+        name: str,
+        draw: Literal["standard_normal", "random"] | Callable[[np.random.Generator, tuple[int, ...]], FloatArray],
+        shape: tuple[int, ...] = (),
+        factor: float = 1.0,
+    ) -> None:
+        """Begin all streams.
+
+        Args:
+            seeds: one, or one for each of the runs side by side, which gives every draw a leading axis.
+            name: of the part.
+            draw: method of the generators, or a function of a generator and a shape.
+            shape: of a draw of one run.
+            factor: on all numbers.
+
+        Raises:
+            ValueError: a negative seed.
+        """
+        self._single = isinstance(seeds, int | np.integer)
+        self._seeds = [seeds] if isinstance(seeds, int | np.integer) else list(seeds)
+        for seed in self._seeds:
+            check_seed(seed)
+        self._generators: list[np.random.Generator] = []  # made with the first block: many streams are never used
+        self._name, self._draw, self._shape, self._factor = name, draw, (BLOCK, *shape), factor
+        self._block: FloatArray = np.empty(0)
+        self._used = BLOCK
+
+    def next(self) -> FloatArray:
+        """Return the next draw of each run, (..., *shape)."""
+        if self._used == BLOCK:
+            self._generators = self._generators or [named_generator(seed, self._name) for seed in self._seeds]
+            drawn = [self._drawn(generator) for generator in self._generators]
+            self._block = self._factor * (drawn[0] if self._single else np.stack(drawn, axis=1))
+            self._used = 0
+        self._used += 1
+        row: FloatArray = self._block[self._used - 1]
+        return row
+
+    def _drawn(self, generator: np.random.Generator) -> FloatArray:
+        draw = self._draw
+        numbers: FloatArray = (
+            getattr(generator, draw)(self._shape) if isinstance(draw, str) else draw(generator, self._shape)
+        )
+        return numbers
+
+    def keep(self, lanes: npt.NDArray[np.intp]) -> None:
+        """Drop the streams of all other lanes."""
+        self._seeds = [self._seeds[lane] for lane in lanes]
+        if self._generators:
+            self._generators, self._block = [self._generators[lane] for lane in lanes], self._block[:, lanes]
