@@ -24,7 +24,7 @@ from page_studies.methods import (
 from page_studies.study import Study, Words, sweep
 from servobench.harness.analysis.comparison import column_of, outcomes, settling_times
 from servobench.harness.batch.results import load_runs, load_steps
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 
 CIRCLE_UNIT: Final = 0.05  # [m] RMS on a circle that costs 1 in the score of 0.1.0
 FIFTHS: Final = 5
