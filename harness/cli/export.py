@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from servobench.harness.cli.terminal import console
+from servobench.harness.cli.terminal import console, say
 
 
 def export(
@@ -19,6 +19,9 @@ def export(
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
     from servobench.harness.analysis.exports import export_folder
+    from servobench.harness.batch import results
 
+    if missing := results.describe_missing(folder):
+        say(missing)
     files = export_folder(folder, out, format_)
     console.print(f"{len(files)} files in {out}", markup=False, highlight=False)

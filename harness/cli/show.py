@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from servobench.harness.cli.terminal import console, print_json, print_markdown, print_tables
+from servobench.harness.cli.terminal import console, print_json, print_markdown, print_tables, say
 
 SLOW_REPORT = 20.0  # [s], beyond which the time that a report took is printed
 
@@ -40,7 +41,9 @@ def statistics(
     if markdown and as_json:
         raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
     runs = results.load_runs(folder)
+    missing = results.describe_missing(folder)
     if as_json:
+        sys.stderr.write(f"{missing}\n" * bool(missing))
         print_json(
             [
                 {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
@@ -48,6 +51,8 @@ def statistics(
             ]
         )
         return
+    if missing:
+        say(missing)
     tables = statistics_tables(runs, metric, never)
     print_markdown(tables) if markdown else print_tables(tables)
 
@@ -67,8 +72,11 @@ def report(
 
 def make_report(folder: Path, out: Path | None = None) -> None:
     """Write the report and print its path and, if it took long, the time."""
+    from servobench.harness.batch import results
     from servobench.harness.pictures.report import write_report
 
+    if missing := results.describe_missing(folder):
+        say(missing)
     began = time.monotonic()
     with console.status("making the report"):
         path = write_report(folder, out)

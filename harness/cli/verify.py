@@ -19,6 +19,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     """
     from servobench.harness.batch.integrity import examine
     from servobench.harness.batch.lock import current_holder
+    from servobench.harness.batch.results import missing_line
 
     holder = current_holder(folder)
     if holder is not None:
@@ -27,9 +28,8 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     for finding in found.findings:
         line = f"{folder / finding.name} {finding.what}: {finding.remedy}"
         say(line)
-    if found.runs < found.wanted:
-        wanting = f"{found.runs} of {found.wanted} runs are there: --resume carries out the others"
-        say(wanting)
+    if line := missing_line(found.runs, found.wanted):
+        say(line)
     if found.findings:
         sys.exit(options.FAILED)
     console.print(f"{found.files} files are what was written, {found.runs} runs", markup=False, highlight=False)
