@@ -29,7 +29,7 @@ import methods_table
 import stored_tables
 from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
-from servobench.harness.config.describe import describe_settings, toml
+from servobench.harness.config.description import describe_settings, toml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
