@@ -15,8 +15,7 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at
 from servobench.harness.config.watched import WatchedWorld, missing_spec
 from servobench.plant.bench.bench import Bench, build_bench
-from servobench.plant.bench.plant import Plant, PlantSetup
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import Plant, PlantSetup, World
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings

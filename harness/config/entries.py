@@ -18,8 +18,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.config.builds import BenchSettings, Build, Copy, Guarded, NoSettings, OnBench, folder_of
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at, show
-from servobench.plant.bench.plant import Plant, PlantEntry
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import Plant, PlantEntry, World
 
 NAME: Final = re.compile(r"\w+(?:[:-]\w+)*")
 

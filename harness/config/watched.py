@@ -8,8 +8,7 @@ from typing import Any, final
 import numpy as np
 
 from servobench.harness.config.settings import ConfigurationError
-from servobench.plant.bench.plant import ImageArray, TrueModel
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import ImageArray, TrueModel, World
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import PlantSpec, Truth
