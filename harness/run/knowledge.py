@@ -18,8 +18,8 @@ from servobench.harness.run.request import RunSettings
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 
 NETWORKS = "networks"
 FILE = "networks.npz"
