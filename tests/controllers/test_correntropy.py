@@ -5,11 +5,18 @@ import pytest
 from scipy.linalg import block_diag
 
 from kit.toy import Learning, motion
-from servobench.controllers.estimators.gmckf import MIN_ERROR, GmckfConfig, gmckf_estimator
-from servobench.controllers.estimators.imcckf import ImcckfConfig, imcckf_estimator
+from servobench.controllers.estimators.correntropy import (
+    MIN_ERROR,
+    GmckfConfig,
+    ImcckfConfig,
+    MckfConfig,
+    RmckfConfig,
+    gmckf_estimator,
+    imcckf_estimator,
+    mckf_estimator,
+    rmckf_estimator,
+)
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
-from servobench.controllers.estimators.mckf import MckfConfig, mckf_estimator
-from servobench.controllers.estimators.rmckf import RmckfConfig, rmckf_estimator
 from servobench.plant.contract.faults import FilterDiverged
 
 M, N, WALK, NOISE = 3, 4, 0.09, 0.001

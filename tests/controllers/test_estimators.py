@@ -8,15 +8,20 @@ from hypothesis import strategies as st
 from kit.toy import Learning, motion, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
-from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator, projection_update
-from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
-from servobench.controllers.estimators.fixed import ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.constant import ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
     KalmanEstimator,
     kalman_update,
     measurement_matrix,
     split_update,
+)
+from servobench.controllers.estimators.projection import (
+    BroydenConfig,
+    BroydenEstimator,
+    CfdlConfig,
+    CfdlEstimator,
+    projection_update,
 )
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
 from servobench.controllers.estimators.ukf import UkfConfig, sigma_weights, ukf_estimator, unscented_update

@@ -6,7 +6,7 @@ import pytest
 from kit.toy import Learning, motion
 from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
-from servobench.controllers.estimators.robust import (
+from servobench.controllers.estimators.robust_filter import (
     BISQUARE,
     MEMORY,
     RobustConfig,

@@ -139,7 +139,7 @@ class RobustEstimator(Estimator[RobustState]):
         keep = np.exp(-duration / MEMORY)[..., None]
         rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTED)
         lost = rejected > LOST_SHARE
-        P = where(lost, _taken_from_sight(P, noise), (P + transposed(P)) / 2)
+        P = where(lost, _restarted_at_frame(P, noise), (P + transposed(P)) / 2)
         excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(axis=-1)
         scale = np.clip(state.scale * np.exp(SCALE_RATE * duration * excess), 1.0, MAX_SCALE)
         deviation, none = innovation * (1.0 - gain[..., 0]), np.zeros_like(innovation)
@@ -168,7 +168,7 @@ class RobustEstimator(Estimator[RobustState]):
         }
 
 
-def _taken_from_sight(P: FloatArray, noise: FloatArray) -> FloatArray:
+def _restarted_at_frame(P: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the covariance of a feature that is where it is seen, which tells nothing about J."""
     taken = P.copy()
     taken[..., 0, :] = taken[..., :, 0] = 0.0
