@@ -2,7 +2,7 @@
 
     y' = y / s,   J' = J / s          s the scale of the feature's channel: 1 m of a place, pixels per metre of a pixel
 
-With s = 1 nothing is changed. Settings in metres are therefore metres of a ball that moves across the camera's line of sight.
+With s = 1 nothing is changed. Settings in metres are therefore metres of a ball that moves across the optical axis.
 """
 
 from __future__ import annotations

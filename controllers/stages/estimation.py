@@ -174,9 +174,8 @@ class Estimation:
             return rotation.mT
         depth = self._cameras.depths_and_motions(observation.joint_position)[0]
         rates = self._cameras.rates(observation.feature, depth)
-        return np.asarray(
-            turned_interaction(rates, transposed(rotation)) @ block_diagonal(np.asarray(np.linalg.pinv(rates)))
-        )
+        inverse = block_diagonal(np.asarray(np.linalg.pinv(rates)))
+        return np.asarray(turned_interaction(rates, transposed(rotation)) @ inverse)
 
     def _depths_and_motions(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return depths (..., c p) [m] and G (..., 3 c p, n) [m/rad]; empty without a camera model."""

@@ -89,7 +89,7 @@ def test_features_that_are_known_to_move_with_points_teach_what_the_points_teach
     plain = turned = arm.start(nominal_ur5().jacobian(path[0]))
     for motion in motions(path):
         plain = arm.update(plain, motion)
-        turned = arm.update(turned, replace(motion, feature_step=turn @ motion.feature_step, seen=turn))
+        turned = arm.update(turned, replace(motion, feature_step=turn @ motion.feature_step, interaction=turn))
     np.testing.assert_array_equal(plain.x, expected.x)
     np.testing.assert_allclose(turned.x, expected.x, atol=1e-9)
     np.testing.assert_allclose(turned.P, expected.P, atol=1e-9)
