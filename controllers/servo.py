@@ -179,7 +179,7 @@ class Servo:
     def _past(self, predictor: Predictor, pair: PairState, observation: Observation) -> Past:
         pairing = self.estimation.pairing
         if pairing is None:
-            raise ValueError("a predictor needs the pair stage, which looks back")
+            raise ValueError("a predictor needs the pair stage, which keeps past joint positions")
         exposed, before = pairing.exposed(pair)
         window = observation.joint_position - pair.past[..., predictor.window, : self.knowledge.spec.n]
         return Past(pairing.delay(pair), exposed, before, window)

@@ -87,7 +87,7 @@ class Estimation:
 
     Attributes:
         estimator: E.
-        pairing: the pair stage; None where no aid looks back.
+        pairing: the pair stage; None where no aid needs past joint positions.
     """
 
     def __init__(self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays) -> None:
@@ -102,7 +102,7 @@ class Estimation:
         self._adds = aids.model != "own" and not estimator.brings_model
         self._shortest = (max(1, whole_periods(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
         self._cameras = knowledge.nominal_cameras if aids.model == "map" else None
-        self.pairing = Pairing(aids, knowledge.spec, delays.latency, self._cameras) if aids.looks_back else None
+        self.pairing = Pairing(aids, knowledge.spec, delays.latency, self._cameras) if aids.needs_past else None
         shape = knowledge.spec.m, knowledge.spec.n
         self._first = estimator.start(np.zeros(shape)) if self._cameras and estimator.brings_model else None
         at_rest = np.zeros(knowledge.spec.n)
