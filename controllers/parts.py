@@ -19,7 +19,7 @@ from servobench.controllers.estimators.correntropy import (
     rmckf_estimator,
 )
 from servobench.controllers.estimators.estimator import Estimator
-from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
 from servobench.controllers.estimators.projection import BroydenConfig, BroydenEstimator, CfdlConfig, CfdlEstimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
@@ -55,7 +55,7 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "constant": Part(ConstantConfig, ConstantEstimator),
     "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
     "ukf": Part(UkfConfig, ukf_estimator),
-    "kalman": Part(KalmanConfig, KalmanEstimator),
+    "kalman": Part(KalmanConfig, kalman_estimator),
     "mckf": Part(MckfConfig, mckf_estimator),
     "imcckf": Part(ImcckfConfig, imcckf_estimator),
     "gmckf": Part(GmckfConfig, gmckf_estimator),

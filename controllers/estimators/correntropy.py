@@ -16,52 +16,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple, Protocol, final
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import KalmanState, cholesky_of
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, cholesky_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, outer, transposed
-from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
+from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
 MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is as good as none, and can be divided by
 MIN_ERROR: Final = 0.1  # [1] in standard deviations
 
 
-class Update(Protocol):
-    """The formula of a filter.
-
-    Args:
-        J: Ĵ before the motion, (..., m, n), m/rad.
-        P: covariance of each row with the walk added, (..., m, n, n), (m/rad)².
-        joint_step: Δq, (..., n), rad.
-        feature_step: Δy, (..., m), m.
-        r: variance of each component of Δy, (...), m².
-
-    Returns:
-        Ĵ and P after the motion.
-    """
+class Correction(Protocol):
+    """The formula of one of these filters; see `kalman.Update`, with the walk already added to P (..., m, n, n)."""
 
     def __call__(  # noqa: D102 - of the class
         self, J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
     ) -> tuple[FloatArray, FloatArray]: ...
 
 
-class WalkSettings(Protocol):
-    """What the settings of every filter have; see `KalmanConfig`."""
+def _by_rows(config: RandomWalk, correction: Correction) -> RandomWalkEstimator:
+    """Return the estimator that adds the walk to the covariance of each row, and then corrects."""
 
-    @property
-    def initial_deviation(self) -> float: ...  # noqa: D102 - of the class
-    @property
-    def walk(self) -> float: ...  # noqa: D102
-    @property
-    def feature_noise(self) -> float: ...  # noqa: D102
-    @property
-    def min_joint_step(self) -> float: ...  # noqa: D102
+    def update(
+        J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        P = P + q[..., None, None, None] * np.eye(P.shape[-1])
+        return correction(J, P, joint_step, feature_step, r=np.broadcast_to(r, q.shape)[()])
+
+    return RandomWalkEstimator(config, update, "by_rows")
 
 
 def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
@@ -72,7 +59,7 @@ def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
 def corrected(
     J: FloatArray, P: FloatArray, gain: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `Update`."""
+    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `Correction`."""
     dq = joint_step[..., None, :]
     A = P - outer(gain, np.matvec(P, dq))
     P = A + outer(r[..., None, None] * gain - np.matvec(A, dq), gain)
@@ -113,7 +100,7 @@ def fixed_point_update(
     tolerance times its norm; it begins at J⁻.
 
     Args:
-        J: J⁻; see `Update`, as for the others up to `r`.
+        J: J⁻; see `Correction`, as for the others up to `r`.
         P: its covariance.
         joint_step: Δq.
         feature_step: Δy.
@@ -148,58 +135,10 @@ def fixed_point_update(
     return corrected(J, P, at.gain, joint_step, feature_step, r=r)
 
 
-@final
-class CorrentropyEstimator(Estimator[KalmanState]):
-    """The random walk of J, corrected by the formula of a filter; motions below a minimum ‖Δq‖ are left out."""
-
-    def __init__(self, config: WalkSettings, update: Update) -> None:
-        """Take the settings of the walk and the formula."""
-        self._config, self._formula = config, update
-        self._walk = config.walk**2
-        self._noise: FloatArray = np.asarray(config.feature_noise)[()]
-
-    def start(self, jacobian: FloatArray) -> KalmanState:
-        """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance of each row."""
-        *lead, m, n = jacobian.shape
-        P = np.broadcast_to(np.eye(n) * self._config.initial_deviation**2, (*lead, m, n, n))
-        return KalmanState(jacobian, P, np.full(lead, False))
-
-    def update(self, state: KalmanState, motion: Motion) -> KalmanState:
-        """Correct by one motion.
-
-        Raises:
-            FilterDiverged: a covariance is no longer positive definite.
-        """
-        large = norm(motion.joint_step) >= self._config.min_joint_step
-        return branch(large, self._correct, state._replace(updated=large), motion)
-
-    def _correct(self, state: KalmanState, motion: Motion) -> KalmanState:
-        noise: FloatArray = self._noise if motion.noise is None else motion.noise
-        q, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
-        P = state.P + q[..., None, None, None] * np.eye(state.P.shape[-1])
-        r = np.broadcast_to(r, q.shape)[()]
-        J, P = self._formula(state.J, P, motion.joint_step, motion.feature_step, r=r)
-        cholesky_of(P)
-        return state._replace(J=J, P=P)
-
-    def diagnostics(self, state: KalmanState) -> Diagnostics:
-        """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
-        variance = state.P.trace(axis1=-2, axis2=-1).mean(axis=-1) / state.P.shape[-1]
-        return {"estimator_updated": state.updated, "jacobian_deviation": np.sqrt(variance)}
-
-
 @settings
-class MckfConfig:
+class MckfConfig(RandomWalk):
     """Settings of the maximum correntropy Kalman filter (`mckf_estimator`)."""
 
-    initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀."""
-    walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; that of `kalman`."""
-    feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
-    min_joint_step: NonNegative = 0.002
-    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     bandwidth: Positive = 3.0
     """[1] b, error in standard deviations at which the weight has sunk to exp(−1/2)."""
     tolerance: Positive = 1e-6
@@ -208,7 +147,7 @@ class MckfConfig:
     """[1] the most of them in an update."""
 
 
-def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) -> CorrentropyEstimator:
+def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the maximum correntropy Kalman filter (MCKF); nothing about the robot is needed.
 
     Chen, Liu, Zhao and Príncipe, "Maximum correntropy Kalman filter", Automatica 76 (2017) 70-77: the sum of the
@@ -221,21 +160,13 @@ def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) 
     """
     weight = partial(gaussian_weight, bandwidth=config.bandwidth)
     fixed_point = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
-    return CorrentropyEstimator(config, fixed_point)
+    return _by_rows(config, fixed_point)
 
 
 @settings
-class GmckfConfig:
+class GmckfConfig(RandomWalk):
     """Settings of the generalised maximum correntropy Kalman filter."""
 
-    initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀."""
-    walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; that of `kalman`."""
-    feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
-    min_joint_step: NonNegative = 0.002
-    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     shape: Positive = 1.5
     """[1] α, exponent of the kernel: 2 is Gaussian, 1 is Laplacian."""
     bandwidth: Positive = 4.0
@@ -252,7 +183,7 @@ def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> Flo
     return np.asarray(size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)))
 
 
-def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> CorrentropyEstimator:
+def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the generalised maximum correntropy Kalman filter (GMCKF); nothing about the robot is needed.
 
     Mo, Wang, Yang, Chen, Li and Jiang, "Generalized Maximum Correntropy Kalman Filter for Target Tracking in TianGong-2
@@ -267,21 +198,13 @@ def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None
     """
     weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
     fixed_point = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
-    return CorrentropyEstimator(config, fixed_point)
+    return _by_rows(config, fixed_point)
 
 
 @settings
-class ImcckfConfig:
+class ImcckfConfig(RandomWalk):
     """Settings of the improved maximum correntropy criterion Kalman filter."""
 
-    initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀."""
-    walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; that of `kalman`."""
-    feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
-    min_joint_step: NonNegative = 0.002
-    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     bandwidth: Positive = 5.0
     """[1] b, norm of the innovation in standard deviations at which the weight has sunk to exp(−1/2)."""
 
@@ -289,7 +212,7 @@ class ImcckfConfig:
 def imcckf_update(
     J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, bandwidth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion; see `Update`."""
+    """Correct by one motion; see `Correction`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)[..., None]
     PH = np.matvec(P, joint_step[..., None, :])
@@ -298,7 +221,7 @@ def imcckf_update(
     return J + innovation[..., None] * gain, (P + transposed(P)) / 2
 
 
-def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = None) -> CorrentropyEstimator:
+def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the improved maximum correntropy criterion Kalman filter; nothing about the robot is needed.
 
     Kulikova, "Square-root algorithms for maximum correntropy estimation of linear discrete-time systems in presence of
@@ -307,21 +230,13 @@ def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = No
 
         λ = G(‖Δy − H x⁻‖_R⁻¹),   K = λ P⁻ Hᵀ (λ H P⁻ Hᵀ + R)⁻¹,   x = x⁻ + K (Δy − H x⁻),   P = (I − K H) P⁻
     """
-    return CorrentropyEstimator(config, partial(imcckf_update, bandwidth=config.bandwidth))
+    return _by_rows(config, partial(imcckf_update, bandwidth=config.bandwidth))
 
 
 @settings
-class RmckfConfig:
+class RmckfConfig(RandomWalk):
     """Settings of the regularised maximum correntropy criterion Kalman filter."""
 
-    initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀."""
-    walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; that of `kalman`."""
-    feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
-    min_joint_step: NonNegative = 0.002
-    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     bandwidth: Positive = 3.0
     """[1] b, innovation in standard deviations at which the weight has sunk to exp(−1/2)."""
     regularisation: Positive = 1e-6
@@ -338,7 +253,7 @@ def rmckf_update(
     bandwidth: float,
     regularisation: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Correct by one motion; see `Update`."""
+    """Correct by one motion; see `Correction`."""
     innovation = feature_step - np.matvec(J, joint_step)
     weight = gaussian_weight(innovation / np.sqrt(r)[..., None], bandwidth) + regularisation
     PH = np.matvec(P, joint_step[..., None, :])
@@ -346,7 +261,7 @@ def rmckf_update(
     return corrected(J, P, gain, joint_step, feature_step, r=r)
 
 
-def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None) -> CorrentropyEstimator:
+def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the regularised maximum correntropy criterion Kalman filter; nothing about the robot is needed.
 
     Leite, Araújo and Martins, "Regularized Maximum Correntropy Criterion Kalman Filter for Uncalibrated Visual Servoing
@@ -360,4 +275,4 @@ def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None
     annealing of the bandwidth, off in their settings, is left out.
     """
     update = partial(rmckf_update, bandwidth=config.bandwidth, regularisation=config.regularisation)
-    return CorrentropyEstimator(config, update)
+    return _by_rows(config, update)
