@@ -11,8 +11,7 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal, NamedTuple, Protocol, TypeAlias, final
+from typing import Literal, NamedTuple, Protocol, TypeAlias, final
 
 import numpy as np
 
@@ -28,10 +27,6 @@ from servobench.plant.contract.signals import BoolArray
 @settings
 class RandomWalk:
     """Settings of every filter in which the Jacobian is a random walk."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "process_deviation": "walk, per root of a second: process_deviation / sqrt(0.05 s)"
-    }
 
     initial_deviation: Positive = 0.05
     """[m/rad] of an entry of Ĵ₀; tuned for the Kalman filter: with a larger one latency spoils the first motions."""
