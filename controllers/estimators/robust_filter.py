@@ -51,8 +51,6 @@ LOST_SHARE: Final = 0.7  # [1] of rejections, above which a feature is taken fro
 class RobustConfig(RandomWalk):
     """Settings of the robust filter of feature and Jacobian."""
 
-    min_joint_step: NonNegative = 0.002
-    """[rad] in smaller motions J does not walk."""
     motion_error: NonNegative = 0.1
     """[1] c, error of a predicted motion over its size, as of delays and of the bend of the path."""
     min_joint_step: NonNegative = 0.002
