@@ -21,9 +21,17 @@ import numpy.typing as npt
 
 from servobench.fmus.variables import FIXED, INPUT, PARAMETER, STATE, ArmLayout, Layout, View
 from servobench.plant.cameras.optics import Optics
-from servobench.plant.cameras.symbolic import EyeGeometry, features, points_in_cameras, seen_features
+from servobench.plant.cameras.symbolic import (
+    SX,
+    ArmGeometry,
+    EyeGeometry,
+    HandEyeGeometry,
+    feature_and_jacobian,
+    features,
+    points_in_cameras,
+    seen_features,
+)
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.robot.symbolic import SX, ArmGeometry, HandEyeGeometry, feature_and_jacobian
 
 # Generated functions do not use all of their parameters; none of them is exported by the library.
 HEAD = """/* Generated with CasADi's code generator; not meant to be edited. */

@@ -20,9 +20,8 @@ import numpy as np
 from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.model import EyeModel, Mount
 from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.robot.arm import rpy_from_rotation
-from servobench.plant.robot.limits import JointLimits, narrowed
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.arm import JointLimits, narrowed, rpy_from_rotation
+from servobench.plant.robot.hand_eye import SensedArm
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
