@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from servobench.fmus.export import export_fmu, fingerprint, nominal_options
-from servobench.fmus.eye_variables import FEATURE, SEEN, View
-from servobench.fmus.variables import Actuation, parameters_of
+from servobench.fmus.variables import FEATURE, SEEN, Actuation, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.cameras.model import EyeModel
@@ -20,7 +18,6 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
-from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.robot.catalogue import UR5, find_robot
@@ -47,8 +44,6 @@ class Ur5FmuConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
 @cache

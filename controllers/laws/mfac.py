@@ -9,14 +9,12 @@ newest measured error is used. Along a singular value σ of Ĵ the loop gain a p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.law import Estimate, Law
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import plus_diagonal, transposed
 from servobench.plant.contract.settings import Positive, PositiveOrInfinite, settings
@@ -26,11 +24,6 @@ from servobench.plant.contract.signals import Observation
 @settings
 class MfacConfig:
     """Settings of the MFAC law."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "step_factor": "gain, in 1/s: -ln(1 - step_factor) / period",
-        "feedforward": "aids.feedforward",
-    }
 
     gain: PositiveOrInfinite = 3.25
     """[1/s] K: ρ = 1 − exp(−K dt), 0.15 at 20 Hz; not the paper's ρ = 1 (`inf`), which three periods of delay make

@@ -285,4 +285,4 @@ def _with_columns(cell: Cell, result: RunResult) -> RunResult:
 
 
 def _failed(cell: Cell, ending: Ending) -> RunResult:
-    return _with_columns(cell, RunResult.failed(cell.request.as_row(), ending))
+    return _with_columns(cell, RunResult.failed(episode.identity(cell.request), ending))

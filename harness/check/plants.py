@@ -9,12 +9,10 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
-from servobench.harness.config.builds import Build, folder_of
-from servobench.harness.config.entries import PLANT
-from servobench.harness.config.own import own_object
+from servobench.harness.config.adapters import Build, folder_of
+from servobench.harness.config.entries import PLANT, own_object
 from servobench.harness.config.registry import choose_plant, find_plant, offering
-from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import completion
-from servobench.harness.cli.named import known_robot
 from servobench.harness.cli.options import ConfigOption, RobotOption, SensingOption, SetOption
+from servobench.harness.cli.selection import known_robot
 from servobench.harness.cli.terminal import console
 
 if TYPE_CHECKING:
@@ -108,8 +108,7 @@ def ssp(
 
 def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Product:
     from servobench.fmus.export import ExportOptions, default_actuation, product
-    from servobench.harness.config.robots import find_robot
-    from servobench.harness.config.sensing import find_sensing
+    from servobench.harness.config.robots import find_robot, find_sensing
     from servobench.plant.contract.seeds import named_seed
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 
@@ -163,7 +162,7 @@ def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
     from rich.table import Table
 
-    from servobench.fmus.information import read_information
+    from servobench.fmus.inspection import read_information
     from servobench.harness.config.settings import ConfigurationError
 
     try:

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from servobench.harness.config.engines import rendered_plant, scene_of
+from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.gym.spaces import Floats32, View

@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from servobench.harness.config.registry import engine_of
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
@@ -149,7 +150,7 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
     spec, status = logged.spec, ending.status
     outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
     return {
-        **request.as_row(),
+        **identity(request),
         "robot": OWN_ROBOT if drawn.true is None else request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
@@ -162,6 +163,11 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
         "reason": ending.reason,
         "mismatch_values": json.dumps(drawn.as_record()),
     }
+
+
+def identity(request: RunRequest) -> dict[str, Any]:
+    """Return the columns that are known of a run before it is carried out."""
+    return {**request.as_row(), "engine": engine_of(request.plant)}
 
 
 def _pose_metrics(drawn: Drawn, logged: Steps) -> dict[str, float]:

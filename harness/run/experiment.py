@@ -13,8 +13,7 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.sensing import find_sensing
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
@@ -30,9 +29,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
+from servobench.plant.robot.hand_eye import SensedArm, TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
-from servobench.plant.robot.sensed import SensedArm
 
 
 @dataclass(frozen=True, eq=False)

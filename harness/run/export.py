@@ -27,7 +27,7 @@ from servobench.fmus.controller_export import (
 )
 from servobench.fmus.export import ExportOptions, default_actuation, product
 from servobench.fmus.product import Product
-from servobench.fmus.trace.array import NotTraceable
+from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.robots import find_robot

@@ -35,7 +35,7 @@ from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Positive, settings
-from servobench.plant.robot.pose_inverse import reach_pose
+from servobench.plant.robot.inverse import reach_pose
 from servobench.plant.robot.robot import Robot
 
 DRAWN_AT_ONCE: Final = 256

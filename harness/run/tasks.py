@@ -36,9 +36,8 @@ from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings, suggest
 from servobench.plant.contract.signals import Channel
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.robot.workspace import Workspace
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 from annotated_types import Ge, Le
 
@@ -12,7 +12,7 @@ from servobench.plant.contract.settings import NonNegative, Number, Positive, Sh
 
 Config = TypeVar("Config")
 Family: TypeAlias = Literal["white", "mixture", "bimodal", "stable", "uniform"]
-"""A family of noise, as `servobench.plant.bench.noise_families` defines them."""
+"""A family of noise, as `servobench.plant.bench.noise` defines them."""
 Stability: TypeAlias = Annotated[float, Ge(0.5), Le(2.0)]
 """Exponent α of a stable distribution; below 0.5 its numbers tell nothing."""
 Skewness: TypeAlias = Annotated[float, Ge(-1.0), Le(1.0)]
@@ -70,8 +70,6 @@ class SensingConfig:
                     "occlusion_windows must be pairs of a begin above 0, as the run begins with a valid feature, and a "
                     f"later end, in s; got [{begin:g}, {end:g}]"
                 )
-
-    RENAMED: ClassVar[Mapping[str, str]] = {"latency_periods": "latency, in seconds (a period of 20 Hz is 0.05)"}
 
 
 def without_disturbance(sensing: SensingConfig) -> SensingConfig:

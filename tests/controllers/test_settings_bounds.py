@@ -5,17 +5,12 @@ import math
 import pytest
 
 from servobench.controllers.aids import AidsConfig
-from servobench.controllers.estimators.broyden import BroydenConfig
-from servobench.controllers.estimators.cfdl import CfdlConfig
-from servobench.controllers.estimators.gmckf import GmckfConfig
-from servobench.controllers.estimators.imcckf import ImcckfConfig
+from servobench.controllers.estimators.correntropy import GmckfConfig, ImcckfConfig, MckfConfig, RmckfConfig
 from servobench.controllers.estimators.kalman import KalmanConfig
-from servobench.controllers.estimators.mckf import MckfConfig
-from servobench.controllers.estimators.rbf import RbfConfig
-from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig
+from servobench.controllers.estimators.projection import BroydenConfig, CfdlConfig
+from servobench.controllers.estimators.rbf import RbfConfig, RbfLyapunovConfig
 from servobench.controllers.estimators.rls import RlsConfig
-from servobench.controllers.estimators.rmckf import RmckfConfig
-from servobench.controllers.estimators.robust import RobustConfig
+from servobench.controllers.estimators.robust_filter import RobustConfig
 from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.laws.mfac import MfacConfig
@@ -24,7 +19,6 @@ from servobench.controllers.laws.pid import PidConfig
 from servobench.controllers.laws.rbfnn import RbfnnConfig
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.nmpc_calibrated import NmpcCalibratedConfig
-from servobench.plant.contract.settings import override
 
 
 def bad(config, **values):
@@ -100,20 +94,3 @@ def test_rules_across_settings_name_both():
     ):
         with pytest.raises(ValueError, match=message):
             config(**values)
-
-
-def test_a_setting_of_the_past_is_refused_with_its_new_name():
-    for config, key, now in (
-        (MfacConfig, "step_factor", "gain, in 1/s"),
-        (MfacConfig, "feedforward", "aids.feedforward"),
-        (PidConfig, "feedforward", "aids.feedforward"),
-        (KalmanConfig, "process_deviation", "walk, per root of a second"),
-        (UkfConfig, "process_deviation", "walk, per root of a second"),
-        (RlsConfig, "forgetting", "memory, in seconds"),
-        (MpcConfig, "delay_periods", "delay, in seconds"),
-    ):
-        message = f"has no setting {key!r} any more: it is now {now}"
-        with pytest.raises(ValueError, match=message):
-            config(**{key: 1.0})
-        with pytest.raises(ValueError, match=f"^a.law {message}"):
-            override("a.law", config(), {key: 1.0})

@@ -1,0 +1,158 @@
+"""The command `servobench record`: films and snapshots of a run."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from servobench.harness.cli import completion
+from servobench.harness.cli.selection import split_names
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
+
+if TYPE_CHECKING:
+    from servobench.harness.pictures.replay import LoggedRun
+
+RECORDED = {
+    "controller": "rbfnn_mfac",
+    "task": "circle",
+    "mismatch": "moderate",
+    "robot": "ur5",
+    "seed": 0,
+}
+RECORDINGS = "recordings"
+
+
+def _new(what: str, complete: Callable[[str], list[str]] | None = None) -> Any:  # noqa: ANN401 - typer's word for it
+    return typer.Option(help=f"New run: {what}, default {RECORDED[what]}.", autocompletion=complete)
+
+
+@dataclass(frozen=True)
+class NewRun:
+    """The run that is carried out where no folder is given."""
+
+    plant: Annotated[
+        str | None,
+        typer.Option(
+            help="New run: plant, default bullet, or mujoco without PyBullet.", autocompletion=completion.plants
+        ),
+    ] = None
+    controller: Annotated[str | None, _new("controller", completion.controllers)] = None
+    task: Annotated[str | None, _new("task", completion.tasks)] = None
+    mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None
+    robot: Annotated[str | None, _new("robot", completion.robots)] = None
+    seed: Annotated[int | None, _new("seed")] = None
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="New run: one setting, such as bullet.latency=0.05.")
+    ] = None
+    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None
+
+    def given(self) -> list[str]:
+        """Return the options of it that were given."""
+        return [f"--{name.rstrip('_')}" for name, value in vars(self).items() if value not in (None, [])]
+
+    def asked(self) -> dict[str, Any]:
+        """Return what the run is of, with defaults for what was not given."""
+        from servobench.harness.config.registry import rendered_plant
+
+        named = {name: getattr(self, name) for name in ("plant", *RECORDED)}
+        chosen = {name: value for name, value in named.items() if value is not None}
+        return {"plant": rendered_plant(self.plant), **RECORDED, **chosen}
+
+
+def record(
+    folder: Annotated[
+        Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
+    ] = None,
+    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+    new: NewRun = NewRun(),
+    kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    begin: Annotated[float, typer.Option(min=0.0, help="Time in the run at which the film begins [s].")] = 0.0,
+    length: Annotated[
+        float | None, typer.Option(min=0.001, help="Length of the film [s]; default: to the end of the run.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the films; default: recordings in the results folder.")
+    ] = None,
+) -> None:
+    """Make a film (MP4, GIF) and snapshots of a run.
+
+    They show the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
+    """
+    from servobench.harness.cli.progress import telling
+    from servobench.harness.config.registry import engine_of, rendered_plant
+    from servobench.harness.pictures.film import KINDS, find_kind, write_recording
+    from servobench.harness.pictures.replay import stretch
+
+    wanted = split_names("kinds", kinds, KINDS, find_kind)
+    into = out or (folder or Path("results")) / RECORDINGS
+    _check_writable(into)
+    with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
+        shown = _shown(folder, run, new)
+        say(f"rendered by {engine_of(rendered_plant(shown.track.row['plant']))}")
+        stem = into / str(shown.track.row["run_id"])
+        paths = write_recording(stretch(shown, begin, length), stem, wanted, tell)
+    for path in paths:
+        say(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse a folder that takes no film before a run is carried out and drawn."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    if not standing.is_dir():
+        raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
+    if not os.access(standing, os.W_OK | os.X_OK):
+        raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
+
+
+def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
+    """Return the run of a folder that is named, or carry out a new one."""
+    from servobench.harness.config.settings import ConfigurationError
+
+    if folder is not None:
+        if given := new.given():
+            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+        return _run_of(folder, run_id)
+    if run_id is not None:
+        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+    return _carried_out(new)
+
+
+def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
+    """Return a run of a results folder; without a name the only one."""
+    from servobench.harness.batch import results
+    from servobench.harness.batch.logged import find_run
+    from servobench.harness.config.registry import rendered_plant
+    from servobench.harness.pictures.replay import logged_run
+
+    row = find_run(folder, run_id)
+    settings = results.read_manifest(folder).get("configuration", {}).get(rendered_plant(row["plant"]), {})
+    return logged_run(row, results.load_steps(folder, [row["run_id"]]), settings)
+
+
+def _carried_out(new: NewRun) -> LoggedRun:
+    """Carry out a run to be shown."""
+    from servobench.harness.batch.apart import choose_controllers, choose_plants
+    from servobench.harness.config.registry import rendered_plant
+    from servobench.harness.config.settings import flatten, read_settings
+    from servobench.harness.pictures.replay import logged_run
+    from servobench.harness.run.episode import run_experiment
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolved import check_settings
+    from servobench.plant.rendered.settings import RenderedConfig
+
+    asked, settings = new.asked(), read_settings(new.config, new.set_ or [])
+    (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
+    chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
+    request = RunRequest(**asked | chosen)
+    check_settings(settings, [request.plant, request.controller, request.task])
+    result = run_experiment(request, settings)
+    shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))
+    return logged_run(result.row, result.steps, shown_as)

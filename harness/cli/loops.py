@@ -1,0 +1,125 @@
+"""The command `servobench analyse`: margins of loops, predicted and simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.terminal import console, print_tables
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from servobench.harness.analysis.loops.equilibrium import Source
+    from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
+    from servobench.harness.config.settings import Settings
+    from servobench.harness.run.resolved import ResolvedRun
+
+TABLE = "analyse.csv"
+
+
+def analyse(
+    controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
+    mismatch: Annotated[
+        str,
+        typer.Option(
+            help="Difference of the true robot from the nominal one: none, factory, moderate, severe, or axes."
+        ),
+    ] = "none",
+    seed: Annotated[int, typer.Option(help="Seed of the warm-up move and of the robot.")] = 0,
+    robot: options.RobotOption = "ur5",
+    jacobian: Annotated[
+        str, typer.Option(help="Jacobian that estimators are fixed at: true, nominal or estimated.")
+    ] = "true",
+    identify: Annotated[
+        bool,
+        typer.Option(
+            "--identify", help="Identify all loops from logged small motions, while estimators go on learning."
+        ),
+    ] = False,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Also find the limits of gain and latency by simulation.")
+    ] = False,
+    overrides: options.Overrides = options.OVERRIDES,
+    out: Annotated[Path, typer.Option(help="Folder for table, pictures and page.")] = Path("results") / "analyse",
+) -> None:
+    """Analyse the loop at rest: margins, Bode, Nyquist, step.
+
+    Also sensitivity, and stability over gain and latency.
+    """
+    from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.pictures.loops import write_pictures
+    from servobench.plant.contract.faults import RunFault
+
+    source, arm = _source(jacobian), selection.known_robot(robot)
+    runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
+    loops: list[LoopAnalysis] = []
+    for run in runs:
+        with console.status(f"analysing {run.request.controller}"):
+            try:
+                loops.append(analyse_loop(run, source, identify=identify))
+            except RunFault as fault:
+                console.print(f"{run.request.controller}: {fault}", soft_wrap=True, markup=False)
+    if not loops:
+        raise ConfigurationError("no loop is left to analyse")
+    table = loop_table(loops)
+    if simulate:
+        chosen = {run.request.controller: run for run in runs}
+        with console.status("simulating"):
+            table = table.join(_simulated([chosen[loop.name] for loop in loops]))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"{out} cannot be written: {error.strerror}") from error
+    table.to_csv(out / TABLE, index=False)
+    text = printed(table)
+    page = write_pictures(out, loops, text, LEGEND)[0]
+    title = f"Loops at rest, estimators frozen at the {source} Jacobian"
+    print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
+    console.print(f"table in {out / TABLE}, pictures in {page}", soft_wrap=True, markup=False)
+
+
+def _source(jacobian: str) -> Source:
+    from servobench.harness.analysis.loops.equilibrium import SOURCES
+    from servobench.harness.config.settings import ConfigurationError
+    from servobench.plant.contract.settings import did_you_mean
+
+    for source in SOURCES:
+        if source == jacobian:
+            return source
+    hint = did_you_mean(jacobian, SOURCES)
+    raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
+
+
+def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
+    """Return a run for each controller on the kinematic plant."""
+    from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
+    from servobench.harness.run.request import RunRequest, read_mismatch
+    from servobench.harness.run.resolved import check_settings, resolve
+
+    names = selection.split_controllers(",".join(controllers), robot)
+    check_settings(settings, [PLANT, TASK, *names])
+    drawn = read_mismatch(mismatch)
+    return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]
+
+
+def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
+    """Return the simulated limits, a row for each run; NaN for a controller that is not composed."""
+    import pandas as pd
+
+    from servobench.controllers.servo import ServoController
+    from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
+
+    rows: list[tuple[float, float]] = []
+    for run in runs:
+        warm = warm_up(run)
+        if isinstance(warm.controller, ServoController):
+            loop = SmallLoop(warm, warm.model, run.plant)
+            rows.append((loop.gain_limit(), loop.latency_limit()))
+        else:
+            rows.append((float("nan"), float("nan")))
+    return pd.DataFrame(rows, columns=["simulated_gain_margin", "simulated_latency_limit_s"])

@@ -1,0 +1,174 @@
+"""Descriptions of settings: unit, meaning, allowed values and value in TOML; and a commented file of all of them."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import math
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from itertools import pairwise
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+UNIT = re.compile(r"(?:\[(.+?)\] ?)?(.*)")  # what a string below a field begins with
+SIGNS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting as a reader wants it.
+
+    Attributes:
+        key: its dotted name within the section.
+        value: as it is.
+        unit: of the value, such as `s`; empty where none is told.
+        allowed: which values may be given, in words; empty for what the default shows already.
+        meaning: one line; empty where none is told.
+    """
+
+    key: str
+    value: Any
+    unit: str
+    allowed: str
+    meaning: str
+
+    @property
+    def group(self) -> str:
+        """Dotted name of the nested section; empty for the section itself."""
+        return self.key.rpartition(".")[0]
+
+    @property
+    def name(self) -> str:
+        """The last part of the key."""
+        return self.key.rpartition(".")[2]
+
+
+def describe_settings(config: Any, prefix: str = "") -> Iterator[Setting]:  # noqa: ANN401 - any settings
+    """Yield each setting of a configuration dataclass, those of nested sections with their name before theirs."""
+    strings, hints = field_strings(type(config)), get_type_hints(type(config), include_extras=True)
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            yield from describe_settings(value, f"{prefix}{item.name}.")
+        else:
+            unit, meaning = UNIT.fullmatch(strings.get(item.name, "")).groups(default="")  # type: ignore[union-attr]
+            yield Setting(prefix + item.name, value, unit, allowed(hints[item.name]), meaning)
+
+
+def field_strings(kind: type[Any]) -> dict[str, str]:
+    """Return the strings below the fields of a class and of those that it inherits from, as one line each, by field."""
+    strings = {}
+    for each in reversed(kind.__mro__[:-1]):
+        try:
+            source = inspect.getsource(each)
+        except (OSError, TypeError):  # the class was typed in, or is not written in Python
+            continue
+        definition = ast.parse(textwrap.dedent(source)).body[0]
+        for field, below in pairwise(definition.body if isinstance(definition, ast.ClassDef) else ()):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+                and isinstance(below.value.value, str)
+            ):
+                strings[field.target.id] = " ".join(below.value.value.split())
+    return strings
+
+
+def allowed(hint: Any) -> str:  # noqa: ANN401 - any annotation
+    """Return what a type allows, in words; nothing for what the default shows already."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        bounds = [
+            f"{sign} {getattr(bound, name):g}"
+            for bound in arguments[1:]
+            for name, sign in SIGNS.items()
+            if hasattr(bound, name)
+        ]
+        return ", ".join(part for part in (allowed(arguments[0]), *bounds) if part)
+    if origin is Literal:
+        return ", ".join(map(toml, arguments))
+    if origin in (Union, UnionType):
+        return " or ".join(filter(None, (allowed(each) for each in arguments if each is not NoneType)))
+    if origin is tuple:
+        each = allowed(arguments[0])
+        size = "list" if arguments[-1] is Ellipsis else f"{len(arguments)} numbers"
+        return size + (f", each {each}" if each else "")
+    return "whole" if hint is int else ""
+
+
+def toml(value: Any) -> str:  # noqa: ANN401 - any setting
+    """Return a value as TOML has it; nothing for a value that is absent."""
+    if isinstance(value, np.ndarray | tuple | list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    if isinstance(value, float | np.floating):
+        return str(float(value))
+    if isinstance(value, str | bool | Path):
+        return json.dumps(value if isinstance(value, bool) else str(value), ensure_ascii=False)
+    return "" if value is None else str(value)
+
+
+def plain(value: Any) -> Any:  # noqa: ANN401 - any setting
+    """Return a value as JSON can have it: arrays as lists, paths as text, infinity as the text "inf"."""
+    if isinstance(value, np.ndarray | tuple | list):
+        return [plain(each) for each in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else str(value)
+    return value if isinstance(value, str | bool | int | None) else str(value)
+
+
+BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+WIDTH = 100  # characters of a line of comment
+HEAD = """\
+# Settings of servobench, for {use} and other commands.
+# Each line has the value in use; leave out what you do not change. --set SECTION.KEY=VALUE changes one for one call.
+"""
+
+
+def configuration_file(
+    sections: Mapping[str, Any], defaults: Mapping[str, Any], titles: Mapping[str, str], use: str
+) -> str:
+    """Return the text of a TOML file that sets every setting of `sections` to its value there.
+
+    Args:
+        sections: configuration dataclasses by section.
+        defaults: the same where nothing is set.
+        titles: one line about each section.
+        use: how the file is used, for the first line.
+    """
+    parts = [HEAD.format(use=use)]
+    for section, config in sections.items():
+        settings = list(describe_settings(config))
+        normal = {each.key: toml(each.value) for each in describe_settings(defaults[section])}
+        for group in dict.fromkeys(["", *(each.group for each in settings)]):  # nested sections after their own
+            lines = [_line(each, normal.get(each.key, "")) for each in settings if each.group == group]
+            title = "" if group else _comment(titles[section])
+            parts.append(f"{title}[{_key(section)}{'.' * bool(group)}{group}]\n{''.join(lines)}")
+    return "\n".join(parts)
+
+
+def _line(setting: Setting, default: str) -> str:
+    """Return the comment and the line of a setting; one without a value is a comment, too."""
+    value, unit = toml(setting.value), f"[{setting.unit}] " if setting.unit else ""
+    facts = "; ".join(
+        part for part in (setting.allowed, f"default {default}" if default else "unset by default") if part
+    )
+    words = f"{unit}{setting.meaning or setting.name}".rstrip(".")
+    return _comment(f"{words} ({facts})") + (f"{setting.name} = {value}\n" if value else f"# {setting.name} =\n")
+
+
+def _comment(text: str) -> str:
+    lines = textwrap.wrap(text, WIDTH - 2, break_long_words=False, break_on_hyphens=False)
+    return "".join(f"# {line}\n" for line in lines)
+
+
+def _key(name: str) -> str:
+    return name if BARE_KEY.fullmatch(name) else json.dumps(name, ensure_ascii=False)

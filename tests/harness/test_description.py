@@ -1,0 +1,106 @@
+"""The configuration file that `servobench init` writes."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from kit.command import servobench
+from servobench.harness.config import registry
+from servobench.harness.config.description import configuration_file, describe_settings
+from servobench.harness.config.registry import controller_names
+from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
+from servobench.harness.run import resolved
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve_sections
+from servobench.harness.run.tasks import TASKS
+
+PLANTS = ("kinematic", "bullet", "mujoco", "fmu")
+
+
+def sections(plants, controllers, tasks, *assignments, path=None):
+    requests = [RunRequest(*each, "none", 0) for each in product(plants, controllers, tasks)]
+    return resolve_sections(requests, read_settings(path, assignments), to_run=False)
+
+
+def assert_same(found, wanted):
+    assert found.keys() == wanted.keys()
+    for name, config in wanted.items():
+        np.testing.assert_equal(flatten(found[name]), flatten(config))
+
+
+def test_a_file_of_everything_reads_back_to_the_same_settings(tmp_path):
+    names = PLANTS, (*controller_names(), "mfac+rls"), tuple(TASKS)
+    wanted = sections(*names)
+    path = tmp_path / "all.toml"
+    path.write_text(configuration_file(wanted, wanted, dict.fromkeys(wanted, "about"), "run"), encoding="utf-8")
+    assert_same(sections(*names, path=path), wanted)
+    read = tomllib.loads(path.read_text(encoding="utf-8"))
+    for name, config in wanted.items():
+        for setting in describe_settings(config):
+            section = read[name]
+            for part in setting.group.split(".") * bool(setting.group):
+                section = section[part]
+            assert (setting.name in section) == (setting.value is not None)
+
+
+def test_changed_settings_are_kept_and_their_defaults_told(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "bench.toml"
+    changes = ("kinematic.sensing.feature_noise=0.5", "ukf_mfac.law.step_weight=0.25")
+    arguments = [word for change in changes for word in ("--set", change)]
+    assert servobench(monkeypatch, "init", str(path), "--plants", "kinematic", *arguments) == 0
+    assert capsys.readouterr().out.replace("\n", "") == f"{path}: run, kinematic, ukf_mfac, exp2"
+    names = ("kinematic",), ("ukf_mfac",), ("exp2",)
+    assert_same(sections(*names, path=path), sections(*names, *changes))
+    lines = path.read_text(encoding="utf-8").splitlines()
+    at = lines.index("feature_noise = 0.5")
+    told = " ".join(line.removeprefix("# ") for line in lines[at - 2 : at])
+    assert told.startswith("[m] standard deviation")
+    assert told.endswith("(≥ 0; default 0.001)")
+    assert max(map(len, (line for line in lines if line.startswith("#")))) <= 120
+
+
+def test_a_file_that_is_there_is_left_as_it_is(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text("mine")
+    assert servobench(monkeypatch, "init", str(path)) == 2
+    assert capsys.readouterr().err == f"servobench: {path} exists already and is left as it is; name another file\n"
+    assert path.read_text() == "mine"
+    path = tmp_path / "none" / "bench.toml"
+    assert servobench(monkeypatch, "init", str(path)) == 2
+    assert capsys.readouterr().err == f"servobench: {path} cannot be written: No such file or directory\n"
+
+
+def test_a_dash_prints_the_file(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert servobench(monkeypatch, "init", "-", "--plants", "kinematic", "--tasks", "waypoints") == 0
+    text = capsys.readouterr().out
+    assert list(tomllib.loads(text)) == ["run", "kinematic", "ukf_mfac", "waypoints"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
+        (("--set", "kinematic.lagg=1"), "kinematic has no setting 'lagg': did you mean 'lag'?"),
+    ],
+)
+def test_a_wrong_name_is_one_line_and_writes_nothing(monkeypatch, capsys, tmp_path, arguments, line):
+    monkeypatch.chdir(tmp_path)
+    assert servobench(monkeypatch, "init", *arguments) == 2
+    assert line in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_of_a_plant_that_cannot_run_here_can_be_written(monkeypatch):
+    missing = replace(registry.find_plant("bullet"), needs=("a_package_that_is_not_there",))
+    monkeypatch.setattr(resolved, "find_plant", lambda _: missing)
+    monkeypatch.setattr(registry, "find_plant", lambda _: missing)
+    assert "bullet" in sections(("bullet",), ("constant",), ("exp2",))
+    with pytest.raises(ConfigurationError, match="plant 'bullet' needs a_package_that_is_not_there"):
+        resolve_sections([RunRequest("bullet", "constant", "exp2", "none", 0)], Settings())
