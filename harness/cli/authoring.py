@@ -11,9 +11,9 @@ from typing import Annotated, Final
 
 import typer
 
-from servobench.harness.cli import completion, options
-from servobench.harness.cli.selection import known_robot, one_sensing
-from servobench.harness.cli.terminal import console, print_tables, say
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import Option
+from servobench.harness.cli.terminal import FAILED, console, print_tables, say
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
@@ -28,7 +28,7 @@ LEGEND: Final = "The log does not answer to the controller, so that this does no
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
-    folder: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
+    folder: Annotated[Path, Option("--folder", "FOLDER", "Folder for the files.")] = Path(),
 ) -> None:
     """Write a commented controller or plant, and its test."""
     from servobench.harness.config.settings import ConfigurationError
@@ -62,7 +62,7 @@ def check(
     subject: Annotated[
         list[str], typer.Argument(metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic.")
     ],
-    limit: Annotated[float, typer.Option(min=1.0, help="Time limit of one check [s].")] = 60.0,
+    limit: Annotated[float, Option("--limit", "SECONDS", "Time limit of one check [s].", least=1.0)] = 60.0,
 ) -> None:
     """Check a controller or a plant against its contract.
 
@@ -98,25 +98,27 @@ def check(
     failed = sum(finding.verdict == "failed" for finding in findings)
     console.print(f"{name}: " + (f"{failed} of {len(findings)} checks failed" if failed else "keeps its contract"))
     if failed:
-        sys.exit(options.FAILED)
+        sys.exit(FAILED)
 
 
 def shadow(
     log: Annotated[
-        Path,
-        typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps."),
+        Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
     ],
     controller: Annotated[
         str | None,
-        typer.Option(
-            help="Name or file of the controller; default: that of the run.", autocompletion=completion.controllers
+        Option(
+            "--controller",
+            "NAME",
+            "Name or file of the controller; default: that of the run.",
+            selection.complete_controllers,
         ),
     ] = None,
-    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+    run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file for what it would have commanded at each instant.")
+        Path | None, Option("--out", "FILE", "CSV file for the commands of the controller at each instant.")
     ] = None,
 ) -> None:
     """Show a controller a logged run and compare commands.
@@ -138,7 +140,7 @@ def shadow(
     elif chosen is None:
         raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
     else:
-        resolved, table = logged_in_file(log, chosen, known_robot(robot), one_sensing(sensing))
+        resolved, table = logged_in_file(log, chosen, robot, sensing)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     if out is not None:

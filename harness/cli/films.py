@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servobench.harness.cli import completion
-from servobench.harness.cli.selection import split_names
+from servobench.harness.cli import selection
+from servobench.harness.cli.options import Option, RunIdOption
 from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ RECORDED = {
 RECORDINGS = "recordings"
 
 
-def _new(what: str, complete: Callable[[str], list[str]] | None = None) -> Any:  # noqa: ANN401 - typer's word for it
-    return typer.Option(help=f"New run: {what}, default {RECORDED[what]}.", autocompletion=complete)
+def _new(name: str, complete: Callable[[str], list[str]] | None = None, value: str = "NAME") -> Option:
+    return Option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.", complete)
 
 
 @dataclass(frozen=True)
@@ -38,46 +38,49 @@ class NewRun:
 
     plant: Annotated[
         str | None,
-        typer.Option(
-            help="New run: plant, default bullet, or mujoco without PyBullet.", autocompletion=completion.plants
+        Option(
+            "--plant", "NAME", "New run: plant, default bullet, or mujoco without PyBullet.", selection.complete_plants
         ),
     ] = None
-    controller: Annotated[str | None, _new("controller", completion.controllers)] = None
-    task: Annotated[str | None, _new("task", completion.tasks)] = None
-    mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None
-    robot: Annotated[str | None, _new("robot", completion.robots)] = None
-    seed: Annotated[int | None, _new("seed")] = None
+    controller: Annotated[str | None, _new("controller", selection.complete_controllers)] = None
+    task: Annotated[str | None, _new("task", selection.complete_tasks)] = None
+    mismatch: Annotated[str | None, _new("mismatch", selection.complete_mismatches)] = None
+    robot: Annotated[str | None, _new("robot", selection.complete_robots)] = None
+    seed: Annotated[int | None, _new("seed", value="INTEGER")] = None
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="New run: one setting, such as bullet.latency=0.05.")
+        list[str] | None, Option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
     ] = None
-    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None
+    config: Annotated[Path | None, Option("--config", "FILE", "New run: TOML file with settings.")] = None
 
     def given(self) -> list[str]:
         """Return the options of it that were given."""
         return [f"--{name.rstrip('_')}" for name, value in vars(self).items() if value not in (None, [])]
 
-    def asked(self) -> dict[str, Any]:
-        """Return what the run is of, with defaults for what was not given."""
+    def names(self) -> dict[str, Any]:
+        """Return the names and the seed of the run, with defaults for those that were not given."""
         from servobench.harness.config.engines import rendered_plant
 
-        named = {name: getattr(self, name) for name in ("plant", *RECORDED)}
-        chosen = {name: value for name, value in named.items() if value is not None}
-        return {"plant": rendered_plant(self.plant), **RECORDED, **chosen}
+        given = {name: value for name in RECORDED if (value := getattr(self, name)) is not None}
+        return {"plant": rendered_plant(self.plant), **RECORDED, **given}
 
 
 def record(
     folder: Annotated[
         Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
     ] = None,
-    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
-    new: NewRun = NewRun(),
-    kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
-    begin: Annotated[float, typer.Option(min=0.0, help="Time in the run at which the film begins [s].")] = 0.0,
+    *,
+    run: RunIdOption = None,
+    new: NewRun,
+    kinds: Annotated[str, Option("--kinds", "NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    begin: Annotated[
+        float, Option("--begin", "SECONDS", "Time in the run at which the film begins [s].", least=0.0)
+    ] = 0.0,
     length: Annotated[
-        float | None, typer.Option(min=0.001, help="Length of the film [s]; default: to the end of the run.")
+        float | None,
+        Option("--length", "SECONDS", "Length of the film [s]; default: to the end of the run.", least=0.001),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the films; default: recordings in the results folder.")
+        Path | None, Option("--out", "FOLDER", "Folder for the films; default: recordings in the results folder.")
     ] = None,
 ) -> None:
     """Make a film (MP4, GIF) and snapshots of a run.
@@ -89,7 +92,7 @@ def record(
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
 
-    wanted = split_names("kinds", kinds, KINDS, find_kind)
+    wanted = selection.split_names("kinds", kinds, KINDS, find_kind)
     into = out or (folder or Path("results")) / RECORDINGS
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
@@ -148,10 +151,10 @@ def _carried_out(new: NewRun) -> LoggedRun:
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.rendered.settings import RenderedConfig
 
-    asked, settings = new.asked(), read_settings(new.config, new.set_ or [])
-    (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
-    chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
-    request = RunRequest(**asked | chosen)
+    names, settings = new.names(), read_settings(new.config, new.set_ or [])
+    (plant,), (controller,) = choose_plants([names["plant"]]), choose_controllers([names["controller"]])
+    chosen = {"plant": plant, "mismatch": read_mismatch(names["mismatch"]), "controller": controller}
+    request = RunRequest(**names | chosen)
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servobench.harness.cli import completion, options, selection
-from servobench.harness.cli.options import RobotOption
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import JsonOption
 from servobench.harness.cli.terminal import console, print_json, say
 
 if TYPE_CHECKING:
@@ -20,11 +21,10 @@ if TYPE_CHECKING:
 DEFAULT_ROBOT = "ur5"
 STANDARD_OUTPUT = Path("-")
 HELP = "Name whose settings to show."
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 
 
 def plants(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.plants)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_plants)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
@@ -41,7 +41,7 @@ def plants(
 
 
 def controllers(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.controllers)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_controllers)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
@@ -63,8 +63,8 @@ def controllers(
 
 
 def tasks(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.tasks)] = None,
-    robot: RobotOption = DEFAULT_ROBOT,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
+    robot: Annotated[str, replace(options.ROBOT, check=None)] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
@@ -92,11 +92,12 @@ def sensing(as_json: JsonOption = False) -> None:
 
 def init(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The new file; - prints it.")] = Path("bench.toml"),
+    *,
     plants: options.PlantsOption = "kinematic,bullet",
     controllers: options.ControllersOption = "ukf_mfac",
     tasks: options.TasksOption = "exp2",
     robot: options.RobotOption = "ur5",
-    overrides: options.Overrides = options.OVERRIDES,
+    overrides: options.Overrides,
 ) -> None:
     """Write a configuration file with all settings, explained.
 
@@ -110,8 +111,8 @@ def init(
     from servobench.harness.run.tasks import find_task
 
     names = selection.split_plants(plants), selection.split_controllers(controllers), selection.split_tasks(tasks)
-    arm, nominal = selection.known_robot(robot), read_mismatch("none")
-    requests = [RunRequest(*each, nominal, 0, robot=arm) for each in product(*names)]
+    nominal = read_mismatch("none")
+    requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
     settings.check_sections([*known_sections(), *names[0], *names[1]])
     finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}

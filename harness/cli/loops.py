@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import Option
 from servobench.harness.cli.terminal import console, print_tables
 
 if TYPE_CHECKING:
@@ -23,28 +24,22 @@ TABLE = "analyse.csv"
 
 def analyse(
     controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
-    mismatch: Annotated[
-        str,
-        typer.Option(
-            help="Difference of the true robot from the nominal one: none, factory, moderate, severe, or axes."
-        ),
-    ] = "none",
-    seed: Annotated[int, typer.Option(help="Seed of the warm-up move and of the robot.")] = 0,
+    *,
+    mismatch: options.MismatchOption = "none",
+    seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
-        str, typer.Option(help="Jacobian that estimators are fixed at: true, nominal or estimated.")
+        str, Option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated.")
     ] = "true",
     identify: Annotated[
-        bool,
-        typer.Option(
-            "--identify", help="Identify all loops from logged small motions, while estimators go on learning."
-        ),
+        bool, Option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning.")
     ] = False,
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Also find the limits of gain and latency by simulation.")
+        bool, Option("--simulate", "", "Also find the limits of gain and latency by simulation.")
     ] = False,
-    overrides: options.Overrides = options.OVERRIDES,
-    out: Annotated[Path, typer.Option(help="Folder for table, pictures and page.")] = Path("results") / "analyse",
+    overrides: options.Overrides,
+    out: Annotated[Path, Option("--out", "FOLDER", "Folder for table, pictures and page.")] = Path("results")
+    / "analyse",
 ) -> None:
     """Analyse the loop at rest: margins, Bode, Nyquist, step.
 
@@ -56,8 +51,8 @@ def analyse(
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.contract.faults import RunFault
 
-    source, arm = _source(jacobian), selection.known_robot(robot)
-    runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
+    source = _source(jacobian)
+    runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []
     for run in runs:
         with console.status(f"analysing {run.request.controller}"):

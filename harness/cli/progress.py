@@ -23,7 +23,7 @@ from rich.status import Status
 from rich.text import Text
 
 from servobench.harness.batch.campaign import Observer, Row
-from servobench.harness.cli.options import INTERRUPTED
+from servobench.harness.cli.terminal import INTERRUPTED
 
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
 

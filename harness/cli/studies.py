@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import Option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,28 +24,31 @@ if TYPE_CHECKING:
     from servobench.harness.studies.tuning.objective import TuningSet
 
 DEFAULT_CONTROLLERS = "arm_mfac, map_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
-EXIT_DIFFERENT = 1
+SWEPT = options.Combinations(controllers="rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid", tasks="random", seeds="10")
 
 
 def sweep(
+    *,
     out: options.FolderOption,
-    plants: options.PlantsOption = "kinematic",
-    controllers: options.ControllersOption = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
-    tasks: options.TasksOption = "random",
-    mismatch: options.MismatchesOption = "moderate",
-    robot: options.RobotOption = "ur5",
-    sensing: options.SensingsOption = "position",
+    combinations: options.Combinations = SWEPT,
     vary: Annotated[
         list[str] | None,
-        typer.Option(help="Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg."),
+        Option(
+            "--vary",
+            "AXIS=VALUES",
+            "Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg.",
+        ),
     ] = None,
-    noise: Annotated[str, typer.Option(help="Comma-separated factors on the plants' sensor noise.")] = "1",
-    latency: Annotated[str, typer.Option(help="Comma-separated camera latencies [s]; default: the plant's.")] = "",
-    period: Annotated[str, typer.Option(help="Comma-separated control periods [s]; default: run.period.")] = "",
-    seeds: options.SeedsOption = "10",
-    running: options.Running = options.RUNNING,
-    overrides: options.Overrides = options.OVERRIDES,
-    judging: options.Judging = options.JUDGING,
+    noise: Annotated[str, Option("--noise", "NUMBERS", "Comma-separated factors on the plants' sensor noise.")] = "1",
+    latency: Annotated[
+        str, Option("--latency", "SECONDS", "Comma-separated camera latencies [s]; default: the plant's.")
+    ] = "",
+    period: Annotated[
+        str, Option("--period", "SECONDS", "Comma-separated control periods [s]; default: run.period.")
+    ] = "",
+    running: options.Running,
+    overrides: options.Overrides,
+    judging: options.Judging,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each.
 
@@ -55,20 +57,11 @@ def sweep(
     from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
-    from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.batch.sweep import SweepPlan, parse_variation
     from servobench.harness.cli.progress import watching
 
     plan = SweepPlan(
-        Batch(
-            selection.split_plants(plants, robot=robot),
-            selection.split_controllers(controllers, robot),
-            selection.split_tasks(tasks),
-            selection.split_mismatches(mismatch),
-            parse_seeds(seeds),
-            selection.known_robot(robot),
-            selection.split_sensings(sensing),
-        ),
+        combinations.batch(),
         tuple(parse_variation(text) for text in vary or []),
         tuple(_numbers("noise", noise)),
         _times("latency", latency),
@@ -108,17 +101,18 @@ def _numbers(option: str, text: str) -> list[float]:
 
 
 def robustness(
+    *,
     out: options.FolderOption,
-    plant: Annotated[str, typer.Option(help="Name or file of the plant.")] = "fmu",
+    plant: Annotated[str, Option("--plant", "NAME", "Name or file of the plant.", selection.complete_plants)] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
-        str, typer.Option(help="Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
+        str, Option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
     ] = "",
-    running: options.Running = options.RUNNING,
-    overrides: options.Overrides = options.OVERRIDES,
+    running: options.Running,
+    overrides: options.Overrides,
 ) -> None:
     """Draw success and settling time along seven axes.
 
@@ -131,31 +125,29 @@ def robustness(
 
     settings = overrides.settings()
     lines = find_lines([axis.strip() for axis in axes.split(",") if axis.strip()])
-    arm = selection.known_robot(robot)
-    names = selection.split_controllers(controllers, arm)
-    where = selection.split_plants(plant, "plant", arm)[0]
-    seen = selection.one_sensing(sensing)
+    names = selection.split_controllers(controllers, robot)
+    where = selection.split_plants(plant, "plant", robot)[0]
     with watching(console, out) as observer:
         how = running.execution(observer)
-        files = make_map(out, where, names, parse_seeds(seeds), settings, how, arm, lines, seen)
+        files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 
 def claims(
+    *,
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[
-        int, typer.Option(metavar="COUNT", help="Robots for each move; two fifths of them for the circle.")
-    ] = 500,
+    seeds: Annotated[int, Option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
-        str, typer.Option(help="Form of the methods: equipped (all aids), published (the law as printed) or both.")
+        str,
+        Option(
+            "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
+        ),
     ] = "both",
-    running: options.Running = options.RUNNING,
+    running: options.Running,
     check: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Table of answers that must come out the same; the exit code is 1 if they differ."
-        ),
+        Option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
     ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
@@ -182,32 +174,42 @@ def claims(
         lines = differences(answers, wanted)
         console.print("\n".join(lines) or f"the same answers as in {check}", soft_wrap=True, markup=False)
         if lines:
-            sys.exit(EXIT_DIFFERENT)
+            sys.exit(FAILED)
 
 
 def tune(
-    controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
+    *,
+    controllers: Annotated[
+        str,
+        Option(
+            "--controllers",
+            "NAMES",
+            "Comma-separated names, or all that have a search space.",
+            selection.completing_lists(selection.complete_controllers),
+        ),
+    ] = "all",
     studies: Annotated[
-        int, typer.Option(help="Studies of each method; the one that is best on a second set of robots is taken.")
+        int,
+        Option(
+            "--studies", "COUNT", "Studies of each method; the one that is best on a second set of robots is taken."
+        ),
     ] = 3,
-    trials: Annotated[int, typer.Option(help="Trials of each study, known settings included.")] = 100,
+    trials: Annotated[int, Option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
-        int, typer.Option(help="Upper limit on the points of the coordinate search that ends a study.")
+        int, Option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, typer.Option(help="Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, Option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
     plants: options.PlantsOption = "kinematic",
-    place: options.Place = options.PLACE,
+    place: options.Place,
     offset: Annotated[
-        int, typer.Option(help="First seed, counted from the beginning of the range kept for tuning.")
+        int, Option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
     ] = 0,
-    study_seed: Annotated[int, typer.Option(help="Seed of the first study's sampler.")] = 0,
+    study_seed: Annotated[int, Option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
         bool,
-        typer.Option(
-            "--check", help="Change each tuned value in use one by one instead, and name changes that are better."
-        ),
+        Option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
     ] = False,
-    out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
+    out: Annotated[Path, Option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
 ) -> None:
@@ -246,7 +248,7 @@ def tune(
 
 def _say_interrupted() -> None:
     console.print("interrupted; the same call continues where it stopped")
-    sys.exit(options.INTERRUPTED)
+    sys.exit(INTERRUPTED)
 
 
 def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
@@ -271,7 +273,7 @@ def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers
     found = improvements(checked.changes())
     console.print(_change_table(found) if found else f"no change improves a score by more than {TOLERANCE:.0%}")
     if found:
-        sys.exit(EXIT_DIFFERENT)
+        sys.exit(FAILED)
 
 
 def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> bool:

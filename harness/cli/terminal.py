@@ -15,6 +15,9 @@ from rich.console import Console
 if TYPE_CHECKING:
     import pandas as pd
 
+FAILED = 1  # exit code where a run failed, a check was not passed or answers are different
+INPUT_ERROR = 2  # exit code
+INTERRUPTED = 130  # exit code after Ctrl-C
 TERMINATED = 128 + signal.SIGTERM  # exit code
 
 KEYS = ("controller", "mismatch", "noise", "latency", "period", "pair")  # first columns that say what a row is about
