@@ -2,7 +2,7 @@
 
     python .ci/release.py [--dist dist] [--python python3.13]
 
-What it leaves in the folder of `--dist` is what would be uploaded. Nothing is uploaded.
+It leaves the files for an upload in the folder of `--dist`. Nothing is uploaded.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def build(dist: Path) -> tuple[Path, Path]:
 
 
 def faults_of_wheel(path: Path) -> list[str]:
-    """Return what is wrong with the names of files and the metadata of a wheel."""
+    """Return the faults of a wheel: names of files, metadata."""
     with zipfile.ZipFile(path) as wheel:
         names = set(wheel.namelist())
     faults = [f"{path.name} lacks {PACKAGE}/{name}" for name in NEEDED if f"{PACKAGE}/{name}" not in names]
@@ -88,7 +88,7 @@ def faults_of_wheel(path: Path) -> list[str]:
 
 
 def faults_of_source(path: Path) -> list[str]:
-    """Return what a source distribution lacks."""
+    """Return the faults of a source distribution: missing files."""
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     return [f"{path.name} lacks {name}" for name in IN_SOURCE if name not in names]
@@ -129,7 +129,7 @@ def describe(python: Path) -> str:
 
 
 def rehearse(python: Path, folder: Path) -> None:
-    """Make a run in an empty folder with what is installed."""
+    """Make a run in an empty folder with the installed package."""
     folder.mkdir()
     quiet(python, "-m", PACKAGE, "--version", folder=folder)
     quiet(python, "-m", PACKAGE, *RUN, "out", folder=folder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import Option, RunIdOption
-from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
+from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Option, RunIdOption, Value
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, refuse, say
 
 if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
@@ -28,8 +27,8 @@ RECORDED = {
 RECORDINGS = "recordings"
 
 
-def _new(name: str, complete: Callable[[str], list[str]] | None = None, value: str = "NAME") -> Option:
-    return Option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.", complete)
+def _new(name: str, value: Value | str) -> Option:
+    return Option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.")
 
 
 @dataclass(frozen=True)
@@ -38,15 +37,13 @@ class NewRun:
 
     plant: Annotated[
         str | None,
-        Option(
-            "--plant", "NAME", "New run: plant, default bullet, or mujoco without PyBullet.", selection.complete_plants
-        ),
+        Option("--plant", PLANT, "New run: plant, default bullet, or mujoco without PyBullet."),
     ] = None
-    controller: Annotated[str | None, _new("controller", selection.complete_controllers)] = None
-    task: Annotated[str | None, _new("task", selection.complete_tasks)] = None
-    mismatch: Annotated[str | None, _new("mismatch", selection.complete_mismatches)] = None
-    robot: Annotated[str | None, _new("robot", selection.complete_robots)] = None
-    seed: Annotated[int | None, _new("seed", value="INTEGER")] = None
+    controller: Annotated[str | None, _new("controller", CONTROLLER)] = None
+    task: Annotated[str | None, _new("task", TASK)] = None
+    mismatch: Annotated[str | None, _new("mismatch", MISMATCH)] = None
+    robot: Annotated[str | None, _new("robot", ROBOT)] = None
+    seed: Annotated[int | None, _new("seed", "INTEGER")] = None
     set_: Annotated[
         list[str] | None, Option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
     ] = None
@@ -60,7 +57,7 @@ class NewRun:
         """Return the names and the seed of the run, with defaults for those that were not given."""
         from servobench.harness.config.engines import rendered_plant
 
-        given = {name: value for name in RECORDED if (value := getattr(self, name)) is not None}
+        given = {name: value for name in ("plant", *RECORDED) if (value := getattr(self, name)) is not None}
         return {"plant": rendered_plant(self.plant), **RECORDED, **given}
 
 
@@ -106,25 +103,21 @@ def record(
 
 def _check_writable(folder: Path) -> None:
     """Refuse a folder that takes no film before a run is carried out and drawn."""
-    from servobench.harness.config.settings import ConfigurationError
-
     standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     if not standing.is_dir():
-        raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
+        refuse(f"{folder} cannot be written: {standing} is a file")
     if not os.access(standing, os.W_OK | os.X_OK):
-        raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
+        refuse(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
 
 
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or carry out a new one."""
-    from servobench.harness.config.settings import ConfigurationError
-
     if folder is not None:
         if given := new.given():
-            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+            refuse(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
         return _run_of(folder, run_id)
     if run_id is not None:
-        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+        refuse("--run names a run of a results folder, and no folder is given")
     return _carried_out(new)
 
 

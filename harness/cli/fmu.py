@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import Option, command
-from servobench.harness.cli.terminal import FAILED, console
+from servobench.harness.cli import options
+from servobench.harness.cli.options import CONTROLLER, Option, command
+from servobench.harness.cli.terminal import FAILED, console, refuse
 
 if TYPE_CHECKING:
     from servobench.fmus.compile import Platform
@@ -46,12 +46,11 @@ class Export:
     def compiling(self) -> Iterator[tuple[Platform, ...]]:
         """Yield the platforms; an error of the export or of a compiler becomes one line for the user."""
         from servobench.fmus.compile import parse_platforms
-        from servobench.harness.config.settings import ConfigurationError
 
         try:
             yield parse_platforms(self.platforms)
         except (ValueError, OSError) as error:
-            raise ConfigurationError(str(error)) from error
+            refuse(str(error))
 
     def request(self, controller: str, settings: Settings) -> RunRequest:
         """Return the run of a controller, and refuse settings that it does not read."""
@@ -82,7 +81,7 @@ class Export:
 @command
 def export(
     *,
-    output: Annotated[Path, Option("--output -o", "FILE", "The .fmu file to write.", files=True)],
+    output: Annotated[Path, Option("--output -o", "FILE", "The .fmu file to write.")],
     fmi: Annotated[
         int,
         Option(
@@ -92,25 +91,18 @@ def export(
         ),
     ] = 2,
     controller: Annotated[
-        str | None,
-        Option(
-            "--controller",
-            "NAME",
-            "Name or file of a controller to export instead of the arm.",
-            selection.complete_controllers,
-        ),
+        str | None, Option("--controller", CONTROLLER, "Name or file of a controller to export instead of the arm.")
     ] = None,
     exported: Export,
     overrides: options.Overrides,
 ) -> None:
     """Export an arm with a mismatch as start values, or a controller."""
     from servobench.fmus.product import check_version
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.controller_fmu import controller_model
 
     settings = overrides.settings()
     if controller is None and settings.sections:
-        raise ConfigurationError("--config and --set are for --controller; an arm has --mismatch")
+        refuse("--config and --set are for --controller; an arm has --mismatch")
     with exported.compiling() as platforms:
         if controller is None:
             product = exported.arm(fmi)
@@ -126,10 +118,8 @@ def export(
 @command
 def ssp(
     *,
-    output: Annotated[Path, Option("--output -o", "FILE", "The .ssp file to write.", files=True)],
-    controller: Annotated[
-        str, Option("--controller", "NAME", "Name or file of the controller.", selection.complete_controllers)
-    ],
+    output: Annotated[Path, Option("--output -o", "FILE", "The .ssp file to write.")],
+    controller: Annotated[str, Option("--controller", CONTROLLER, "Name or file of the controller.")],
     exported: Export,
     overrides: options.Overrides,
 ) -> None:
@@ -174,12 +164,11 @@ def info(file: FileArgument) -> None:
     from rich.table import Table
 
     from servobench.fmus.information import read_information
-    from servobench.harness.config.settings import ConfigurationError
 
     try:
         information = read_information(file)
     except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+        refuse(str(error))
     console.print(f"{information.model_name}: FMI {information.fmi_version}, {', '.join(information.interfaces)}")
     console.print(f"made by {information.tool}; token {information.token}")
     sources = "; with sources" if information.has_sources else ""

@@ -13,7 +13,7 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import JsonOption
-from servobench.harness.cli.terminal import console, print_json, say
+from servobench.harness.cli.terminal import console, print_json, refuse, say, writing
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trial import Tried
@@ -64,25 +64,24 @@ def controllers(
 
 def tasks(
     name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
-    robot: Annotated[str, replace(options.ROBOT, check=None)] = DEFAULT_ROBOT,
+    robot: Annotated[str, replace(options.ROBOT_OPTION, value=replace(options.ROBOT, check=None))] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
     from servobench.harness.config.robots import find_robot
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.tasks import TASKS, find_task
     from servobench.harness.run.teaching import taught
 
     if name:
         _show_settings(name, taught(find_task(name), find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
-        raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
+        refuse("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
         _show_names([_described(name, entry.summary) for name, entry in TASKS.items()], as_json=as_json)
 
 
 def sensing(as_json: JsonOption = False) -> None:
-    """List the sensing set-ups: what cameras measure of the arm."""
+    """List the sensing set-ups: features that cameras measure."""
     from servobench.plant.cameras.registry import EYES
 
     _show_names([_described(name, entry.summary) for name, entry in EYES.items()], as_json=as_json)
@@ -104,7 +103,7 @@ def init(
     Each has its value, and as a comment its meaning, unit, range and default. No file is overwritten.
     """
     from servobench.harness.config.registry import find_controller, find_plant
-    from servobench.harness.config.settings import ConfigurationError, Settings
+    from servobench.harness.config.settings import Settings
     from servobench.harness.config.template import configuration_file
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import known_sections, resolve_sections
@@ -128,13 +127,10 @@ def init(
     if file == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    try:
-        with file.open("x", encoding="utf-8") as new:
-            new.write(text)
-    except FileExistsError:
-        raise ConfigurationError(f"{file} exists already and is left as it is; name another file") from None
-    except OSError as error:
-        raise ConfigurationError(f"{file} cannot be written: {error.strerror}") from error
+    if file.exists():
+        refuse(f"{file} exists already and is left as it is; name another file")
+    with writing(file), file.open("x", encoding="utf-8") as new:
+        new.write(text)
     say(f"{file}: {', '.join(sections)}")
 
 
@@ -143,7 +139,7 @@ def _described(name: str, summary: str) -> dict[str, str]:
 
 
 def _listed(all_of_them: Iterable[Tried], unused: Iterable[tuple[str, str]]) -> list[dict[str, str]]:
-    """Return names with their summaries, and what is wrong with those that cannot be used."""
+    """Return names with their summaries, or with the fault of those that cannot be used."""
     found = [
         {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
         for each in all_of_them
@@ -166,14 +162,14 @@ def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:
     for each in found:
         base = summaries.get(each["name"].partition(":")[0], "")
         words = each.get("summary", "")
-        if base and words != base:  # a variant: only what is different
+        if base and words != base:  # a variant: only the difference
             words = words.removeprefix(base).lstrip("; ")
         table.add_row(Text(each["name"]), Text(words) if words else Text(each.get("error", ""), style="red"))
     console.print(table)
 
 
 def _show_settings(section: str, config: object, *, as_json: bool) -> None:
-    """Print each setting with its default, and what it means."""
+    """Print each setting with its default and its meaning."""
     from rich.padding import Padding
     from rich.text import Text
 

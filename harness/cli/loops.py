@@ -9,7 +9,7 @@ import typer
 
 from servobench.harness.cli import options, selection
 from servobench.harness.cli.options import Option
-from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.terminal import console, print_tables, refuse, writing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,8 @@ def analyse(
         str, Option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated.")
     ] = "true",
     identify: Annotated[
-        bool, Option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning.")
+        bool,
+        Option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning."),
     ] = False,
     simulate: Annotated[
         bool, Option("--simulate", "", "Also find the limits of gain and latency by simulation.")
@@ -47,7 +48,6 @@ def analyse(
     """
     from servobench.harness.analysis.loops.loop_analysis import analyse_loop
     from servobench.harness.analysis.loops.table import LEGEND, loop_table, printed
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.contract.faults import RunFault
 
@@ -61,17 +61,15 @@ def analyse(
             except RunFault as fault:
                 console.print(f"{run.request.controller}: {fault}", soft_wrap=True, markup=False)
     if not loops:
-        raise ConfigurationError("no loop is left to analyse")
+        refuse("no loop is left to analyse")
     table = loop_table(loops)
     if simulate:
         chosen = {run.request.controller: run for run in runs}
         with console.status("simulating"):
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"{out} cannot be written: {error.strerror}") from error
-    table.to_csv(out / TABLE, index=False)
+        table.to_csv(out / TABLE, index=False)
     text = printed(table)
     page = write_pictures(out, loops, text, LEGEND)[0]
     title = f"Loops at rest, estimators frozen at the {source} Jacobian"
@@ -81,14 +79,13 @@ def analyse(
 
 def _source(jacobian: str) -> Source:
     from servobench.harness.analysis.loops.equilibrium import SOURCES
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.contract.settings import did_you_mean
 
-    for source in SOURCES:
-        if source == jacobian:
-            return source
-    hint = did_you_mean(jacobian, SOURCES)
-    raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
+    known = [source for source in SOURCES if source == jacobian]
+    if not known:
+        hint = did_you_mean(jacobian, SOURCES)
+        refuse(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
+    return known[0]
 
 
 def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:

@@ -93,12 +93,12 @@ def main() -> None:
     except KeyboardInterrupt:  # before the command began
         code = INTERRUPTED
     except typer.TyperException as error:
-        _refuse(_usage_line(error))
+        _end(_usage_line(error))
     except (ValueError, ImportError) as error:
         line = _line_for_user(error)
         if line is None:
             raise
-        _refuse(line)
+        _end(line)
     except OSError as error:
         line = _line_of_system(error)
         if line is None or "--debug" in sys.argv:
@@ -124,7 +124,7 @@ def _say_where_a_signal_strikes() -> None:
             faulthandler.enable(sys.__stderr__)
 
 
-def _refuse(line: str) -> NoReturn:
+def _end(line: str) -> NoReturn:
     if line:
         sys.stderr.write(f"servobench: {line}\n")
     sys.exit(INPUT_ERROR)
@@ -164,7 +164,7 @@ def _line_for_user(error: ValueError | ImportError) -> str | None:
 
 @contextlib.contextmanager
 def rejoining_words() -> Iterator[None]:
-    """Let bash complete within a word that it splits at a colon or an equals sign; it wants what follows the last."""
+    """Let bash complete within a word that it splits at a colon or an equals sign; it wants the part behind the last."""
     if os.environ.get(COMPLETION_REQUEST) != BASH:
         yield
         return

@@ -1,8 +1,8 @@
 """Options of the command line, each declared once, and commands made of them.
 
-The type of a parameter declares its option: `Robot = Annotated[str, Option("--robot", "NAME", "…")]`. Its row is all
-there is to an option: help pages, completion by shells, checks and the table of docs/commands.md are made from it.
-A parameter whose type is a dataclass stands for its fields, each of which is an option; its default gives theirs.
+The type of a parameter declares its option: `seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the run.")]`.
+Help pages, completion by shells, checks and the table in docs/commands.md are made from this one row. A parameter whose
+type is a dataclass stands for its fields, each of which is an option.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from servobench.harness.cli import selection
+from servobench.harness.cli.terminal import refuse
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
@@ -28,41 +29,68 @@ EXECUTION = "Execution"  # panel of the options for workers, limits and resuming
 
 
 @dataclass(frozen=True)
+class Value:
+    """A kind of value that options take.
+
+    Attributes:
+        word: its name in help pages.
+        complete: values that a shell offers for an incomplete one.
+        check: returns the value of a text that was given or is the default, or refuses it.
+    """
+
+    word: str
+    complete: Callable[[str], list[str]] | None = None
+    check: Callable[[str], str] | None = None
+
+    def several(self) -> Value:
+        """Return the value of an option that takes a comma-separated list of these."""
+        return Value(f"{self.word}S", selection.completing_lists(self.complete) if self.complete else None)
+
+
+PLANT = Value("NAME", selection.complete_plants)
+CONTROLLER = Value("NAME", selection.complete_controllers)
+ESTIMATOR = Value("NAME", selection.complete_estimators)
+TASK = Value("NAME", selection.complete_tasks)
+MISMATCH = Value("NAME", selection.complete_mismatches)
+ROBOT = Value("NAME", selection.complete_robots, selection.known_robot)
+SENSING = Value("NAME", selection.complete_sensings, selection.known_sensing)
+
+
+@dataclass(frozen=True)
 class Option:
     """An option of the command line.
 
     Attributes:
         name: with its dashes; `--on/--off` for a switch with two names, `--output -o` for a short one.
-        value: word for its value in help pages; empty for a switch.
+        value: kind of its value, or only the word for it; empty for a switch.
         help: meaning, unit in brackets.
-        complete: values that a shell offers for an incomplete one.
-        check: returns the value of a string that was given or is the default, or refuses it.
         least: smallest number that is allowed.
         panel: title under which help pages show it.
-        files: whether it takes a file and no folder.
         absent: command without this option -> the reason.
     """
 
     name: str
-    value: str
+    value: Value | str
     help: str
-    complete: Callable[[str], list[str]] | None = None
-    check: Callable[[str], str] | None = None
     least: float | None = None
     panel: str | None = None
-    files: bool = False
     absent: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> Value:
+        """The kind of its value."""
+        return self.value if isinstance(self.value, Value) else Value(self.value)
 
     def typed(self) -> Any:  # noqa: ANN401 - typer's own word for it
         """Return the option as typer declares it."""
         return typer.Option(
             *self.name.split(),
-            metavar=self.value,
+            metavar=self.kind.word,
             help=self.help,
-            autocompletion=self.complete,
+            autocompletion=self.kind.complete,
             min=self.least,
             rich_help_panel=self.panel,
-            dir_okay=not self.files,
+            dir_okay=self.kind.word != "FILE",
         )
 
 
@@ -83,8 +111,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         from servobench.harness.config.registry import offering
 
         for name, option in declared.items():
-            if option.check is not None and values[name] is not None:
-                values[name] = option.check(values[name])
+            if option.kind.check is not None and values[name] is not None:
+                values[name] = option.kind.check(values[name])
         for name, group in groups.items():
             values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
         with offering():  # a user's own controllers have their names for as long as the command takes
@@ -121,130 +149,47 @@ def reason_without(command_name: object, option_name: object) -> str:
     return next(reasons, "")
 
 
-def _several(name: str, listed_by: str, complete: Callable[[str], list[str]], kinds: str = "names or files") -> Option:
-    """Return the option for several of the names that a command lists."""
-    words = f"Comma-separated {kinds}, or 'all'; servobench {listed_by} lists them."
-    return Option(name, "NAMES", words, selection.completing_lists(complete))
-
-
-MISMATCH_WORDS = "none, factory, moderate, severe, or axes"
-JsonOption = Annotated[bool, Option("--json", "", "Print JSON, for other programs.")]
-ConfigOption = Annotated[
-    Path | None, Option("--config", "FILE", "TOML file with settings; a [section] for each plant, controller or task.")
-]
-SetOption = Annotated[
-    list[str] | None, Option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated.")
-]
-PlantsOption = Annotated[str, _several("--plants", "plants", selection.complete_plants)]
-ControllersOption = Annotated[str, _several("--controllers", "controllers", selection.complete_controllers)]
-TasksOption = Annotated[str, _several("--tasks", "tasks", selection.complete_tasks, "names")]
-TaskOption = Annotated[
-    str, Option("--task", "NAME", "Name of the task; servobench tasks lists them.", selection.complete_tasks)
-]
-MismatchOption = Annotated[
-    str,
-    Option(
-        "--mismatch",
-        "NAME",
-        f"Difference of the true robot from the nominal one: {MISMATCH_WORDS}, such as links=10%+tool=20mm.",
-        selection.complete_mismatches,
-    ),
-]
-MismatchesOption = Annotated[
-    str,
-    Option(
-        "--mismatch",
-        "NAMES",
-        f"Comma-separated: {MISMATCH_WORDS}, such as links=10%+tool=20mm.",
-        selection.completing_lists(selection.complete_mismatches),
-    ),
-]
-ROBOT = Option(
+AXES = "none, factory, moderate, severe, or axes, such as links=10%+tool=20mm"
+LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
+ROBOT_OPTION = Option(
     "--robot",
-    "NAME",
+    ROBOT,
     "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf.",
-    selection.complete_robots,
-    check=selection.known_robot,
     absent={
         "claims": "the claims are those of the paper, which are about a UR5",
         "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
     },
 )
-RobotOption = Annotated[str, ROBOT]
-SENSING_ABSENT = {
-    "claims": "the claims are those of the paper, which are about the ball in 3-D",
-    "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; compare "
-    "shows how they do",
-    "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
-    "record": "films show the ball's way through space; figures of run --sensing show pixels",
-    "controllers": "settings of a controller are the same under all sensing",
-}
-SensingOption = Annotated[
-    str,
-    Option(
-        "--sensing",
-        "NAME",
-        "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
-        selection.complete_sensings,
-        check=selection.known_sensing,
-        absent=SENSING_ABSENT,
-    ),
+SENSING_OPTION = Option(
+    "--sensing",
+    SENSING,
+    "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
+    absent={
+        "claims": "the claims are those of the paper, which are about the ball in 3-D",
+        "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
+        "compare shows how they do",
+        "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
+        "record": "films show the ball's way through space; figures of run --sensing show pixels",
+        "controllers": "settings of a controller are the same under all sensing",
+    },
+)
+RobotOption = Annotated[str, ROBOT_OPTION]
+SensingOption = Annotated[str, SENSING_OPTION]
+PlantsOption = Annotated[str, Option("--plants", PLANT.several(), LISTED.format("plants"))]
+ControllersOption = Annotated[str, Option("--controllers", CONTROLLER.several(), LISTED.format("controllers"))]
+TasksOption = Annotated[
+    str, Option("--tasks", TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")
 ]
-SensingsOption = Annotated[
-    str,
-    Option(
-        "--sensing",
-        "NAMES",
-        "Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the hand.",
-        selection.completing_lists(selection.complete_sensings),
-        absent=SENSING_ABSENT,
-    ),
+TaskOption = Annotated[str, Option("--task", TASK, "Name of the task; servobench tasks lists them.")]
+MismatchOption = Annotated[
+    str, Option("--mismatch", MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")
 ]
 SeedsOption = Annotated[str, Option("--seeds", "SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
 FolderOption = Annotated[Path, Option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")]
 RunIdOption = Annotated[str | None, Option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")]
+JsonOption = Annotated[bool, Option("--json", "", "Print JSON, for other programs.")]
 DebugOption = Annotated[
     bool, Option("--debug", "", "Run in this process, and stop at the first crash with its trace.", panel=EXECUTION)
-]
-StrictOption = Annotated[bool, Option("--strict", "", "End with exit code 1 if a run failed.", panel=EXECUTION)]
-ResumeOption = Annotated[
-    bool, Option("--resume", "", "Continue in a folder whose runs were interrupted.", panel=EXECUTION)
-]
-WorkersOption = Annotated[
-    int | None,
-    Option("--workers", "COUNT", "Worker processes; default: one for each processor.", least=1, panel=EXECUTION),
-]
-SchedulerOption = Annotated[
-    str | None, Option("--scheduler", "ADDRESS", "Address of a Dask scheduler to which runs are sent.", panel=EXECUTION)
-]
-TimeoutOption = Annotated[
-    float | None,
-    Option(
-        "--run-timeout",
-        "SECONDS",
-        "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
-        least=0.001,
-        panel=EXECUTION,
-    ),
-]
-MemoryOption = Annotated[
-    str | None,
-    Option(
-        "--run-memory",
-        "SIZE",
-        "Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
-        "servobench's.",
-        panel=EXECUTION,
-    ),
-]
-IsolateOption = Annotated[
-    bool,
-    Option(
-        "--isolate/--no-isolate",
-        "",
-        "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
-        panel=EXECUTION,
-    ),
 ]
 
 
@@ -255,9 +200,17 @@ class Combinations:
     plants: PlantsOption = "kinematic"
     controllers: ControllersOption = "all"
     tasks: TasksOption = "exp1,exp2,exp3,exp4,circle"
-    mismatch: MismatchesOption = "moderate"
+    mismatch: Annotated[str, Option("--mismatch", MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
     robot: RobotOption = "ur5"
-    sensing: SensingsOption = "position"
+    sensing: Annotated[
+        str,
+        replace(
+            SENSING_OPTION,
+            value=SENSING.several(),
+            help="Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the "
+            "hand.",
+        ),
+    ] = "position"
     seeds: SeedsOption = "1"
 
     def batch(self) -> Batch:
@@ -283,9 +236,35 @@ class Combinations:
 class Limited:
     """Limits of a single run."""
 
-    run_timeout: TimeoutOption = None
-    run_memory: MemoryOption = None
-    isolate: IsolateOption = True
+    run_timeout: Annotated[
+        float | None,
+        Option(
+            "--run-timeout",
+            "SECONDS",
+            "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
+            least=0.001,
+            panel=EXECUTION,
+        ),
+    ] = None
+    run_memory: Annotated[
+        str | None,
+        Option(
+            "--run-memory",
+            "SIZE",
+            "Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
+            "servobench's.",
+            panel=EXECUTION,
+        ),
+    ] = None
+    isolate: Annotated[
+        bool,
+        Option(
+            "--isolate/--no-isolate",
+            "",
+            "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
+            panel=EXECUTION,
+        ),
+    ] = True
 
     def bounds(self) -> Bounds:
         """Return them as the driver takes them.
@@ -295,12 +274,11 @@ class Limited:
         """
         from servobench.harness.batch.guard import read_size
         from servobench.harness.batch.workers import Bounds
-        from servobench.harness.config.settings import ConfigurationError
 
         try:
             memory = None if self.run_memory is None else read_size(self.run_memory)
         except ValueError as error:
-            raise ConfigurationError(f"--run-memory: {error}") from error
+            refuse(f"--run-memory: {error}")
         return Bounds(self.run_timeout, memory, self.isolate)
 
 
@@ -308,15 +286,23 @@ class Limited:
 class Place(Limited):
     """Processors or cluster that carry runs out."""
 
-    workers: WorkersOption = None
-    scheduler: SchedulerOption = None
+    workers: Annotated[
+        int | None,
+        Option("--workers", "COUNT", "Worker processes; default: one for each processor.", least=1, panel=EXECUTION),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        Option("--scheduler", "ADDRESS", "Address of a Dask scheduler to which runs are sent.", panel=EXECUTION),
+    ] = None
 
 
 @dataclass(frozen=True)
 class Running(Place):
     """Execution of runs that can be resumed."""
 
-    resume: ResumeOption = False
+    resume: Annotated[
+        bool, Option("--resume", "", "Continue in a folder whose runs were interrupted.", panel=EXECUTION)
+    ] = False
 
     def execution(self, observer: Observer | None = None) -> Execution:
         """Return it as the driver takes it."""
@@ -330,7 +316,7 @@ class Judging:
     """Treatment of runs that fail."""
 
     debug: DebugOption = False
-    strict: StrictOption = False
+    strict: Annotated[bool, Option("--strict", "", "End with exit code 1 if a run failed.", panel=EXECUTION)] = False
 
     def execution(self, running: Running) -> Execution:
         """Return the execution of runs; one by one in this process if they are debugged.
@@ -338,8 +324,6 @@ class Judging:
         Raises:
             ConfigurationError: processes or a time limit for runs that are debugged.
         """
-        from servobench.harness.config.settings import ConfigurationError
-
         how = running.execution()
         if not self.debug:
             return how
@@ -351,7 +335,7 @@ class Judging:
         }
         for option, value in given.items():
             if value:
-                raise ConfigurationError(f"--debug carries runs out one by one in this process; leave {option} away")
+                refuse(f"--debug carries runs out one by one in this process; leave {option} away")
         return replace(how, workers=1, debug=True)
 
 
@@ -359,8 +343,14 @@ class Judging:
 class Overrides:
     """Settings that a user gives."""
 
-    set_: SetOption = None
-    config: ConfigOption = None
+    set_: Annotated[
+        list[str] | None,
+        Option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated."),
+    ] = None
+    config: Annotated[
+        Path | None,
+        Option("--config", "FILE", "TOML file with settings; a [section] for each plant, controller or task."),
+    ] = None
 
     def settings(self, *further: str) -> Settings:
         """Return them, with `further` assignments on top."""

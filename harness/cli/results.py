@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from servobench.harness.cli.options import JsonOption, Option
-from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, say
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, refuse, say
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,10 +47,9 @@ def statistics(
     from servobench.harness.analysis.cells import as_plain
     from servobench.harness.analysis.tables import statistics_rows, statistics_tables
     from servobench.harness.batch import results
-    from servobench.harness.config.settings import ConfigurationError
 
     if markdown and as_json:
-        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
+        refuse("--markdown and --json are two ways to print the same; give one of them")
     runs = results.load_runs(folder)
     if as_json:
         print_json(
@@ -99,9 +98,9 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
 
 
 def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
-    """Check that a results folder holds what was written.
+    """Check the files of a results folder by their checksums.
 
-    Names each file that is damaged, and what to type. The exit code is 1 if there is one.
+    Names each damaged file and its remedy. The exit code is 1 if there is one.
     """
     from servobench.harness.batch.integrity import examine
     from servobench.harness.batch.lock import current_holder
@@ -118,7 +117,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
         say(wanting)
     if found.findings:
         sys.exit(FAILED)
-    console.print(f"{found.files} files are what was written, {found.runs} runs", markup=False, highlight=False)
+    console.print(f"{found.files} files are as they were written, {found.runs} runs", markup=False, highlight=False)
 
 
 def export(

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import Option
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, Option
 from servobench.harness.cli.results import judge, make_report, print_faults
-from servobench.harness.cli.terminal import INTERRUPTED, console, print_tables, say
+from servobench.harness.cli.terminal import INTERRUPTED, console, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,25 +44,21 @@ def run(
         str | None,
         Option(
             "--plant",
-            "NAME",
+            PLANT,
             "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed.",
-            selection.complete_plants,
         ),
     ] = None,
     controller: Annotated[
         str | None,
         Option(
             "--controller",
-            "NAME",
+            CONTROLLER,
             f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
-            selection.complete_controllers,
         ),
     ] = None,
     estimator: Annotated[
         str | None,
-        Option(
-            "--estimator", "NAME", "Compose the law --controller with this estimator.", selection.complete_estimators
-        ),
+        Option("--estimator", ESTIMATOR, "Compose the law --controller with this estimator."),
     ] = None,
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = "moderate",
@@ -82,14 +78,13 @@ def run(
     """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.settings import ConfigurationError
 
     if None not in (method, controller) and method != controller:
-        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
+        refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
     plant = selection.known_plant(plant)
     if view and plant != "bullet":
-        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {plant}")
-    law = method or controller or DEFAULT_CONTROLLER
+        refuse(f"--view shows the plant bullet only, got --plant {plant}")
+    law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.known_controller(law if estimator is None else f"{law}+{estimator}")
     seeds = parse_seeds(f"{seed},")
     batch = Batch((plant,), (name,), (task,), (mismatch,), seeds, robot, (sensing,))
@@ -109,11 +104,10 @@ def compare(
 ) -> None:
     """Compare controllers: run every combination."""
     from servobench.harness.batch.campaign import comparison
-    from servobench.harness.config.settings import ConfigurationError
 
     batch = combinations.batch()
     if running.resume and out is None:
-        raise ConfigurationError("--resume needs --out, the folder to continue in")
+        refuse("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
     folder = _carry_out(campaign, out, judging.execution(running), with_report=with_report)
     judge(folder, strict=judging.strict)
@@ -123,9 +117,7 @@ def train(
     *,
     controller: Annotated[
         str,
-        Option(
-            "--controller", "NAME", "Name of the controller whose networks to train.", selection.complete_controllers
-        ),
+        Option("--controller", CONTROLLER, "Name of the controller whose networks to train."),
     ] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",

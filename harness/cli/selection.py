@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from servobench.harness.cli.terminal import refuse, say
+
 if TYPE_CHECKING:
     from servobench.controllers.controller import ControllerEntry
     from servobench.harness.batch.trial import Tried
@@ -82,7 +84,6 @@ def _matching(incomplete: str, names: Iterable[str]) -> list[str]:
 
 def known_robot(name: str) -> str:
     """Return the name of a robot that can be found, and print the assumptions made about it."""
-    from servobench.harness.cli.terminal import say
     from servobench.harness.config.robots import find_robot
 
     note = find_robot(name).note
@@ -105,7 +106,6 @@ def known_plant(text: str | None) -> str:
     The default is the first of bullet, mujoco and kinematic that is installed.
     """
     from servobench.harness.batch.apart import choose_plants
-    from servobench.harness.cli.terminal import say
     from servobench.harness.config.engines import default_plant
     from servobench.plant.bench.plant import PlantEntry
 
@@ -145,13 +145,11 @@ def split_words(text: str) -> tuple[str, ...]:
 
 def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
     """Split a comma-separated list of names, each of which `find` accepts; `all` stands for those in `known`."""
-    from servobench.harness.config.settings import ConfigurationError
-
     if text.strip() == "all":
         return tuple(known)
     names = split_words(text)
     if not names:
-        raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
+        refuse(f"--{kind} is empty; valid: {', '.join(known)}")
     for name in names:
         find(name)
     refuse_repetition(kind, names)
@@ -160,11 +158,9 @@ def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str]
 
 def refuse_repetition(option: str, values: Sequence[object]) -> None:
     """Refuse a list that names something twice."""
-    from servobench.harness.config.settings import ConfigurationError
-
     for value in values:
         if values.count(value) > 1:
-            raise ConfigurationError(f"--{option} names {value} twice")
+            refuse(f"--{option} names {value} twice")
 
 
 def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import Option
+from servobench.harness.cli.options import CONTROLLER, PLANT, Option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -79,23 +79,20 @@ def sweep(
 
 def _times(option: str, text: str) -> tuple[float | None, ...]:
     """Return times, s; numbers from 1 on are refused because they were control periods in version 0.1."""
-    from servobench.harness.config.settings import ConfigurationError
-
     times = _numbers(option, text) if text.strip() else [None]
     if max(time or 0.0 for time in times) >= 1.0:
-        raise ConfigurationError(f"--{option} is in seconds, below 1, such as 0.05 for a period of 20 Hz; got {text!r}")
+        refuse(f"--{option} is in seconds, below 1, such as 0.05 for a period of 20 Hz; got {text!r}")
     return tuple(times)
 
 
 def _numbers(option: str, text: str) -> list[float]:
-    from servobench.harness.config.settings import ConfigurationError
 
     try:
         numbers = [float(part) for part in text.split(",") if part.strip()]
-    except ValueError as error:
-        raise ConfigurationError(f"--{option} must be comma-separated numbers, got {text!r}") from error
+    except ValueError:
+        refuse(f"--{option} must be comma-separated numbers, got {text!r}")
     if not numbers or min(numbers) < 0:
-        raise ConfigurationError(f"--{option} must be numbers from 0 on, got {text!r}")
+        refuse(f"--{option} must be numbers from 0 on, got {text!r}")
     selection.refuse_repetition(option, [f"{number:g}" for number in numbers])
     return numbers
 
@@ -103,13 +100,14 @@ def _numbers(option: str, text: str) -> list[float]:
 def robustness(
     *,
     out: options.FolderOption,
-    plant: Annotated[str, Option("--plant", "NAME", "Name or file of the plant.", selection.complete_plants)] = "fmu",
+    plant: Annotated[str, Option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
-        str, Option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
+        str,
+        Option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
     ] = "",
     running: options.Running,
     overrides: options.Overrides,
@@ -181,12 +179,7 @@ def tune(
     *,
     controllers: Annotated[
         str,
-        Option(
-            "--controllers",
-            "NAMES",
-            "Comma-separated names, or all that have a search space.",
-            selection.completing_lists(selection.complete_controllers),
-        ),
+        Option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
     ] = "all",
     studies: Annotated[
         int,
@@ -219,7 +212,6 @@ def tune(
     """
     from servobench.harness.batch.lock import locked
     from servobench.harness.batch.workers import open_workers
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.studies.tuning.campaign import TuningPlan, check_study_folder, open_methods, write_results
     from servobench.harness.studies.tuning.objective import TuningSet
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
@@ -229,7 +221,7 @@ def tune(
         runs = TuningSet(selection.split_plants(plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+        refuse(str(error))
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):
@@ -257,14 +249,12 @@ def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers
     from servobench.harness.studies.tuning.check import TOLERANCE, Check, improvements
 
     checked, lines = Check(folder, names, runs), Lines()
-    total, done = len(checked), checked.known()
-    begun = done
+    total, begun = len(checked), checked.known()
     with run_progress(console) as progress:
-        bar = progress.add_task("points", total=total, completed=done)
+        bar = progress.add_task("points", total=total, completed=begun)
         try:
-            for _ in checked.carry_out(workers):
-                progress.update(bar, advance=1)
-                done += 1
+            for done, _ in enumerate(checked.carry_out(workers), begun + 1):
+                progress.update(bar, completed=done)
                 if not console.is_terminal:
                     lines.tell((done - begun) / (total - begun), f"{done} of {total} points")
         except KeyboardInterrupt:
