@@ -55,7 +55,7 @@ class NewRun:
 
     def names(self) -> dict[str, Any]:
         """Return the names and the seed of the run, with defaults for those that were not given."""
-        from servobench.harness.config.engines import rendered_plant
+        from servobench.harness.config.registry import rendered_plant
 
         given = {name: value for name in ("plant", *RECORDED) if (value := getattr(self, name)) is not None}
         return {"plant": rendered_plant(self.plant), **RECORDED, **given}
@@ -85,7 +85,7 @@ def record(
     They show the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
-    from servobench.harness.config.engines import engine_of, rendered_plant
+    from servobench.harness.config.registry import engine_of, rendered_plant
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
 
@@ -125,7 +125,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
     from servobench.harness.batch.logged import find_run
-    from servobench.harness.config.engines import rendered_plant
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.pictures.replay import logged_run
 
     row = find_run(folder, run_id)
@@ -136,7 +136,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
     from servobench.harness.batch.apart import choose_controllers, choose_plants
-    from servobench.harness.config.engines import rendered_plant
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import flatten, read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment

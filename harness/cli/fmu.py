@@ -64,8 +64,7 @@ class Export:
     def arm(self, fmi: int) -> Product:
         """Return the arm, with the mismatch as start values."""
         from servobench.fmus.export import ExportOptions, default_actuation, product
-        from servobench.harness.config.robots import find_robot
-        from servobench.harness.config.sensing import find_sensing
+        from servobench.harness.config.robots import find_robot, find_sensing
         from servobench.plant.contract.seeds import named_seed
         from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 

@@ -43,7 +43,7 @@ app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
 
 
 def _print_version(wanted: bool) -> None:
-    from servobench.harness.config.version import version_line
+    from servobench.harness.config.installation import version_line
 
     if wanted:
         typer.echo(version_line())
@@ -154,7 +154,7 @@ def _line_of_system(error: OSError) -> str | None:
 
 def _line_for_user(error: ValueError | ImportError) -> str | None:
     """Return the one-line error for a bad input or a missing extra; None for a defect."""
-    from servobench.harness.config.extras import missing_extra
+    from servobench.harness.config.installation import missing_extra
     from servobench.harness.config.settings import ConfigurationError
 
     if isinstance(error, ImportError):
@@ -164,7 +164,7 @@ def _line_for_user(error: ValueError | ImportError) -> str | None:
 
 @contextlib.contextmanager
 def rejoining_words() -> Iterator[None]:
-    """Let bash complete within a word that it splits at a colon or an equals sign; it wants the part behind the last."""
+    """Let bash complete within a word that it splits at a colon or an equals sign; it wants the part behind it."""
     if os.environ.get(COMPLETION_REQUEST) != BASH:
         yield
         return

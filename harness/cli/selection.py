@@ -39,7 +39,7 @@ def complete_tasks(incomplete: str) -> list[str]:
 
 def complete_sensings(incomplete: str) -> list[str]:
     """Return the sensing set-ups whose names begin so."""
-    from servobench.harness.config.sensing import sensing_names
+    from servobench.harness.config.robots import sensing_names
 
     return _matching(incomplete, sensing_names())
 
@@ -94,7 +94,7 @@ def known_robot(name: str) -> str:
 
 def known_sensing(name: str) -> str:
     """Return the name of a sensing set-up that can be found; a mistyped one is refused."""
-    from servobench.harness.config.sensing import find_sensing
+    from servobench.harness.config.robots import find_sensing
 
     find_sensing(name)
     return name
@@ -106,7 +106,7 @@ def known_plant(text: str | None) -> str:
     The default is the first of bullet, mujoco and kinematic that is installed.
     """
     from servobench.harness.batch.apart import choose_plants
-    from servobench.harness.config.engines import default_plant
+    from servobench.harness.config.registry import default_plant
     from servobench.plant.bench.plant import PlantEntry
 
     if text is None:
@@ -216,6 +216,6 @@ def split_mismatches(text: str) -> tuple[str, ...]:
 
 def split_sensings(text: str) -> tuple[str, ...]:
     """Return the names of sensing set-ups, each looked up."""
-    from servobench.harness.config.sensing import find_sensing, sensing_names
+    from servobench.harness.config.robots import find_sensing, sensing_names
 
     return split_names("sensing", text, sensing_names(), find_sensing)

@@ -1,4 +1,4 @@
-"""Plants, controllers and tasks by name: those of this package and those that other distributions publish.
+"""Plants and controllers by name: those of this package and those that other distributions publish.
 
 A third party publishes a `PlantEntry`, a `ControllerEntry`, or a subclass of `Plant`, `World` or `Controller` under the
 entry-point group `servobench.plants` or `servobench.controllers`; a name of this package cannot be taken over. Those
@@ -12,18 +12,29 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose, suggest_pair
 from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
-from servobench.harness.config.extras import check_installed
-from servobench.harness.config.own import Own, describe_import, is_place, read_own
+from servobench.harness.config.entries import (
+    CONTROLLER,
+    PLANT,
+    Entry,
+    Kind,
+    Own,
+    make_entry,
+    read_own,
+)
+from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import describe_import, is_place
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.settings import suggest
+
+if TYPE_CHECKING:
+    from servobench.plant.rendered.engine import OpenScene
 
 PLANT_GROUP = "servobench.plants"
 CONTROLLER_GROUP = "servobench.controllers"
@@ -41,7 +52,6 @@ ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
-FORMER_NAMES = {"rbfnn_mfac_plus": "map_mfac"}  # understood until 0.3.0
 
 
 Offer: TypeAlias = Own[ControllerEntry] | Own[PlantEntry]
@@ -71,7 +81,7 @@ def offer(own: Offer) -> str:
     """
     name, other = own.name, _OFFERED.get(own.name)
     taken = {RUN: "a section of settings", **dict.fromkeys(plant_names(), "a plant")}
-    taken |= dict.fromkeys([*controller_names(), *FORMER_NAMES], "a controller")
+    taken |= dict.fromkeys(controller_names(), "a controller")
     if name in taken:
         raise ConfigurationError(f"{taken[name]} called {name!r} exists already; {_rename(own)}")
     if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
@@ -149,7 +159,7 @@ def published(entry: type[ControllerEntry | PlantEntry], name: str) -> EntryPoin
 def unused_points(entry: type[ControllerEntry | PlantEntry]) -> list[tuple[str, str]]:
     """Return the names of entry points that are not used, each with a line that says why: others have the name."""
     group, kind = (PLANT_GROUP, PLANT) if entry is PlantEntry else (CONTROLLER_GROUP, CONTROLLER)
-    own = PLANTS if entry is PlantEntry else (*CONTROLLERS, *FORMER_NAMES)
+    own = PLANTS if entry is PlantEntry else CONTROLLERS
     found = dict[tuple[str, str], str]()
     for point in entry_points(group=group):
         used = _points(group).get(point.name)
@@ -193,7 +203,6 @@ def find_controller(name: str) -> ControllerEntry:
             return mapped_controller(user_path(name.removeprefix(MAPPED)), name)
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
-    name = FORMER_NAMES.get(name, name)
     law, plus, estimator = name.partition("+")
     if plus:
         try:
@@ -215,7 +224,7 @@ def is_foreign_plant(name: str, *, trusted: bool = False) -> bool:
 
 def is_foreign_controller(name: str) -> bool:
     """Return whether a controller runs code that is not of this package; pairs of its laws and estimators do not."""
-    law, plus, estimator = FORMER_NAMES.get(name, name).partition("+")
+    law, plus, estimator = name.partition("+")
     return not (law in LAWS and estimator in ESTIMATORS if plus else law in CONTROLLERS)
 
 
@@ -287,3 +296,55 @@ def _load(group: str, kind: str, name: str) -> object:
     except (Exception, SystemExit) as error:
         why = describe_import(error, point.module)
         raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {why}") from error
+
+
+def engine_of(name: str) -> str:
+    """Return which engine computes or renders a plant, in a line; empty where there is none, or no such plant here."""
+    try:
+        return _told(find_plant(name))
+    except (ConfigurationError, ImportError):
+        return ""
+
+
+@cache
+def _told(entry: PlantEntry) -> str:
+    return entry.engine() if entry.engine is not None else ""
+
+
+def default_plant() -> tuple[str, str]:
+    """Return the plant of a run for which none is named, and why it is not a first choice; empty if it is.
+
+    Where PyBullet has no wheel, `mujoco` is as good a choice as `bullet`, and the one to install.
+    """
+    missing = {}
+    for name in RENDERED:
+        try:
+            installed_plant(name)
+        except ConfigurationError as error:
+            missing[name] = str(error)
+        else:
+            return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
+    return UNRENDERED, missing[RENDERED[has_no_wheel()]]
+
+
+def scene_of(plant: str) -> OpenScene:
+    """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
+    if plant == "mujoco":
+        from servobench.plant.rendered.mujoco.scene import MujocoScene  # noqa: PLC0415
+
+        return MujocoScene
+    from servobench.plant.rendered.bullet.scene import BulletScene  # noqa: PLC0415
+
+    return BulletScene
+
+
+def rendered_plant(named: str | None = None) -> str:
+    """Return the plant whose engine shows runs of the plant `named`: itself if it renders, or else one that is there.
+
+    Raises:
+        ConfigurationError: the engine is missing, or all of them are; the message says what to install.
+    """
+    name, why = (named, "") if named is not None and named in RENDERED else default_plant()
+    if name == UNRENDERED:
+        raise ConfigurationError(why)
+    return installed_plant(name).name
