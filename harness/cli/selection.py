@@ -53,7 +53,7 @@ def complete_estimators(incomplete: str) -> list[str]:
 
 def complete_mismatches(incomplete: str) -> list[str]:
     """Return the profiles and axes of mismatch whose names begin so; after a `+` the axes."""
-    from servobench.plant.robot.mismatch_axes import AXES, PROFILES
+    from servobench.plant.robot.mismatch import AXES, PROFILES
 
     before, plus, last = incomplete.rpartition("+")
     axes = [f"{axis}=" for axis in AXES]
@@ -209,7 +209,7 @@ def split_tasks(text: str) -> tuple[str, ...]:
 def split_mismatches(text: str) -> tuple[str, ...]:
     """Return mismatches, each read, so that a mistyped one is refused at once."""
     from servobench.harness.run.request import read_mismatch
-    from servobench.plant.robot.mismatch_axes import PROFILES
+    from servobench.plant.robot.mismatch import PROFILES
 
     return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
 

@@ -8,8 +8,7 @@ from typing import Final
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.settings import suggest
-from servobench.plant.robot.mismatch import parse_magnitudes
-from servobench.plant.robot.mismatch_axes import Magnitude
+from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 MOVE: Final = "camera_move"
 LATENCY: Final = "latency"
