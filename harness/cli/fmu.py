@@ -80,7 +80,7 @@ class Export:
 @command
 def export(
     *,
-    output: Annotated[Path, Option("--output -o", "FILE", "The .fmu file to write.")],
+    output: Annotated[Path, Option("--output -o", "FILE", "The .fmu file to write.", folder_okay=False)],
     fmi: Annotated[
         int,
         Option(
@@ -117,7 +117,7 @@ def export(
 @command
 def ssp(
     *,
-    output: Annotated[Path, Option("--output -o", "FILE", "The .ssp file to write.")],
+    output: Annotated[Path, Option("--output -o", "FILE", "The .ssp file to write.", folder_okay=False)],
     controller: Annotated[str, Option("--controller", CONTROLLER, "Name or file of the controller.")],
     exported: Export,
     overrides: options.Overrides,

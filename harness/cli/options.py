@@ -67,6 +67,7 @@ class Option:
         least: smallest number that is allowed.
         panel: title under which help pages show it.
         absent: command without this option -> the reason.
+        folder_okay: whether a path may be that of a folder.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Option:
     least: float | None = None
     panel: str | None = None
     absent: Mapping[str, str] = field(default_factory=dict)
+    folder_okay: bool = True
 
     @property
     def kind(self) -> Value:
@@ -90,7 +92,7 @@ class Option:
             autocompletion=self.kind.complete,
             min=self.least,
             rich_help_panel=self.panel,
-            dir_okay=self.kind.word != "FILE",
+            dir_okay=self.folder_okay,
         )
 
 
