@@ -97,7 +97,7 @@ def export(
 ) -> None:
     """Export an arm with a mismatch as start values, or a controller."""
     from servobench.fmus.product import check_version
-    from servobench.harness.run.controller_fmu import controller_model
+    from servobench.harness.run.export import controller_model
 
     settings = overrides.settings()
     if controller is None and settings.sections:
@@ -127,7 +127,7 @@ def ssp(
     The reference is the target of the task `target`.
     """
     from servobench.fmus.ssp import write_loop
-    from servobench.harness.run.loop_ssp import loop_products
+    from servobench.harness.run.export import loop_products
 
     settings = overrides.settings()
     request = exported.request(controller, settings)
@@ -162,7 +162,7 @@ def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
     from rich.table import Table
 
-    from servobench.fmus.information import read_information
+    from servobench.fmus.inspection import read_information
 
     try:
         information = read_information(file)

@@ -19,7 +19,7 @@ from servobench.harness.analysis.measures import MEASURES
 from servobench.harness.pictures.ensembles import Ensembles
 from servobench.harness.pictures.panels import LETTER, Styles
 from servobench.harness.pictures.style import TEXT, WIDE, Layout, MethodStyle
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
 SETTLING, NEVER = "settling_time_s", 1.3  # and where a run without a value stands, over the largest value

@@ -16,7 +16,7 @@ from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import LONG, OVERVIEW
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
 ERROR, JACOBIAN, STEP_TIME = "error_norm", "jacobian_error", "controller_time_us"

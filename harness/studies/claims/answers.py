@@ -28,7 +28,7 @@ import pandas as pd
 
 from servobench.harness.analysis.comparison import differences_of_pairs, settling_times
 from servobench.harness.analysis.statistics import median_with_interval, signed_rank_p_value, success_rate
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.claims.measurements import (
     DURATION,
     LEVEL,

@@ -17,7 +17,7 @@ from servobench.harness.analysis.statistics import (
     median_with_interval,
     signed_rank_p_value,
 )
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.harness.studies.claims.studies import CIRCLE, MOVES, OTHERS, PROPOSED
 
 LEVEL: Final = 0.05
