@@ -36,7 +36,7 @@ def sweep(
 
     No steps are kept. A sweep that was interrupted is continued with --resume.
     """
-    from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
+    from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.compare import Batch, parse_seeds
