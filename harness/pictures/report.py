@@ -88,7 +88,7 @@ class Picture:
     """A figure as it stands in the page.
 
     Attributes:
-        kind: what it shows; see `harness.pictures.draw`.
+        kind: what it shows; a key of `servobench.harness.pictures.figures.HEADINGS`.
         title: alternative text.
         tasks: that it shows; none if it is of all.
         wide: for a sheet of paper, a notebook and most screens.
