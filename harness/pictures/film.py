@@ -23,7 +23,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.config.extras import missing_extra
+from servobench.harness.config.installation import missing_extra
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
