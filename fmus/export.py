@@ -21,8 +21,8 @@ from servobench.fmus.variables import Actuation, ArmLayout, arm_groups, paramete
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 
 MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
 CORE = "kinematics"

@@ -20,8 +20,16 @@ from servobench.fmus.eye_variables import View
 from servobench.fmus.source import generated_source
 from servobench.fmus.variables import ArmLayout
 from servobench.plant.cameras.optics import Optics
-from servobench.plant.cameras.symbolic import EyeGeometry, features, points_in_cameras, seen_features
-from servobench.plant.robot.symbolic import SX, ArmGeometry, HandEyeGeometry, feature_and_jacobian
+from servobench.plant.cameras.symbolic import (
+    SX,
+    ArmGeometry,
+    EyeGeometry,
+    HandEyeGeometry,
+    feature_and_jacobian,
+    features,
+    points_in_cameras,
+    seen_features,
+)
 
 
 def kinematics_source(layout: ArmLayout) -> str:

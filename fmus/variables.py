@@ -19,10 +19,8 @@ import numpy as np
 from servobench.fmus.eye_variables import SEEN, View, view_parameters
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
-from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.limits import JointLimits, narrowed
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.arm import JointLimits, SerialArm, narrowed, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"

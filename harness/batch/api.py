@@ -27,8 +27,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import RunResult, run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolved import check_settings
-from servobench.plant.bench.plant import Plant, PlantEntry
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry

@@ -86,7 +86,7 @@ def estimators(incomplete: str) -> list[str]:
 
 def mismatches(incomplete: str) -> list[str]:
     """Return the profiles and axes of mismatch whose names begin so; after a `+` the axes."""
-    from servobench.plant.robot.mismatch_axes import AXES, PROFILES
+    from servobench.plant.robot.mismatch import AXES, PROFILES
 
     before, plus, last = incomplete.rpartition("+")
     axes = [f"{axis}=" for axis in AXES]

@@ -55,7 +55,7 @@ def refuse_repetition(option: str, values: Sequence[object]) -> None:
 def split_mismatches(text: str) -> tuple[str, ...]:
     """Return the mismatches that a user named; each is read, so that a mistyped one is refused at once."""
     from servobench.harness.run.request import read_mismatch
-    from servobench.plant.robot.mismatch_axes import PROFILES
+    from servobench.plant.robot.mismatch import PROFILES
 
     return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
 

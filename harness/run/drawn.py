@@ -11,8 +11,8 @@ from servobench.harness.run.resolved import ResolvedRun
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.cameras.draws import CameraDraws
 from servobench.plant.contract.seeds import named_seed
+from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.mismatch import MismatchSample, sample_mismatch
-from servobench.plant.robot.sensed import SensedArm
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,9 +29,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
+from servobench.plant.robot.hand_eye import SensedArm, TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.robot.sensed import SensedArm
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.request import RunSettings
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 
 
 def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:

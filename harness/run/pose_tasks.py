@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import Positive, settings
-from servobench.plant.robot.pose_inverse import reach_pose
+from servobench.plant.robot.inverse import reach_pose
 from servobench.plant.robot.robot import Robot
 
 REACHED: Final = 1e-6  # of the error that `reach_pose` returns

@@ -39,9 +39,8 @@ from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
 from servobench.plant.contract.signals import Channel
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 from servobench.plant.robot.ur5 import MOVES, STRETCHED
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits

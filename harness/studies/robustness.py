@@ -39,8 +39,7 @@ from servobench.harness.run.resolved import check_settings
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.settings import suggest
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.mismatch import parse_magnitudes
-from servobench.plant.robot.mismatch_axes import Magnitude
+from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"
 TASK: Final = "random"

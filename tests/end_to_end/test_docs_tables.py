@@ -26,8 +26,7 @@ from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import FmuMapping
-from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.robot.mismatch_axes import AXES, PROFILES
+from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
 PACKAGE = "servobench"
 

@@ -29,7 +29,7 @@ from servobench.harness.studies.robustness import (
     settling_median,
 )
 from servobench.plant.contract.sensing import SENSOR_AXES
-from servobench.plant.robot.mismatch_axes import Magnitude
+from servobench.plant.robot.mismatch import Magnitude
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():

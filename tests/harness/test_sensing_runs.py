@@ -32,8 +32,7 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.inverse import closest_distance
-from servobench.plant.robot.pose_inverse import reach_pose
+from servobench.plant.robot.inverse import closest_distance, reach_pose
 
 PIXEL_WORDS = ["pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand"]
 
