@@ -162,7 +162,7 @@ def info(file: FileArgument) -> None:
     """Show version, platforms, capabilities and variables."""
     from rich.table import Table
 
-    from servobench.fmus.information import read_information
+    from servobench.fmus.inspection import read_information
     from servobench.harness.config.settings import ConfigurationError
 
     try:

@@ -21,7 +21,7 @@ from servobench.fmus.controller_export import (
     ControllerRun,
     controller_groups,
 )
-from servobench.fmus.trace.array import NotTraceable
+from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten

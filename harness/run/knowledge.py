@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from servobench.controllers.camera_model import CameraModel
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
-from servobench.controllers.sight import Sight
 from servobench.controllers.units import in_natural_units
 from servobench.harness.run.network_cache import network_source
 from servobench.harness.run.request import RunSettings
@@ -28,16 +28,16 @@ def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: Ru
         spec=spec,
         preview=run.preview_rows,
         nominal_jacobian=nominal.jacobian,
-        nominal_sight=_sight(nominal),
+        nominal_cameras=_cameras(nominal),
         region=(robot.workspace.lower, robot.workspace.upper),
     )
 
 
-def _sight(nominal: SensedArm) -> Sight | None:
+def _cameras(nominal: SensedArm) -> CameraModel | None:
     """Return how the cameras of a nominal model see points, where its features are those of single points."""
     if not (isinstance(nominal, EyeModel) and nominal.eye.single and nominal.eye.locate):
         return None
-    return Sight(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
+    return CameraModel(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
 
 
 def in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:

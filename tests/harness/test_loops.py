@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from kit.plants import configure, setup
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.laws.mfac import mfac_step
 from servobench.controllers.servo import ServoController
-from servobench.controllers.stages.inverses import damped_inverse
 from servobench.harness.analysis.loops.arm import ArmModel
 from servobench.harness.analysis.loops.equilibrium import arm_model, at_rest, linear_controller, warm_up
 from servobench.harness.analysis.loops.identification import SmallMotions, controller_response, excite

@@ -101,7 +101,7 @@ def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
     experiment = build_experiment(request, Settings())
     knowledge = experiment.controller.servo.knowledge
-    assert (knowledge.nominal_jacobian, knowledge.nominal_sight, knowledge.train) == (None, None, None)
+    assert (knowledge.nominal_jacobian, knowledge.nominal_cameras, knowledge.train) == (None, None, None)
     config, known = (default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True))
     assert (config.initial.source, known.initial.source) == ("probe", "nominal")
     assert config.estimator == type(config.estimator)() != known.estimator

@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
-from servobench.controllers.rotation import nearest_rotation
-from servobench.controllers.sight import Sight, through
+from servobench.controllers.algebra import nearest_rotation
+from servobench.controllers.camera_model import CameraModel, feature_jacobian
 from servobench.controllers.stages.camera_map import CameraMap, Innovation, Step
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
@@ -38,7 +38,7 @@ TURNS: Final = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 
 """[e_i]× of the three axes."""
 
 
-class SightBank(NamedTuple):
+class PointBank(NamedTuple):
     """The state of the filters.
 
     Attributes:
@@ -50,15 +50,15 @@ class SightBank(NamedTuple):
     P: FloatArray
 
 
-def sight_update(
-    bank: SightBank,
+def point_update(
+    bank: PointBank,
     H: FloatArray,
     feature_step: FloatArray,
     valid: BoolArray,
     frame: FloatArray,
     model: FloatArray,
     learns: BoolArray | bool = True,
-) -> tuple[SightBank, Innovation]:
+) -> tuple[PointBank, Innovation]:
     """Learn from one motion.
 
     Args:
@@ -97,7 +97,7 @@ def sight_update(
     before = np.where(valid, np.diagonal(bank.P, axis1=-2, axis2=-1)[..., ENTRIES:], 0.0)
     spread = 2.0 * np.add.reduce(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
     sums = np.add.reduce(diagonal, axis=-1), np.add.reduce(before, axis=-1)
-    return SightBank(theta, P), Innovation(np.vecdot(nu, weighted), spread, *sums)
+    return PointBank(theta, P), Innovation(np.vecdot(nu, weighted), spread, *sums)
 
 
 def near_turn(M: FloatArray, P: FloatArray, deviation: float, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -157,43 +157,43 @@ def _cost(R: FloatArray, entries: FloatArray, information: FloatArray) -> FloatA
 
 
 @final
-class SightMap(CameraMap[SightBank]):
+class PointMap(CameraMap[PointBank]):
     """M of each camera; a map is (..., c, 3, 3)."""
 
-    def __init__(self, aids: AidsConfig, sight: Sight, features: int) -> None:
+    def __init__(self, aids: AidsConfig, model: CameraModel, features: int) -> None:
         """Take the settings, what is known of the cameras, and m."""
         super().__init__(aids)
-        self.columns, self._c, self._p = sight.rows, sight.cameras, sight.points
-        self._K = features // sight.cameras
+        self.columns, self._c, self._p = model.rows, model.cameras, model.points
+        self._K = features // model.cameras
         self._P0 = aids.map_deviation**2 * np.eye(ENTRIES)
 
-    def start(self, lead: tuple[int, ...], candidates: int, frame: float) -> tuple[SightBank, FloatArray]:
+    def start(self, lead: tuple[int, ...], candidates: int, frame: float) -> tuple[PointBank, FloatArray]:
         """See `CameraMap.start`."""
         lanes, size = (*lead, candidates, self._c), ENTRIES + self._K
         eye, theta, P = np.eye(3), np.zeros((*lanes, size)), np.zeros((*lanes, size, size))
         theta[..., :ENTRIES] = eye.ravel()
         P[..., :ENTRIES, :ENTRIES], P[..., ENTRIES:, ENTRIES:] = self._P0, frame * np.eye(self._K)
-        return SightBank(theta, P), np.broadcast_to(eye, (*lead, self._c, 3, 3))
+        return PointBank(theta, P), np.broadcast_to(eye, (*lead, self._c, 3, 3))
 
-    def unknown(self, bank: SightBank, frame: FloatArray) -> SightBank:
+    def unknown(self, bank: PointBank, frame: FloatArray) -> PointBank:
         """See `CameraMap.unknown`."""
         bank = self.interrupted(bank, frame)
         bank.P[..., :ENTRIES, :ENTRIES] = self._P0
         return bank
 
-    def interrupted(self, bank: SightBank, frame: FloatArray) -> SightBank:
+    def interrupted(self, bank: PointBank, frame: FloatArray) -> PointBank:
         """See `CameraMap.interrupted`."""
         theta, P = bank.theta.copy(), bank.P.copy()
         theta[..., ENTRIES:], P[..., ENTRIES:], P[..., ENTRIES:, :] = 0.0, 0.0, 0.0
         P[..., ENTRIES:, ENTRIES:] = frame[..., None, None, None, None] * np.eye(self._K)
-        return SightBank(theta, P)
+        return PointBank(theta, P)
 
     def lengths(self, step: Step) -> FloatArray:
         """Return √Σ ‖L‖²_F ‖x‖² over all points."""
         squares = self._squares(step)
         return np.asarray(np.sqrt(np.add.reduce(squares.reshape(*squares.shape[:-2], -1), axis=-1)))
 
-    def walked(self, bank: SightBank, step: Step, lengths: FloatArray) -> SightBank:
+    def walked(self, bank: PointBank, step: Step, lengths: FloatArray) -> PointBank:
         """Return the bank with P_M ← P_M + w² ‖x‖ I, x the mean motion of the points, no larger than P₀."""
         aids, P = self._aids, bank.P.copy()
         moved = norm(self._points(step.x)).mean(axis=-1)
@@ -205,8 +205,8 @@ class SightMap(CameraMap[SightBank]):
         return bank._replace(P=P)
 
     def update(
-        self, bank: SightBank, step: Step, lengths: FloatArray, frame: FloatArray
-    ) -> tuple[SightBank, Innovation]:
+        self, bank: PointBank, step: Step, lengths: FloatArray, frame: FloatArray
+    ) -> tuple[PointBank, Innovation]:
         """See `CameraMap.update`."""
         rates, points = step.rates, self._points(step.x)
         k, shape = rates.shape[-2], (*step.x.shape[:-1], self._c, self._K)
@@ -216,18 +216,18 @@ class SightMap(CameraMap[SightBank]):
         moved, valid = self._by_camera(step.feature_step), self._by_camera(step.valid)
         variance = frame[..., None, None, None]
         learns = np.logical_or.reduce(valid & (squares >= variance), axis=-1)
-        new, said = sight_update(bank, H, moved, valid, variance, model, learns)
+        new, said = point_update(bank, H, moved, valid, variance, model, learns)
         count = np.maximum(np.add.reduce(step.valid, axis=-1), 1)[..., None]
         nis, spread, total, before = (np.add.reduce(each, axis=-1) for each in said)
         frames = 1.0 + np.minimum(before / (count * frame[..., None]), 1.0)
         return new, Innovation(nis, spread, total / count, frames)
 
-    def completed(self, bank: SightBank, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def completed(self, bank: PointBank, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `near_turn`."""
         M = bank.theta[..., :ENTRIES].reshape(*bank.theta.shape[:-1], 3, 3)
         return near_turn(M, bank.P[..., :ENTRIES, :ENTRIES], self._aids.rotation_deviation, rotation)
 
-    def deviation(self, bank: SightBank, rotation: FloatArray) -> FloatArray:
+    def deviation(self, bank: PointBank, rotation: FloatArray) -> FloatArray:
         """Return the deviation of the angles of the camera that is known least, (...), rad."""
         own = turn_deviation(bank.P[..., :ENTRIES, :ENTRIES], self._aids.rotation_deviation, rotation)
         return np.asarray(np.maximum.reduce(own, axis=-1))
@@ -238,7 +238,7 @@ class SightMap(CameraMap[SightBank]):
 
     def jacobian(self, map_: FloatArray, base: FloatArray, rates: FloatArray) -> FloatArray:
         """Return L M G."""
-        return through(rates, map_, base)
+        return feature_jacobian(rates, map_, base)
 
     def _points(self, x: FloatArray) -> FloatArray:
         return x.reshape(*x.shape[:-1], self._c, self._p, 3)

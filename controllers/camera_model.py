@@ -1,4 +1,4 @@
-"""What a controller may know of how cameras see: the nominal motions of points, and the interaction matrix.
+"""The camera model that a controller may know: nominal motions of points, and the interaction matrix.
 
     J = L(y, z) R G(q)          R the turn of the true camera, z the depth of a point
 
@@ -16,24 +16,24 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 
-Look: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+PointKinematics: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 Interaction: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """How c nominal cameras see p points, of which each has features of its own, m = c p k.
+class CameraModel:
+    """A model of c nominal cameras and p points, of which each has features of its own, m = c p k.
 
     Attributes:
         cameras: c.
         points: p.
-        look: q (..., n) [rad] -> points (..., c, p, 3) [m] in the nominal cameras and motions (..., c, p, 3, n).
+        kinematics: q (..., n) [rad] -> points (..., c, p, 3) [m] in the nominal cameras and motions (..., c, p, 3, n).
         interaction: features (..., m) and depths (..., c, p) [m] -> L (..., c, p, k, 3).
     """
 
     cameras: int
     points: int
-    look: Look
+    kinematics: PointKinematics
     interaction: Interaction
 
     @property
@@ -43,18 +43,18 @@ class Sight:
 
     def motions(self, joint_position: FloatArray) -> FloatArray:
         """Return G of all points, (..., 3 c p, n) m/rad."""
-        return _flat(self.look(joint_position)[1])
+        return _flat(self.kinematics(joint_position)[1])
 
     def depths_and_motions(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return z of all points, (..., c p) m, and G of all points, (..., 3 c p, n) m/rad."""
-        points, motions = self.look(joint_position)
+        points, motions = self.kinematics(joint_position)
         return np.ascontiguousarray(points[..., 2]).reshape(*points.shape[:-3], -1), _flat(motions)
 
     def rates(self, feature: FloatArray, depth: FloatArray) -> FloatArray:
         """Return L by cameras, (..., c, p, k, 3), for features (..., m) and depths (..., c p) [m]."""
         return self.interaction(feature, depth.reshape(*depth.shape[:-1], self.cameras, self.points))
 
-    def in_unit(self, scale: float) -> Sight:
+    def in_unit(self, scale: float) -> CameraModel:
         """Return what is known with features divided by `scale`."""
 
         def natural(feature: FloatArray, depth: FloatArray) -> FloatArray:
@@ -63,19 +63,19 @@ class Sight:
         return replace(self, interaction=natural)
 
 
-def through(rates: FloatArray, turn: FloatArray, motions: FloatArray) -> FloatArray:
+def feature_jacobian(rates: FloatArray, turn: FloatArray, motions: FloatArray) -> FloatArray:
     """Return L R G, (..., m, n), for L (..., c, p, k, 3), R (..., c, 3, 3) and G (..., 3 c p, n)."""
     c, p = rates.shape[-4:-2]
     blocks = motions.reshape(*motions.shape[:-2], c, p, 3, motions.shape[-1])
     return _flat((rates @ turn[..., None, :, :]) @ blocks)
 
 
-def seen_through(rates: FloatArray, turn: FloatArray) -> FloatArray:
+def turned_interaction(rates: FloatArray, turn: FloatArray) -> FloatArray:
     """Return L R as one matrix, (..., m, 3 c p), for L (..., c, p, k, 3) and R (..., c, 3, 3)."""
-    return of_points(rates @ turn[..., None, :, :])
+    return block_diagonal(rates @ turn[..., None, :, :])
 
 
-def of_points(blocks: FloatArray) -> FloatArray:
+def block_diagonal(blocks: FloatArray) -> FloatArray:
     """Return blocks (..., c, p, i, j) of single points on the diagonal of one matrix, (..., c p i, c p j)."""
     *lead, c, p, i, j = blocks.shape
     whole, points = np.zeros((c * p, c * p, *lead, i, j)), np.arange(c * p)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kit.toy import Learning, motion
-from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
+from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
-from servobench.controllers.estimators.robust import (
+from servobench.controllers.estimators.robust_filter import (
     BISQUARE,
     MEMORY,
     RobustConfig,
@@ -86,7 +86,7 @@ def test_it_holds_at_40_percent_outlier_frames_where_others_do_not(frames_each):
     robust = RobustEstimator(RobustConfig(walk=0.01, motion_error=0.0))
     assert error_after(robust, 0.0) < 0.02
     assert error_after(robust, **shares) < 0.04
-    for other in (KalmanEstimator(KalmanConfig(walk=0.01)), RlsEstimator(RlsConfig())):
+    for other in (kalman_estimator(KalmanConfig(walk=0.01)), RlsEstimator(RlsConfig())):
         assert error_after(other, 0.0) < 0.08
         assert error_after(other, **shares) > 0.3
 

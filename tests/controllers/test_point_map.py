@@ -8,12 +8,12 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.camera_model import CameraModel, block_diagonal, feature_jacobian, turned_interaction
 from servobench.controllers.controller import Delays, RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
-from servobench.controllers.estimators.fixed import ConstantEstimator
-from servobench.controllers.sight import Sight, of_points, seen_through, through
+from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
-from servobench.controllers.stages.sight_map import ENTRIES, SightBank, near_turn, sight_update, turn_deviation
+from servobench.controllers.stages.point_map import ENTRIES, PointBank, near_turn, point_update, turn_deviation
 from servobench.controllers.units import in_natural_units
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.faults import FilterDiverged
@@ -36,14 +36,14 @@ def motions(count, seed=0):
 def fresh(features=K):
     theta, P = np.zeros(ENTRIES + features), np.diag([*[0.7] * ENTRIES, *[FRAME] * features])
     theta[:ENTRIES] = np.eye(3).ravel()
-    return SightBank(theta, P)
+    return PointBank(theta, P)
 
 
 def filtered(H, dy, model, valid=None):
     bank, said = fresh(H.shape[1]), []
     for k in range(len(H)):
         seen = np.full(H.shape[1], True) if valid is None else valid[k]
-        bank, innovation = sight_update(bank, H[k], dy[k], seen, np.array([FRAME]), model[k])
+        bank, innovation = point_update(bank, H[k], dy[k], seen, np.array([FRAME]), model[k])
         said.append(innovation)
     return bank, said
 
@@ -71,8 +71,8 @@ def test_the_filter_is_generalised_least_squares_and_its_score_the_likelihood():
 def test_motions_shorter_than_the_noise_leave_map_and_covariance_and_follow_the_noise():
     H, dy, model = motions(6)
     bank, _ = filtered(H, dy, model)
-    new, said = sight_update(bank, H[0], dy[0], np.full(K, True), np.array([FRAME]), model[0], learns=False)
-    usual, same = sight_update(bank, H[0], dy[0], np.full(K, True), np.array([FRAME]), model[0])
+    new, said = point_update(bank, H[0], dy[0], np.full(K, True), np.array([FRAME]), model[0], learns=False)
+    usual, same = point_update(bank, H[0], dy[0], np.full(K, True), np.array([FRAME]), model[0])
     np.testing.assert_array_equal(new.theta[:ENTRIES], bank.theta[:ENTRIES])
     np.testing.assert_allclose(new.P[:ENTRIES, :ENTRIES], bank.P[:ENTRIES, :ENTRIES], atol=1e-12)
     assert not np.allclose(usual.theta[:ENTRIES], bank.theta[:ENTRIES])
@@ -128,15 +128,15 @@ def test_two_rows_of_a_map_tell_the_third():
 def test_a_covariance_that_is_none_is_refused():
     bank = fresh()
     with pytest.raises(FilterDiverged, match="covariance of the map is not positive definite"):
-        sight_update(bank._replace(P=-9.0 * bank.P), *(each[0] for each in motions(1)[:2]), np.full(K, True),
+        point_update(bank._replace(P=-9.0 * bank.P), *(each[0] for each in motions(1)[:2]), np.full(K, True),
                      np.array([FRAME]), np.zeros(K))  # fmt: skip
 
 
 def test_blocks_of_points_on_the_diagonal_multiply_as_points_do():
     rng = np.random.default_rng(0)
     rates, turn, G = rng.normal(size=(5, 2, 3, 2, 3)), rng.normal(size=(5, 2, 3, 3)), rng.normal(size=(5, 18, 6))
-    np.testing.assert_allclose(seen_through(rates, turn) @ G, through(rates, turn, G), atol=1e-12)
-    np.testing.assert_array_equal(of_points(rates[0])[8:10, 12:15], rates[0, 1, 1])
+    np.testing.assert_allclose(turned_interaction(rates, turn) @ G, feature_jacobian(rates, turn, G), atol=1e-12)
+    np.testing.assert_array_equal(block_diagonal(rates[0])[8:10, 12:15], rates[0, 1, 1])
 
 
 class Watching:
@@ -148,9 +148,9 @@ class Watching:
         arm, sample = sample_mismatch(mismatch, robot, seed)
         self.true, _ = sensing.true(robot, arm, sample, mismatch, seed)
         nominal = sensing.nominal(robot)
-        sight = Sight(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
+        cameras = CameraModel(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
         spec = hand_eye_spec(nominal, PERIOD, 1.0, 6.0)
-        self.knowledge = in_natural_units(RobotKnowledge(spec, 0, nominal.jacobian, nominal_sight=sight))
+        self.knowledge = in_natural_units(RobotKnowledge(spec, 0, nominal.jacobian, nominal_cameras=cameras))
         config = AidsConfig(**{"model": "map", "delay": "given", "noise": "identified", **aids})
         self.stages = Estimation((estimator or (lambda _: ConstantEstimator()))(self.knowledge), self.knowledge, config,
                                  Delays(0.0, 0.0, 0.0))  # fmt: skip

@@ -32,10 +32,10 @@ import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import cholesky_of
+from servobench.controllers.estimators.kalman import RandomWalk, cholesky_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, outer, transposed, where
-from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.settings import NonNegative, settings
 
 BISQUARE: Final = 4.685  # [1] c_b: 95 % efficiency under normal noise
 NORMAL_MEDIAN: Final = 0.6745  # [1] median of |N(0, 1)|
@@ -48,15 +48,9 @@ LOST_SHARE: Final = 0.7  # [1] of rejections, above which a feature is taken fro
 
 
 @settings
-class RobustConfig:
+class RobustConfig(RandomWalk):
     """Settings of the robust filter of feature and Jacobian."""
 
-    initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀."""
-    walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; that of `kalman`."""
-    feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified."""
     motion_error: NonNegative = 0.1
     """[1] c, error of a predicted motion over its size, as of delays and of the bend of the path."""
     min_joint_step: NonNegative = 0.002
@@ -139,7 +133,7 @@ class RobustEstimator(Estimator[RobustState]):
         keep = np.exp(-duration / MEMORY)[..., None]
         rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTED)
         lost = rejected > LOST_SHARE
-        P = where(lost, _taken_from_sight(P, noise), (P + transposed(P)) / 2)
+        P = where(lost, _restarted_at_frame(P, noise), (P + transposed(P)) / 2)
         excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(axis=-1)
         scale = np.clip(state.scale * np.exp(SCALE_RATE * duration * excess), 1.0, MAX_SCALE)
         deviation, none = innovation * (1.0 - gain[..., 0]), np.zeros_like(innovation)
@@ -168,7 +162,7 @@ class RobustEstimator(Estimator[RobustState]):
         }
 
 
-def _taken_from_sight(P: FloatArray, noise: FloatArray) -> FloatArray:
+def _restarted_at_frame(P: FloatArray, noise: FloatArray) -> FloatArray:
     """Return the covariance of a feature that is where it is seen, which tells nothing about J."""
     taken = P.copy()
     taken[..., 0, :] = taken[..., :, 0] = 0.0

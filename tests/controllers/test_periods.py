@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servobench.controllers.laws.preview import check_preview, sampled
-from servobench.controllers.periods import in_periods
+from servobench.controllers.periods import check_preview, in_periods, sampled
 
 
 @given(

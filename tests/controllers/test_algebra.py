@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from servobench.controllers.stages.inverses import damped_inverse, project_to_row_space
-from servobench.controllers.stages.posture import step_with_posture
+from servobench.controllers.algebra import damped_inverse, project_to_row_space
+from servobench.controllers.stages.finish import step_with_posture
 
 
 def damped_inverse_by_svd(J, damping):

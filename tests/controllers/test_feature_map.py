@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from servobench.controllers.rotation import nearest_rotation
-from servobench.controllers.stages.map_bank import fresh_bank, map_update, near_rotation
+from servobench.controllers.algebra import nearest_rotation
+from servobench.controllers.stages.feature_map import fresh_bank, map_update, near_rotation
 from servobench.plant.contract.faults import FilterDiverged
 
 FRAME = 0.49  # σ²
