@@ -33,8 +33,8 @@ from servobench.harness.analysis.statistics import (
     tail_mean,
 )
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text

@@ -93,7 +93,7 @@ def ssp(
     from servobench.fmus.compile import CompilationFailed, CompilerMissing, parse_platforms
     from servobench.fmus.ssp import write_loop
     from servobench.harness.config.settings import ConfigurationError, read_settings
-    from servobench.harness.run.loop_ssp import loop_products
+    from servobench.harness.run.export import loop_products
 
     settings = read_settings(config, assignments or ())
     request = _request(controller, known_robot(robot), sensing, mismatch, seed, settings)
@@ -121,7 +121,7 @@ def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Produc
 
 def _controller(fmi: int, name: str, robot: str, sensing: str, mismatch: str, seed: int, settings: Settings) -> Product:
     from servobench.fmus.product import check_version
-    from servobench.harness.run.controller_fmu import controller_model
+    from servobench.harness.run.export import controller_model
 
     check_version(fmi)
     return controller_model(_request(name, robot, sensing, mismatch, seed, settings), settings).product(fmi)

@@ -70,8 +70,7 @@ def tasks(
     """List the tasks, or show the settings of one."""
     from servobench.harness.config.robots import find_robot
     from servobench.harness.config.settings import ConfigurationError
-    from servobench.harness.run.tasks import TASKS, find_task
-    from servobench.harness.run.teaching import taught
+    from servobench.harness.run.tasks import TASKS, find_task, taught
 
     if name:
         _show_settings(name, taught(find_task(name), find_robot(robot)), as_json=as_json)

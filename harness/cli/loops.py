@@ -50,8 +50,7 @@ def analyse(
 
     Also sensitivity, and stability over gain and latency.
     """
-    from servobench.harness.analysis.loops.loop_analysis import analyse_loop
-    from servobench.harness.analysis.loops.table import LEGEND, loop_table, printed
+    from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.contract.faults import RunFault
@@ -113,8 +112,7 @@ def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
     import pandas as pd
 
     from servobench.controllers.servo import ServoController
-    from servobench.harness.analysis.loops.equilibrium import warm_up
-    from servobench.harness.analysis.loops.simulation import SmallLoop
+    from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
 
     rows: list[tuple[float, float]] = []
     for run in runs:

@@ -131,7 +131,7 @@ def export(
 
 def print_faults(runs: pd.DataFrame) -> None:
     """Print why runs failed, a line each; of many the first ones."""
-    from servobench.harness.run.ending import COMPLETED
+    from servobench.harness.run.result import COMPLETED
 
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
         line = f"{row['run_id']}: {row['status']}: {row['reason']}"
@@ -146,7 +146,7 @@ def judge(folder: Path, *, strict: bool) -> None:
         strict: whether a run that failed makes the command fail.
     """
     from servobench.harness.batch import results
-    from servobench.harness.run.ending import COMPLETED
+    from servobench.harness.run.result import COMPLETED
 
     statuses = [table["status"] for table in results.iterate_runs(folder, ("status",))]
     count, failed = sum(map(len, statuses)), sum(int((status != COMPLETED).sum()) for status in statuses)

@@ -163,7 +163,7 @@ def train(
     from servobench.harness.batch.apart import choose_controllers
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
-    from servobench.harness.run.network_cache import NETWORKS
+    from servobench.harness.run.knowledge import NETWORKS
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.contract.cache import cache_folder
 

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
-from servobench.harness.analysis.loops.margins import loci
+from servobench.harness.analysis.loops.response import loci
 from servobench.harness.pictures.style import (
     Styles,
     add_legend,

@@ -30,7 +30,7 @@ from servobench.harness.pictures.style import (
     panel_grid,
 )
 from servobench.harness.pictures.tracks import Ensembles
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
 SETTLING, NEVER = "settling_time_s", 1.3  # and where a run without a value stands, over the largest value

@@ -20,7 +20,7 @@ from servobench.harness.analysis.comparison import POINT_TO_POINT, settling_time
 from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
 FEATURE = "feature_"

@@ -41,7 +41,7 @@ from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.compare import Batch
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import did_you_mean
 
 ALIKE_SHARE: Final = 0.10  # of the median settling time

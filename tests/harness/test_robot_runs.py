@@ -18,8 +18,7 @@ from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve, resolve_sections
-from servobench.harness.run.tasks import TASKS
-from servobench.harness.run.teaching import taught
+from servobench.harness.run.tasks import TASKS, taught
 from servobench.plant.robot.catalogue import find_robot
 
 PANDA = RunRequest("kinematic", "map_mfac", "exp2", "moderate", 3, robot="panda")

@@ -12,8 +12,7 @@ import servobench
 from kit.resting import Resting
 from servobench.controllers.controller import Controller
 from servobench.harness.batch import results
-from servobench.harness.run.ending import Ending, log_entry
-from servobench.harness.run.episode import RunResult
+from servobench.harness.run.result import Ending, RunResult, log_entry
 from servobench.plant.contract.faults import FilterDiverged, RunFault
 from servobench.plant.contract.signals import Command
 
@@ -102,7 +101,7 @@ CRASHES = {
 def test_the_reason_names_error_message_file_line_and_method(kind):
     result = servobench.run(kind, task="exp2", settings=SHORT)
     status, message, method = CRASHES[kind]
-    place = f"(test_ending.py:{line_of(kind)} in {kind.__name__}.{method})"
+    place = f"(test_result.py:{line_of(kind)} in {kind.__name__}.{method})"
     assert (result.row["status"], result.row["reason"]) == (status, f"{message} {place}")
     assert f'{Path(__file__).name}", line {line_of(kind)}, in {method}' in result.trace
     assert "harness/run" not in result.trace

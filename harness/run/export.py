@@ -1,8 +1,12 @@
-"""A controller made ready for export as an FMU: its step is recorded, and a run of it is kept for comparison."""
+"""Controllers and closed loops made ready for export as FMUs.
+
+The step of a controller is recorded, and a run of it is kept inside the FMU for comparison.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import islice
 from typing import Any, Final
 
@@ -21,12 +25,15 @@ from servobench.fmus.controller_export import (
     ControllerRun,
     controller_groups,
 )
+from servobench.fmus.export import ExportOptions, default_actuation, product
+from servobench.fmus.product import Product
 from servobench.fmus.trace.arrays import NotTraceable
 from servobench.fmus.trace.record import Recorded, record
 from servobench.harness.config.registry import find_controller
+from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten
-from servobench.harness.run.experiment import Experiment, build
-from servobench.harness.run.request import RunRequest
+from servobench.harness.run.experiment import Experiment, build, draw
+from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
@@ -157,3 +164,26 @@ def _periods(experiment: Experiment) -> Iterator[tuple[Observation, FloatArray, 
         unknown = np.zeros((plant.spec.m, plant.spec.n))
         yield observation, reference, command.joint_velocity, unknown if estimate is None else estimate
         observation = plant.step(command)
+
+
+def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
+    """Return plant and controller of a run whose target rests, and how long the run is [s].
+
+    The plant begins where the run does; the reference of the controller starts as the target of the run.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
+    """
+    resolved = resolve(request, settings)
+    drawn, robot = draw(resolved), find_robot(request.robot)
+    if drawn.true is None:
+        raise ConfigurationError(f"plant {request.plant} brings a robot of its own, which is not exported")
+    run: RunSettings = resolved.run
+    reference = drawn.scenario.reference.sampled(run.period, 1 + run.preview_rows)
+    actuation = default_actuation(robot)
+    if drawn.scenario.start is not None:
+        actuation = replace(actuation, home=drawn.scenario.start)
+    words = f"{request.mismatch}, seed {request.seed}"
+    plant = product(ExportOptions(2, drawn.true, actuation, mismatch=words, robot=robot))
+    controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
+    return plant, controller, drawn.scenario.duration

@@ -1,24 +1,32 @@
-"""Runs that advance together: a plant, a controller and a log of many lanes for the same loop that carries out one run.
+"""Runs that advance together: many robots, targets and seeds under one method, on one plant with a lane for each run.
 
-A run that ends early leaves the plant and the controller; the loop goes on with the others and sees its last values in
-its place. What raises in a step of the controller concerns some lanes only, but does not say which: the step, which is
-pure, is repeated with ever fewer lanes until the run is found.
+The same loop that carries out one run steps a plant, a controller and a log of many lanes. A run that ends early leaves
+plant and controller; the loop goes on with the others and keeps its last values in its place. An error in a step of the
+controller concerns some lanes only, but does not say which: the step is pure, so it is repeated with ever fewer lanes
+until the failing run is found.
 """
 
 from __future__ import annotations
 
-from typing import Any, final
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.controller import Controller, Diagnostics
-from servobench.controllers.servo import Servo, ServoState
+from servobench.controllers.servo import Servo, ServoController, ServoState
+from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.run.experiment import Drawn, assemble, draw, loop_settings
 from servobench.harness.run.log import StepLog, Steps
+from servobench.harness.run.loop import LoopSettings
+from servobench.harness.run.resolved import ResolvedRun
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import take
+from servobench.plant.contract.lanes import stack, take
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
 
 LaneIndex = npt.NDArray[np.intp]
@@ -235,3 +243,40 @@ class ManyLogs(StepLog):
         for time in (self._rows.controller_time, self._rows.plant_time):
             time.fill(np.nan)
         return super().steps()
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Runs made ready: plant, controller and reference with a lane for each."""
+
+    bench: Bench
+    servo: Servo
+    drawn: tuple[Drawn, ...]  # the true robot and the task of each run
+    desired: FloatArray  # (B, periods + preview, m) [unit of the feature]
+    loop: LoopSettings
+
+
+def side_by_side_key(run: ResolvedRun) -> Hashable | None:
+    """Return what runs of one campaign must share to advance together; None for a run that goes alone."""
+    request = run.request
+    if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
+        return None
+    moved = request.mismatch.size("camera_move") > 0.0
+    names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved, request.robot
+    return (*names, request.mismatch.sensor, request.sensing, id(run.run), id(run.controller), id(run.task))
+
+
+def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Together:
+    """Make runs of one `side_by_side_key` ready.
+
+    Raises:
+        Exception: whatever a run alone would raise, or runs that cannot advance together.
+    """
+    first, drawn = runs[0], tuple(draw(run) for run in runs)
+    moved = [each.moved.camera for each in drawn if each.moved is not None]
+    loop = loop_settings(first.run, drawn[0].scenario.duration, np.stack(moved) if moved else None)
+    rows = loop.periods + loop.preview
+    desired = np.stack([each.scenario.reference.sampled(first.run.period, rows) for each in drawn])
+    robots, starts = stack([each.true for each in drawn]), np.array([each.scenario.start for each in drawn])
+    plant, controller = assemble(first, robots, starts, keep)
+    return Together(cast(Bench, plant), cast(ServoController, controller).servo, drawn, desired, loop)

@@ -21,7 +21,7 @@ import numpy as np
 from servobench.controllers.controller import JacobianFunction
 from servobench.controllers.servo import Servo, ServoState
 from servobench.controllers.stages.estimation import Estimation, EstimationState
-from servobench.harness.analysis.loops.matrices import StateSpace
+from servobench.harness.analysis.loops.systems import StateSpace
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import map_arrays
 from servobench.plant.contract.signals import Observation, trusted_observation

@@ -1,4 +1,4 @@
-"""What a policy sees of a run and what it is rewarded for, over any leading axes."""
+"""The observation and action spaces of a policy and its reward, over any leading axes."""
 
 from __future__ import annotations
 

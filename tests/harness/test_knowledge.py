@@ -8,8 +8,8 @@ import pytest
 from kit.toy import plant_spec
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.fit import train
-from servobench.harness.run import network_cache
-from servobench.harness.run.network_cache import NETWORKS, network_source
+from servobench.harness.run import knowledge as network_cache
+from servobench.harness.run.knowledge import NETWORKS, network_source
 from servobench.plant.contract import cache
 from servobench.plant.contract.cache import cache_folder
 

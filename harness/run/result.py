@@ -1,4 +1,4 @@
-"""How a run ended, and where: a status, a reason in one line, and for the log of failures a short trace.
+"""The result of a run: its rows, and how it ended: a status, a reason in one line and, for a failure, a short trace.
 
 The place of an error is the deepest line of the user's own code: of a script, of a notebook or of a plug-in, but not of
 this package, of the standard library or of another installed one. An error without such a line has the place in this
@@ -12,23 +12,27 @@ import site
 import sysconfig
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
+from importlib.metadata import entry_points
 from multiprocessing import parent_process
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from servobench.harness.config.registry import plugin_packages
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.faults import RunFault
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from servobench.plant.bench.plant import ImageArray
 
 COMPLETED = "completed"
 NUMERICAL_ERROR = "numerical_error"
 CRASHED = "crashed"
 TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
 OUT_OF_MEMORY = "out_of_memory"
-STATUSES = (COMPLETED, NUMERICAL_ERROR, CRASHED, TIMED_OUT, OUT_OF_MEMORY)  # beside those of the kinds of `RunFault`
 
 TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
 PACKAGE, HARNESS = __name__.partition(".")[0], str(Path(__file__).parents[1])
@@ -64,6 +68,29 @@ class Ending:
             return cls(NUMERICAL_ERROR, f"{_one_line(error)}{where}", trace)
         status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
         return cls(status, f"{describe_error(error)}{where}", trace)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The result of a run.
+
+    Attributes:
+        row: the run's row in the table of runs.
+        steps: one row a period; None if not asked for.
+        picture: the last picture of the camera; None without a camera or if not asked for.
+        trace: of the error that ended the run, for the log of failures; empty without one.
+    """
+
+    row: dict[str, Any]
+    steps: pd.DataFrame | None
+    picture: ImageArray | None = field(default=None, repr=False)
+    trace: str = ""
+
+    @classmethod
+    def failed(cls, identity: Mapping[str, Any], ending: Ending) -> RunResult:
+        """Return the result of a run of which only the columns of its request and its ending are known."""
+        known = {"status": ending.status, "outcome": ending.status, "periods": 0, "reason": ending.reason}
+        return cls({**identity, **known, "mismatch_values": "{}"}, None, trace=ending.trace)
 
 
 def describe_error(error: BaseException) -> str:
@@ -141,7 +168,15 @@ def _is_users(frame: FrameType) -> bool:
     module, file = _module(frame), frame.f_code.co_filename
     if module == PACKAGE or (file.startswith("<") and not file.startswith("<ipython")):
         return False
-    return module in plugin_packages() or not any(Path(file).is_relative_to(folder) for folder in _libraries())
+    return module in _plugin_packages() or not any(Path(file).is_relative_to(folder) for folder in _libraries())
+
+
+@cache
+def _plugin_packages() -> frozenset[str]:
+    """Return the top-level packages of other distributions that publish something for this package."""
+    groups = (group for group in entry_points().groups if group.startswith(f"{PACKAGE}."))
+    points = (point for group in groups for point in entry_points(group=group))
+    return frozenset(point.module.partition(".")[0] for point in points) - {PACKAGE}
 
 
 @cache

@@ -15,8 +15,7 @@ import numpy as np
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.harness.run.task_settings import PointTask
-from servobench.harness.run.tasks import TASKS, Scenario, find_task
+from servobench.harness.run.tasks import TASKS, PointTask, Scenario, find_task
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.sensing import SensingConfig
