@@ -55,8 +55,7 @@ def sweep(
     from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
-    from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.batch.sweep import SweepPlan, parse_variation
+    from servobench.harness.batch.plan import Batch, SweepPlan, parse_seeds, parse_variation
     from servobench.harness.cli.progress import watching
 
     plan = SweepPlan(
@@ -124,7 +123,7 @@ def robustness(
 
     The robustness map; each axis of the mismatch or of the sensor is varied by itself.
     """
-    from servobench.harness.batch.compare import parse_seeds
+    from servobench.harness.batch.plan import parse_seeds
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.map_lines import find_lines
     from servobench.harness.studies.robustness import make_map

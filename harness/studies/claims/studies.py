@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from servobench.controllers.methods import PUBLISHED
-from servobench.harness.batch.blocks import Cell
-from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.plant.contract.settings import did_you_mean
