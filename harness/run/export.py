@@ -35,7 +35,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings, fla
 from servobench.harness.run.experiment import Experiment, build, draw
 from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation

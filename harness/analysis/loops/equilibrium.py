@@ -19,7 +19,7 @@ from servobench.harness.analysis.loops.systems import ArmModel, StateSpace
 from servobench.harness.config.robots import find_robot
 from servobench.harness.run.experiment import build
 from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant, PlantSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.sensing import without_disturbance
