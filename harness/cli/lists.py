@@ -69,10 +69,10 @@ def tasks(
 ) -> None:
     """List the tasks, or show the settings of one."""
     from servobench.harness.config.robots import find_robot
-    from servobench.harness.run.tasks import TASKS, find_task, taught
+    from servobench.harness.run.tasks import TASKS, fitted
 
     if name:
-        _show_settings(name, taught(find_task(name), find_robot(robot)), as_json=as_json)
+        _show_settings(name, fitted(name, find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
         refuse("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
