@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.fmus.eye_variables import FEATURE, SEEN
-from servobench.fmus.variables import Actuation, Layout
+from servobench.fmus.variables import FEATURE, SEEN, Actuation, Layout
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator

@@ -6,7 +6,7 @@ import pytest
 
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
 from servobench.plant.bench.plant import PlantSetup

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from servobench.fmus.information import read_information
+from servobench.fmus.inspection import read_information
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.config.settings import ConfigurationError, Settings

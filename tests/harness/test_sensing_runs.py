@@ -23,10 +23,10 @@ from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.pose_error import pose_error
-from servobench.harness.run.pose_tasks import PoseTask, displaced, pose_start
+from servobench.harness.run.references import View
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
-from servobench.harness.run.views import View
+from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.model import EyeModel

@@ -24,7 +24,7 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
 from servobench.fmus.compile import parse_platforms
-from servobench.fmus.information import read_information
+from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.compare import parse_seeds, refuse_tuning_seeds
 from servobench.harness.batch.sweep import parse_variation
