@@ -17,7 +17,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.gym.spaces import Floats32, View
 from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
+from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost, RunFault
