@@ -17,15 +17,14 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.gym.spaces import Floats32, View
 from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
+from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.rendered.overview import Overview
-from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none

@@ -34,7 +34,7 @@ from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten
 from servobench.harness.run.experiment import Experiment, build, draw
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation

@@ -18,7 +18,7 @@ from servobench.harness.analysis.loops.linearisation import Rest, frozen, linear
 from servobench.harness.analysis.loops.systems import ArmModel, StateSpace
 from servobench.harness.config.robots import find_robot
 from servobench.harness.run.experiment import Experiment, build
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant, PlantSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.sensing import without_disturbance
