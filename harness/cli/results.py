@@ -44,8 +44,7 @@ def statistics(
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.cells import as_plain
-    from servobench.harness.analysis.tables import statistics_rows, statistics_tables
+    from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
 
     if markdown and as_json:

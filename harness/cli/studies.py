@@ -18,9 +18,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from servobench.harness.batch.workers import Workers
-    from servobench.harness.studies.tuning.campaign import Method, TuningPlan
-    from servobench.harness.studies.tuning.check import Change
-    from servobench.harness.studies.tuning.files import TunedValues
+    from servobench.harness.studies.tuning.campaign import Change, Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 
 DEFAULT_CONTROLLERS = "arm_mfac, map_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
@@ -54,7 +52,7 @@ def sweep(
 
     No steps are kept. A sweep that was interrupted is continued with --resume.
     """
-    from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
+    from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.sweep import SweepPlan, parse_variation
@@ -118,8 +116,7 @@ def robustness(
     """
     from servobench.harness.batch.compare import parse_seeds
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.map_lines import find_lines
-    from servobench.harness.studies.robustness import make_map
+    from servobench.harness.studies.robustness import find_lines, make_map
 
     settings = overrides.settings()
     lines = find_lines([axis.strip() for axis in axes.split(",") if axis.strip()])
@@ -153,9 +150,15 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
-    from servobench.harness.studies.claims.studies import find_divisions
-    from servobench.harness.studies.claims.table import ANSWERS, differences, elsewhere, read_answers
+    from servobench.harness.studies.claims import find_divisions
+    from servobench.harness.studies.reproduction import (
+        ANSWERS,
+        FIGURES,
+        differences,
+        elsewhere,
+        read_answers,
+        reproduce,
+    )
 
     names = selection.split_plants(plants)
     divisions = find_divisions(division)
@@ -246,7 +249,7 @@ def _say_interrupted() -> None:
 def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
     """Score every change of one value of the settings in use and say which of them improve a score by too much."""
     from servobench.harness.cli.progress import Lines, run_progress
-    from servobench.harness.studies.tuning.check import TOLERANCE, Check, improvements
+    from servobench.harness.studies.tuning.campaign import TOLERANCE, Check, improvements
 
     checked, lines = Check(folder, names, runs), Lines()
     total, begun = len(checked), checked.known()

@@ -20,7 +20,7 @@ from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.studies.tuning.ledger import Ledger
+from servobench.harness.studies.tuning.scoring import Ledger
 
 SWEEP = (
     "sweep", "--controllers", "constant,rls", "--seeds", "200", "--workers", "1", "--set", "random.duration=6",

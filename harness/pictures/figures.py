@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import textwrap
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -12,25 +11,32 @@ from typing import NamedTuple, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
-from PIL import Image
 
 from servobench.harness.analysis.comparison import with_places
 from servobench.harness.batch import results
-from servobench.harness.pictures.batch import ACCURACY, EFFORT, SMOOTHNESS, draw_measures, draw_step_times
-from servobench.harness.pictures.ensembles import Ensembles, load_ensembles, shown_until
-from servobench.harness.pictures.motion import draw_joint_motion
-from servobench.harness.pictures.panels import Styles
-from servobench.harness.pictures.paper import draw_features, draw_jacobians, draw_moves, draw_tracking
+from servobench.harness.pictures.measures import ACCURACY, EFFORT, SMOOTHNESS, draw_measures, draw_step_times
 from servobench.harness.pictures.paths import draw_paths
-from servobench.harness.pictures.style import NARROW, TEXT, WIDE, Layout, divisions, figure_style, method_styles
-from servobench.harness.pictures.tracks import Group, load_groups
+from servobench.harness.pictures.responses import (
+    draw_features,
+    draw_jacobians,
+    draw_joint_motion,
+    draw_moves,
+    draw_tracking,
+)
+from servobench.harness.pictures.style import (
+    NARROW,
+    TEXT,
+    WIDE,
+    Layout,
+    Styles,
+    divisions,
+    figure_style,
+    method_styles,
+    save_figure,
+)
+from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles, load_groups, shown_until
 
 FOLDER = "figures"
-FORMATS = ("png", "pdf")
-RESOLUTION = 150  # dpi of PNG
-PALETTE = 64  # colours
-STRIP = 0.04  # [in] above and below what is drawn
 LETTERS = 15.0  # of a title in an inch
 MOVES_A_FIGURE = 4
 TASKS_A_FIGURE = 4
@@ -50,7 +56,6 @@ HEADINGS = {
 }
 OVER_SEEDS = ("errors", "jacobian", "tracking")  # kinds that show a median and a band
 OF_FIRST_SEED = ("features", "paths", "tracking_path", "joint_speeds")
-
 T = TypeVar("T")
 
 
@@ -73,40 +78,6 @@ def draw_figures(folder: Path) -> list[Path]:
     return [
         path for named in folder_figures(folder) for path in save_figure(named.figure, folder / FOLDER / named.stem)
     ]
-
-
-def save_figure(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as PNG and as PDF beside each other; the same figure gives the same bytes."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for ending in FORMATS:
-        paths.append(stem.with_name(f"{stem.name}.{ending}"))
-        with figure_style(TEXT):
-            metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
-            figure.savefig(paths[-1], dpi=RESOLUTION, metadata=metadata)
-        figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
-    return paths
-
-
-def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
-    """Return a figure as a small, sharp PNG, and width and height with which it is to be shown, px.
-
-    The picture is as high as what is drawn: nothing is cut, and there is no empty strip.
-    """
-    large, small = io.BytesIO(), io.BytesIO()
-    with figure_style(TEXT):
-        if (engine := figure.get_layout_engine()) is not None:
-            engine.execute(figure)  # once, also for the edges of what is drawn
-            figure.set_layout_engine("none")
-        drawn = figure.get_tightbbox()
-        low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
-        box = Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
-        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
-    # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
-    with Image.open(large) as picture:
-        indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-        indexed.save(small, "PNG", optimize=True)
-    return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
 
 
 def folder_figures(folder: Path) -> Iterator[NamedFigure]:

@@ -1,11 +1,12 @@
-"""Figures of numbers, a row a controller: what each run came to, and how long steps take."""
+"""Figures of metrics: of each run, of computing times, and of settled runs over a condition that varies."""
 
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -14,11 +15,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from servobench.harness.analysis.comparison import settling_times
+from servobench.harness.analysis.comparison import settled_share, settling_times
 from servobench.harness.analysis.measures import MEASURES
-from servobench.harness.pictures.ensembles import Ensembles
-from servobench.harness.pictures.panels import LETTER, Styles
-from servobench.harness.pictures.style import TEXT, WIDE, Layout, MethodStyle
+from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
+from servobench.harness.pictures.style import (
+    LETTER,
+    TEXT,
+    WIDE,
+    Layout,
+    MethodStyle,
+    Styles,
+    add_legend,
+    label_rows,
+    panel_grid,
+)
+from servobench.harness.pictures.tracks import Ensembles
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
@@ -34,6 +45,12 @@ NAME_LETTERS: Final = 20  # of a controller's name in a line beside an axis, for
 LETTERS: Final = 16.0  # of a label in an inch
 NUMBERS: Final = 0.25  # [in] beside the names
 LEAST_ROWS: Final = 4  # controllers for which a panel has room
+SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
+UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
+LINE_LETTERS: Final = 30  # of a line of text within a panel
+Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
+SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
+SWEPT = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
 
 
 class _Dots(NamedTuple):
@@ -247,3 +264,135 @@ def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles,
     else:
         axes.set_xlim(0.0, edge)
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
+
+
+def draw_places(
+    axes: Axes,
+    places: Sequence[float],
+    values: Mapping[str, Sequence[Estimate]],
+    styles: Mapping[str, MethodStyle],
+) -> None:
+    """Draw an estimate with its interval for each method at each place; the methods stand beside each other.
+
+    Args:
+        axes: where.
+        places: abscissae, ascending; marks are spread over a part of the first distance.
+        values: method -> an estimate a place; an infinite one is left out, an infinite end leaves the picture.
+        styles: method -> style.
+    """
+    width = SPREAD * (places[1] - places[0] if len(places) > 1 else 1.0)
+    for k, (name, estimates) in enumerate(values.items()):
+        style = styles[name]
+        shift = width * ((k + 0.5) / len(values) - 0.5)
+        x = np.array(places, dtype=float) + shift
+        y, low, high = (np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high"))
+        known = np.isfinite(y)
+        if known.any():
+            y, top = y[known], float(np.max(y[known]))
+            below = y - np.where(np.isfinite(low), low, np.nan)[known]
+            above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y  # out of the picture
+            axes.errorbar(
+                x[known], y, yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0), color=style.colour,
+                linestyle="none", marker=style.marker or "_", markersize=4.5, linewidth=1.2,
+                elinewidth=1.0, capsize=2.0, label=name,
+            )  # fmt: skip
+
+
+def draw_curves(
+    axes: Axes, places: Sequence[float], values: Curves, styles: Mapping[str, MethodStyle], top: float
+) -> None:
+    """Draw an estimate over a quantity, a line a method with its interval as a band; abscissae are to scale.
+
+    Methods with the same curve share one line, and the panel names them.
+
+    Args:
+        axes: where.
+        places: abscissae, ascending.
+        values: method -> an estimate a place; an infinite one is a mark at the upper edge.
+        styles: method -> style.
+        top: upper edge of the panel.
+    """
+    x, shared = np.array(places, dtype=float), []
+    groups = same_curves(values)
+    for names in groups:
+        first, style = names[0], styles[names[0]]
+        y, low, high = (np.array([getattr(e, part) for e in values[first]]) for part in ("value", "low", "high"))
+        known = ~np.isnan(y)
+        if not known.any():
+            continue
+        edges = np.nan_to_num(np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=1.05 * top)
+        axes.fill_between(x[known], *edges, color=style.colour, alpha=0.12, linewidth=0.0)
+        _draw_line(axes, x[known], y[known], style, first, top)
+        for name in names[1:]:
+            axes.plot([], [], label=name, **styles[name].line_arguments(1))
+        if len(names) > 1:
+            shared.append(("all methods" if len(groups) == 1 else ", ".join(names), y))
+    for names_text, y in shared:
+        constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
+        words = textwrap.fill(f"one line{constant}: {names_text}", LINE_LETTERS)
+        upper = float(np.nanmean(np.minimum(y, top))) < top / 2.0
+        level, side = (0.96, "top") if upper else (0.04, "bottom")
+        axes.text(0.03, level, words, transform=axes.transAxes, va=side, fontsize=TEXT - 2.0,
+                  bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0})  # fmt: skip
+    axes.set_ylim(-0.02 * top, top)
+
+
+def same_curves(values: Curves) -> list[list[str]]:
+    """Return the methods, those with the same values and intervals everywhere together."""
+    groups: dict[str, list[str]] = {}
+    for name, estimates in values.items():
+        groups.setdefault(repr([(e.value, e.low, e.high) for e in estimates]), []).append(name)
+    return list(groups.values())
+
+
+def _draw_line(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle, name: str, top: float) -> None:
+    look: dict[str, Any] = {"color": style.colour, "markerfacecolor": style.face, "markersize": 4.5, "linewidth": 1.2}
+    beyond = ~np.isfinite(y)
+    shown = np.where(beyond, UPPER * top, y)
+    axes.plot(x, shown, label=name, linestyle=style.line, marker=style.marker, markevery=~beyond, **look)
+    if beyond.any():
+        axes.plot(x[beyond], np.full(np.count_nonzero(beyond), UPPER * top), linestyle="none", marker=6,
+                  **(look | {"markersize": 6.5}))  # fmt: skip
+
+
+def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -> Figure | None:
+    """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies, if one does."""
+    sweeps = _sweeps(runs)
+    if not sweeps:
+        return None
+    figure, panels = panel_grid(len(sweeps), 2.5, layout)
+    for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
+        shares = {key: settled_share(own) for key, own in part.groupby(["controller", "size"])}
+        names, sizes = part["controller"].unique(), sorted(part["size"].unique())
+        values = {name: [shares.get((name, size), NO_ESTIMATE) for size in sizes] for name in names}
+        draw_curves(axes, sizes, values, styles, top=104.0)
+        axes.set_xlabel(label)
+    label_rows(panels, "settled runs [%]")
+    figure.suptitle("How many moves settle over what is varied; bands are 95 % intervals", fontsize=TEXT + 1.0)
+    add_legend(figure, panels)
+    return figure
+
+
+def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each condition with at least two sizes the runs concerned, with the column `size`.
+
+    Where a sweep says along which axis a run stands, the axes are its own, and the numbers that vary at one place of
+    an axis; else the mismatches are read, and runs without mismatch have size 0 on each axis.
+    """
+    none = runs.head(0)
+    places = [runs] if "axis" not in runs else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
+    sweeps = {
+        label: runs.assign(size=factor * runs[name].astype(float))
+        for name, (label, factor) in SWEPT.items()
+        if name in runs and any(own[name].nunique() > 1 for own in places)
+    }
+    if "axis" not in runs or (runs["axis"].fillna("") == "").all():
+        none = runs[runs["mismatch"] == "none"].assign(size=0.0)
+        runs = runs.assign(**runs["mismatch"].str.extract(SIZED_AXIS))
+    along = runs[runs["axis"].fillna("") != ""]
+    along = along.assign(size=along["magnitude"].astype(float))
+    for (axis, unit), group in along.groupby(["axis", "unit"], sort=False):
+        name = str(axis).replace("_", " ")
+        sweeps[f"{name} [{unit}]" if unit else name] = pd.concat([none, group]) if len(none) else group
+    known = {label: part.dropna(subset=["size"]) for label, part in sweeps.items()}
+    return {label: part for label, part in known.items() if part["size"].nunique() > 1}
