@@ -1,4 +1,4 @@
-"""What goes into an FMU, whatever the model, and how it is written: sources, libraries, description, documentation.
+"""The content of an FMU of any model, and how it is written: sources, libraries, description, documentation.
 
 Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
 """
@@ -51,14 +51,14 @@ RELATED_FILES: Final = (
 
 @dataclass(frozen=True)
 class Product:
-    """What goes into an FMU.
+    """The content of an FMU.
 
     Attributes:
         fmi_version: 2 or 3.
         folder: of the model below `fmus`, with model.c, model.h and license.txt.
         core: name of the generated C file and of its header in that folder.
         source: text of that C file.
-        constants: what the model needs in layout.h beside sizes and offsets of its variables.
+        constants: for layout.h, beside sizes and offsets of the variables.
         description: of the model.
         documentation: HTML.
         reference: text of the reference run's inputs and outputs.
