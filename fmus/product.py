@@ -36,8 +36,8 @@ HEADERS: Final = {
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
 FMI_SOURCES: Final = {
-    2: ("fmi2.c", "fmi2_exchange.c"),
-    3: ("fmi3.c", "fmi3_exchange.c", "fmi3_derivatives.c", "fmi3_absent.c"),
+    2: ("fmi2.c",),
+    3: ("fmi3.c", "fmi3_derivatives.c", "fmi3_absent.c"),
 }
 INSTANCE_HEADERS: Final = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
 SHARED_SOURCES: Final = ("model.c", "instance.c")
@@ -80,6 +80,7 @@ class Product:
             "model_functions.h",
             "instance.h",
             "instance.c",
+            "shared_functions.h",
             INSTANCE_HEADERS[version_],
             *FMI_SOURCES[version_],
         )
