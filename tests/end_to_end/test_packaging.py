@@ -35,7 +35,7 @@ def wheel_names(tmp_path_factory):
 
 def test_the_wheel_holds_one_package_with_its_types(wheel_names):
     assert {name.split("/")[0].split("-")[0] for name in wheel_names} == {"servobench"}
-    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/signals.py"} <= wheel_names
+    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/contract/signals.py"} <= wheel_names
     assert {name.split("/")[1] for name in wheel_names if name.startswith("servobench/") and name.count("/") > 1} == {
         *FOLDERS
     }
@@ -101,6 +101,30 @@ def test_another_version_in_the_citation_is_told(files, tmp_path):
         (tmp_path / name).write_text((ROOT / name).read_text(encoding="utf-8").replace("\nversion: ", "\nversion: 9."))
     (fault,) = release.faults_of_versions(files[0], tmp_path)
     assert fault.startswith("CITATION.cff says version 9.")
+
+
+def test_only_the_tagged_commit_of_a_version_without_changes_is_a_release(tmp_path):
+    def git(*words):
+        subprocess.run(["git", "-c", "user.name=A", "-c", "user.email=a@b.c", *words], cwd=tmp_path, check=True)
+
+    git("init", "--quiet")
+    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## Unreleased\n")
+    git("add", ".")
+    git("commit", "--quiet", "-m", "one")
+    untagged, undated = release.faults_of_commit(tmp_path, "9.1.0")
+    assert untagged == "no commit has the tag v9.1.0; git tag -a v9.1.0, or --rehearse"
+    assert undated == "CHANGELOG.md has no section 9.1.0 with its date"
+    git("tag", "v9.1.0")
+    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## 9.1.0 (2026-01-01)\n")
+    assert release.faults_of_commit(tmp_path, "9.1.0") == [
+        "the checkout has changes; commit or remove them, or --rehearse"
+    ]
+    git("commit", "--quiet", "-am", "two")
+    (moved,) = release.faults_of_commit(tmp_path, "9.1.0")
+    assert moved.startswith("the checkout is at ")
+    assert moved.endswith("; git checkout v9.1.0, or --rehearse")
+    git("tag", "--force", "v9.1.0")
+    assert release.faults_of_commit(tmp_path, "9.1.0") == []
 
 
 def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):

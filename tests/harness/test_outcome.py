@@ -10,7 +10,7 @@ from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.outcome import find_outcome, joint_rests_at_limit
 from servobench.harness.run.references import FixedPoint
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.tasks import SINGULAR, Scenario
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.hand_eye import hand_eye_spec

@@ -13,10 +13,16 @@ from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.studies import map_lines, robustness
-from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, Line, find_lines
+from servobench.harness.studies import robustness
+from servobench.harness.studies import robustness as map_lines
 from servobench.harness.studies.robustness import (
+    KNOWN_LINES,
+    LATENCY,
+    LINES,
+    MOVE,
+    Line,
     draw_map,
+    find_lines,
     map_cells,
     moved_settings,
     predicted_limits,

@@ -1,0 +1,163 @@
+"""A request with all its settings as typed values: names looked up and texts read once a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+from servobench.controllers.parts import ESTIMATORS, LAWS
+from servobench.harness.config.defaults import default_config
+from servobench.harness.config.registry import (
+    controller_names,
+    find_controller,
+    find_plant,
+    installed_plant,
+    plant_names,
+)
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.tasks import TASKS, find_task, taught
+from servobench.plant.bench.plant import PlantEntry
+from servobench.plant.contract.sensing import change_sensing, vary_sensing
+from servobench.plant.robot.robot import Robot
+
+
+@dataclass(frozen=True)
+class ResolvedRun:
+    """All that a run depends on; it can be pickled. Plant and run have noise, latency and period of the request."""
+
+    request: RunRequest
+    run: RunSettings
+    plant: Any
+    controller: Any
+    task: Any
+
+
+def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
+    """Return `request` with the settings of its plant, controller and task.
+
+    Raises:
+        ConfigurationError: an unknown name, or a setting that cannot be used.
+    """
+    return select(request, resolve_sections([request], settings))
+
+
+def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_run: bool = True) -> dict[str, Any]:
+    """Return the typed settings of every section that `requests` read, by name.
+
+    Args:
+        requests: the runs.
+        settings: what is set.
+        to_run: whether what the plants need has to be installed; their settings are known without it.
+
+    Raises:
+        ConfigurationError: an unknown name, or a setting that cannot be used.
+    """
+    defaults: dict[str, Any] = {"run": RunSettings()}
+    requests = list(requests)
+    for request in requests:
+        for name, what in ((request.plant, "plant"), (request.controller, "controller")):
+            if name in TASKS:
+                raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
+        if request.plant == request.controller:
+            raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
+    robot = _common_robot(requests)
+    find = installed_plant if to_run else find_plant
+    defaults |= {
+        name: _plant_default(name, find(name), robot) for name in dict.fromkeys(each.plant for each in requests)
+    }
+    defaults |= {
+        name: default_config(find_controller(name), model_known=robot.known)
+        for name in dict.fromkeys(each.controller for each in requests)
+    }
+    defaults |= {name: taught(find_task(name), robot) for name in dict.fromkeys(each.task for each in requests)}
+    return {name: settings.resolve(name, default) for name, default in defaults.items()}
+
+
+def _common_robot(requests: Iterable[RunRequest]) -> Robot:
+    """Return the robot of all runs of a batch, which share the settings of plants and tasks."""
+    names = list(dict.fromkeys(each.robot for each in requests)) or [DEFAULT_ROBOT]
+    if len(names) > 1:
+        raise ConfigurationError(f"a batch has one robot, got {', '.join(names)}; use a batch for each")
+    return find_robot(names[0])
+
+
+def _plant_default(name: str, entry: PlantEntry, robot: Robot) -> Any:  # noqa: ANN401 - any configuration dataclass
+    if entry.own_robot and robot.name != DEFAULT_ROBOT:
+        raise ConfigurationError(f"plant {name} brings a robot of its own, so --robot {robot.name} does not apply")
+    return entry.config() if entry.config_for is None else entry.config_for(robot)
+
+
+def select(request: RunRequest, sections: dict[str, Any]) -> ResolvedRun:
+    """Return `request` with its settings out of those that `resolve_sections` returned.
+
+    Raises:
+        ConfigurationError: a noise factor, latency or axis of the sensor for a plant that has no such setting, or a
+            number that is out of its bounds.
+    """
+    plant, run = sections[request.plant], sections["run"]
+    if request.noise_factor != 1.0 or request.latency is not None or request.mismatch.sensor:
+        try:
+            plant = vary_sensing(plant, request.noise_factor, request.latency)
+            plant = change_sensing(plant, request.mismatch.disturbed)
+        except ValueError as error:
+            raise ConfigurationError(f"plant {request.plant}: {error}") from error
+    if request.period is not None:
+        run = _with_period(run, request.period)
+    return ResolvedRun(request, run, plant, sections[request.controller], sections[request.task])
+
+
+@lru_cache
+def _with_period(run: RunSettings, period: float) -> RunSettings:
+    """Return the same object for all runs of a period [s], so that they can advance together.
+
+    Raises:
+        ConfigurationError: a period that is not positive.
+    """
+    try:
+        return replace(run, period=period)
+    except ValueError as error:
+        raise ConfigurationError(f"run: {error}") from error
+
+
+def check_settings(settings: Settings, running: Iterable[str]) -> None:
+    """Refuse settings that nothing would read, here or elsewhere, and assignments to what does not run.
+
+    Args:
+        settings: overrides of the defaults.
+        running: the sections that are read here, apart from `run`.
+
+    Raises:
+        ConfigurationError: an unknown section; an assignment to one that does not run; or an unknown key or a bad value
+            in a section of a file that does not run.
+    """
+    names = ["run", *dict.fromkeys(running)]
+    pairs = [section for section in settings.sections if _is_pair(section)]
+    settings.check_sections([*known_sections(), *pairs, *names])
+    settings.check_running(names)
+    for section in settings.sections:
+        if section not in names and (default := _default(section)) is not None:
+            settings.resolve(section, default)
+
+
+def known_sections() -> list[str]:
+    """Return every section that a configuration may have, but for those of pairs and of mapped FMUs."""
+    return ["run", *plant_names(), *controller_names(), *TASKS]
+
+
+def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
+    """Return the defaults of a section; None for a plant or controller that cannot be loaded here."""
+    if section in TASKS:
+        return find_task(section).default
+    try:
+        return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
+    except ConfigurationError:  # a plug-in, or a library that is not installed: nothing of this section runs here
+        return None
+
+
+def _is_pair(section: str) -> bool:
+    law, plus, estimator = section.partition("+")
+    return bool(plus) and law in LAWS and estimator in ESTIMATORS

@@ -1,0 +1,175 @@
+"""Poses of the cameras and the target of a set-up: planned around a robot's workspace, and as drawn for a run.
+
+Fixed cameras look at the middle of the workspace from the same distance: the first one from above, as planned for
+`position`, a second one from in front, `SIDE` from the vertical. The target is on the flange, in place of the ball, and
+a plate faces the first camera at the arm's home.
+
+Cameras on the hand are in place of the ball, look along the flange's axis and are `BASELINE` apart if there are two,
+turned towards the point that they look at. The target is in the world, where they look from the arm's home.
+
+The cameras of a run are drawn by name and seed, as the arm is. Focal lengths are scaled, principal points shifted and
+radial distortions set, each drawn uniformly from plus or minus the magnitude. A camera on the hand is turned about its
+own centre as well, by an angle drawn below `mount` about a random axis. Every further camera of a set-up turns as the
+first one does (`camera_rotation`), by draws of its own. Every axis has a random stream of its own; a camera has the
+same draws in every set-up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from math import atan2, cos, radians, sin
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.model import EyeModel, Mount
+from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.seeds import named_generator
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.hand_eye import turn_about
+from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
+from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.workspace import camera_pose
+
+SIDE: Final = radians(60.0)  # of the second fixed camera's view from the vertical
+HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
+BASELINE: Final = 0.2  # [m] between two cameras on the hand; for a UR5
+OPTICAL = ("focal", "centre", "distortion")  # axes of a mismatch that a camera in pixels has
+ON_HAND = "mount"  # the axis that a camera on the hand has
+
+
+@dataclass(frozen=True, eq=False)
+class CameraDraws:
+    """The values drawn for c cameras.
+
+    Attributes:
+        focal: (c,), factors on the focal lengths.
+        centre: (c, 2), shifts of the principal points [px].
+        distortion: (c,), k of the radial distortion [1].
+        turn: (c, 3), rotation vectors [rad] of the cameras after the first one, whose turn is that of the robot.
+        mount: (c, 3), rotation vectors [rad] about the cameras' own centres.
+    """
+
+    focal: FloatArray
+    centre: FloatArray
+    distortion: FloatArray
+    turn: FloatArray
+    mount: FloatArray
+
+    def as_record(self) -> dict[str, object]:
+        """Return the values as plain lists, for JSON."""
+        return {f"camera_{field.name}": getattr(self, field.name).tolist() for field in fields(self)}
+
+
+def planned(count: int) -> CameraDraws:
+    """Return the draws of `count` cameras that are as planned."""
+    zero = np.zeros(count)
+    return CameraDraws(np.ones(count), np.zeros((count, 2)), zero, np.zeros((count, 3)), np.zeros((count, 3)))
+
+
+def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
+    """Draw how `count` cameras differ from those that are planned; `seed` is that of the robot's mismatch."""
+    size = mismatch.size
+
+    def draw(name: str, *shape: int) -> FloatArray:
+        """Return numbers of ±1, (count, ...), the first ones alike for any count."""
+        return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, (count, *shape))
+
+    mount = named_generator(seed, "mismatch.mount_axis").standard_normal((count, 3))
+    mount *= size(ON_HAND) * draw(ON_HAND, 1) / np.linalg.norm(mount, axis=-1, keepdims=True)
+    return CameraDraws(
+        focal=1.0 + size("focal") * draw("focal"),
+        centre=size("centre") * draw("centre", 2),
+        distortion=size("distortion") * draw("distortion"),
+        turn=np.array([np.zeros(3), *(_draw_turn(mismatch, i, seed) for i in range(1, count))]),
+        mount=mount,
+    )
+
+
+def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
+    """Return the rotation vector, (3,) rad, of a further camera, drawn as that of the first one is."""
+    angle = mismatch.size("camera_rotation")
+    axis = draw_camera_axis(angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}"))
+    share = 1.0 if mismatch.camera_exact else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
+    return np.asarray(share * angle * axis)
+
+
+@lru_cache(maxsize=64)
+def nominal_model(eye: Eye, mount: Mount, robot: Robot) -> EyeModel:
+    """Return the nominal arm with cameras and target as planned, which controllers may know.
+
+    Raises:
+        ValueError: the arm has too few joints for the set-up.
+    """
+    if robot.n < eye.least_joints:
+        wanted = f"an arm of {eye.least_joints} joints or more"
+        raise ValueError(f"sensing {eye.name} needs {wanted}, and {robot.title} has {robot.n}")
+    return _model(eye, mount, robot, robot.arm, planned_cameras(eye, mount, robot), planned(eye.cameras))
+
+
+def true_model(eye: Eye, mount: Mount, robot: Robot, arm: SerialArm, turn: FloatArray, draws: CameraDraws) -> EyeModel:
+    """Return a true arm with cameras as drawn.
+
+    Args:
+        eye: the set-up.
+        mount: of its cameras.
+        robot: the nominal one.
+        arm: the true one.
+        turn: (3,), rotation vector of the first camera [rad].
+        draws: of all cameras.
+
+    Raises:
+        ValueError: see `nominal_model`.
+    """
+    nominal = nominal_model(eye, mount, robot)
+    turns = [turn, *draws.turn[1:]]
+    pivot = nominal.pivot(robot.workspace.centre)
+    cameras = np.stack([turn_about(pose, each, pivot) for pose, each in zip(nominal.cameras, turns, strict=True)])
+    if mount == "hand":
+        cameras[:, :3, :3] @= Rotation.from_rotvec(draws.mount).as_matrix()
+        cameras[:, :3, 3] += arm.tool - robot.arm.tool
+    return _model(eye, mount, robot, arm, cameras, draws)
+
+
+def planned_cameras(eye: Eye, mount: Mount, robot: Robot) -> FloatArray:
+    """Return the poses of the cameras as planned, (c, 4, 4), in the frame that they are mounted on.
+
+    Raises:
+        ValueError: more cameras than there are places for.
+    """
+    if eye.cameras not in (1, 2):
+        raise ValueError(f"{eye.name} needs {eye.cameras} cameras, and there are places for one or two")
+    work = robot.workspace
+    if mount == "fixed":
+        above, distance = work.camera_pose()[:3, :3], eye.closeness * work.camera_distance
+        front = Rotation.from_euler("y", SIDE).as_matrix() @ above
+        return np.stack([camera_pose(R, work.centre, distance) for R in (above, front)[: eye.cameras]])
+    poses = np.stack([np.eye(4)] * eye.cameras)
+    poses[:, :3, 3] = robot.arm.tool
+    if eye.cameras == 2:
+        half, distance = 0.5 * BASELINE * work.scale, HAND_DISTANCE * work.scale
+        for pose, side in zip(poses, (-1.0, 1.0), strict=True):
+            angle = -side * atan2(half, distance)
+            pose[:3, 0], pose[:3, 2] = (cos(angle), 0.0, -sin(angle)), (sin(angle), 0.0, cos(angle))
+            pose[:3, 3] += (side * half, 0.0, 0.0)
+    return poses
+
+
+def _model(eye: Eye, mount: Mount, robot: Robot, arm: SerialArm, cameras: FloatArray, draws: CameraDraws) -> EyeModel:
+    work = robot.workspace
+    optics = ideal_optics(CAMERA, eye.cameras)
+    optics = Optics(optics.focal * draws.focal, optics.centre + draws.centre, draws.distortion, optics.size)
+    home = robot.arm.frames(work.home)[-1]
+    shape = work.scale * np.array(eye.target)
+    if mount == "fixed":
+        facing = home[:3, :3].T @ work.camera_pose()[:3, :3]
+        target, distance = arm.tool + shape @ facing.T, eye.closeness * work.camera_distance
+    else:
+        distance = HAND_DISTANCE * work.scale
+        ahead = robot.arm.tool + np.array([0.0, 0.0, distance])
+        target = (shape + ahead) @ home[:3, :3].T + home[:3, 3]
+    return EyeModel(arm, eye, mount, cameras, optics, target, distance, CAMERA.focal, work.camera_distance)

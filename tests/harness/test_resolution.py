@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from kit.plants import NEEDS_BULLET
+from servobench.harness.config.registry import controller_names, engine_of
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.resolution import resolve
+from servobench.plant.robot.mismatch import Mismatch
+
+
+@pytest.mark.parametrize("controller", [*controller_names(), "mfac+rls"])
+def test_a_resolved_run_can_be_sent_to_another_process(controller):
+    run = resolve(RunRequest("kinematic", controller, "circle", Mismatch("moderate"), 3, 2.0, 0.05), Settings())
+    again = pickle.loads(pickle.dumps(run))
+    assert (again.request, again.run, again.plant, again.task) == (run.request, run.run, run.plant, run.task)
+    assert repr(again.controller) == repr(run.controller)
+
+
+def test_a_resolved_run_holds_what_the_user_set_and_what_the_request_varies():
+    law = {"law": {"gain": 4.0}}
+    settings = Settings({"run": {"preview_time": 0.15}, "circle": {"laps": 1}, "ukf_mfac": law})
+    run = resolve(RunRequest("kinematic", "ukf_mfac", "circle", Mismatch(), 0, latency=0.1, period=0.02), settings)
+    assert run.run == RunSettings(0.02, 0.15)
+    assert run.task.laps == 1
+    assert run.controller.law.gain == 4.0
+    assert run.plant.sensing.latency == 0.1
+
+
+def test_the_text_of_a_mismatch_is_read_and_a_bad_one_refused():
+    request = RunRequest("kinematic", "rls", "exp1", "moderate+links=10%", 0)
+    assert request.mismatch == Mismatch.parse("moderate+links=10%")
+    assert request.as_row()["mismatch"] == "moderate+links=10%"
+    assert request.run_id == "kinematic-rls-exp1-moderate+links=10_-0"
+    with pytest.raises(ConfigurationError, match="'mild' is not known"):
+        RunRequest("kinematic", "rls", "exp1", "mild", 0)
+
+
+def test_a_run_has_whole_periods():
+    assert RunSettings(period=0.05).periods(10.0) == 200
+    assert RunSettings(period=0.3).periods(1.0) == 4
+    with pytest.raises(ValueError, match="period must be above 0"):
+        RunSettings(period=0.0)
+
+
+@pytest.mark.parametrize(
+    ("plant", "engine"),
+    [("kinematic", ""), ("there_is_none", ""), pytest.param("bullet", "PyBullet ", marks=NEEDS_BULLET)],
+)
+def test_a_row_names_the_engine_that_renders_its_plant(plant, engine):
+    told = engine_of(plant)
+    assert told.startswith(engine)
+    assert bool(told) == bool(engine)
