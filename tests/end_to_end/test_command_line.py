@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -105,6 +108,18 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
     assert "Traceback" not in output
     assert "--resume" in output
     assert 3 <= len(results.load_runs(out)) < 100
+
+
+def test_tests_that_are_started_with_interrupts_ignored_can_interrupt_nevertheless(tmp_path):
+    (tmp_path / "test_handler.py").write_text(
+        "import signal\n\n\ndef test_it():\n    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
+    )
+    tests = [sys.executable, "-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "test_handler.py"]
+    done = subprocess.run(
+        ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *tests], cwd=tmp_path, check=False, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
 
 
 def test_a_killed_batch_keeps_every_finished_run_and_can_be_resumed(monkeypatch, capsys, tmp_path):
