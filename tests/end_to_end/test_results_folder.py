@@ -15,7 +15,7 @@ import pytest
 
 from kit import breaking
 from kit.command import finish, judged, part_count, servobench, start, wait_for
-from servobench.harness.batch import results
+from servobench.harness.batch import campaign, results
 from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.workers import Bounds
@@ -74,10 +74,26 @@ def test_of_many_processes_that_resume_at_once_one_works_and_the_others_are_refu
 
     children = [in_child(partial(resume, chance.uniform(0.0, 0.6))) for _ in range(RESUMERS)]
     codes = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
-    assert set(codes) <= {0, 2}
+    assert set(codes) <= {0, 2}, codes
     assert 0 in codes
     tables = (judged(results.load_runs(folder)) for folder in (out, tmp_path / "alone"))
     pd.testing.assert_frame_equal(*tables, check_exact=True)
+    assert examine(out).findings == []
+
+
+def test_a_batch_that_another_process_began_before_the_lock_was_taken_is_resumed(tmp_path, monkeypatch):
+    out, how = tmp_path / "out", Execution(workers=1, block=4, resume=True, bounds=Bounds(isolate=False))
+    batch, lock = breaking.campaign(False, ("constant",), 4), campaign.locked
+    out.mkdir()
+
+    def late(folder: Path, **options: bool):
+        monkeypatch.setattr(campaign, "locked", lock)
+        carry_out(batch, out, how)
+        return lock(folder, **options)
+
+    monkeypatch.setattr(campaign, "locked", late)
+    carry_out(batch, out, how)
+    assert len(results.load_runs(out)) == 4
     assert examine(out).findings == []
 
 
