@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar, Final, Literal, final
+from collections.abc import Iterable
+from typing import Any, Final, Literal, final
 
 import casadi
 import numpy as np
@@ -27,13 +27,6 @@ _PLAN_TOLERANCE: Final = 1e-9  # [rad] a smaller change of the plan ends the ite
 @settings
 class NmpcCalibratedConfig:
     """Settings of `nmpc_calibrated`; "tuned" = on simulated UR5s with joint lag and a command delay of one period."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "horizon": "horizon_time, in seconds",
-        "delay_periods": "delay, in seconds",
-        "rho": "decay, per second",
-        "disturbance_gain": "disturbance_rate, per second",
-    }
 
     horizon_time: Positive = 0.4
     """[s] how far the prediction reaches; with the delay within the default preview of 0.5 s."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
-from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.robot.catalogue import UR5, find_robot
@@ -47,8 +45,6 @@ class Ur5FmuConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
 @cache

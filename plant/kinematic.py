@@ -10,9 +10,8 @@ Delay, noise, latency and lost frames are those of `servobench.plant.bench.bench
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import lru_cache, partial
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +26,6 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
-from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.sensed import SensedArm
 
@@ -46,8 +44,6 @@ class KinematicConfig:
     """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
     sensing: SensingConfig = nested(SensingConfig)
     """Noise, latency, frame period and lost frames."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
 @lru_cache(maxsize=64)

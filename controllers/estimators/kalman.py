@@ -11,8 +11,8 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import ClassVar, Literal, NamedTuple, final
+from collections.abc import Callable
+from typing import Literal, NamedTuple, final
 
 import numpy as np
 
@@ -28,10 +28,6 @@ from servobench.plant.contract.signals import BoolArray
 @settings
 class KalmanConfig:
     """Settings of the Kalman filter."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "process_deviation": "walk, per root of a second: process_deviation / sqrt(0.05 s)"
-    }
 
     initial_deviation: Positive = 0.05
     """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""

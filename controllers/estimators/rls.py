@@ -8,8 +8,7 @@ It minimises Σ λ^(k−t) ‖Δy_t − J Δq_t‖² + λ^k tr[(J − Ĵ₀) P�
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -25,8 +24,6 @@ from servobench.plant.contract.signals import BoolArray
 @settings
 class RlsConfig:
     """Settings of recursive least squares."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {"forgetting": "memory, in seconds: -0.05 s / ln(forgetting)"}
 
     memory: PositiveOrInfinite = 0.975
     """[s] of motion that is remembered: λ = exp(−duration/memory), 0.95 for a motion of 0.05 s."""

@@ -15,10 +15,9 @@ multiples of the identity it even splits by rows: the form "split" gives the sam
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -32,8 +31,6 @@ from servobench.plant.contract.settings import NonNegative, Positive, settings
 @settings
 class UkfConfig:
     """Settings of the unscented Kalman filter."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = KalmanConfig.RENAMED
 
     initial_deviation: Positive = 0.05
     """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""

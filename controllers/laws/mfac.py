@@ -9,8 +9,7 @@ newest measured error is used. Along a singular value σ of Ĵ the loop gain a p
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -26,11 +25,6 @@ from servobench.plant.contract.signals import Observation
 @settings
 class MfacConfig:
     """Settings of the MFAC law."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "step_factor": "gain, in 1/s: -ln(1 - step_factor) / period",
-        "feedforward": "aids.feedforward",
-    }
 
     gain: PositiveOrInfinite = 3.25
     """[1/s] K: ρ = 1 − exp(−K dt), 0.15 at 20 Hz; not the paper's ρ = 1 (`inf`), which three periods of delay make

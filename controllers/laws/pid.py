@@ -13,8 +13,7 @@ with e = y_ref − y (..., m), its integral I and its filtered derivative d:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 
@@ -31,8 +30,6 @@ from servobench.plant.contract.signals import BoolArray, Observation
 @settings
 class PidConfig:
     """Settings of the PID law; the defaults damp a loop with three periods of delay at 20 Hz well."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {"feedforward": "aids.feedforward"}
 
     proportional_gain: Positive = 2.5
     """[1/s] K_p; a share of 0.12 of the error per period of 0.05 s."""

@@ -13,7 +13,7 @@ from page_studies.methods import FOUR, SUFFIX, quoted
 from page_studies.study import Words
 from servobench.harness.analysis.statistics import MISSING
 
-SUCCESSOR: Final = "map_mfac"  # of `rbfnn_mfac_plus`, which is still understood as a name of it
+SUCCESSOR: Final = "map_mfac"  # of `rbfnn_mfac_plus`
 THEN: Final = (SUCCESSOR, *(name + SUFFIX for name in FOUR))  # the methods of 0.1.0 by their present names
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import completion
-from servobench.harness.cli.named import known_robot
 from servobench.harness.cli.options import ConfigOption, RobotOption, SensingOption, SetOption
+from servobench.harness.cli.selection import known_robot
 from servobench.harness.cli.terminal import console
 
 if TYPE_CHECKING:

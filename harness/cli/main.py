@@ -13,20 +13,11 @@ from typing import Annotated, Any, NoReturn
 import typer
 import typer.main
 
-from servobench.harness.cli import completion, lists, runs, show, studies
-from servobench.harness.cli.analyse import analyse
-from servobench.harness.cli.check import check
-from servobench.harness.cli.export import export
+from servobench.harness.cli import authoring, completion, lists, results, runs, studies
+from servobench.harness.cli.films import record
 from servobench.harness.cli.fmu import fmu_app
-from servobench.harness.cli.grouping import grouped
-from servobench.harness.cli.init import init
-from servobench.harness.cli.new import new
-from servobench.harness.cli.options import FAILED, INTERRUPTED
-from servobench.harness.cli.record import record
-from servobench.harness.cli.shadow import shadow
-from servobench.harness.cli.sweep import sweep
-from servobench.harness.cli.verify import verify
-from servobench.harness.cli.wording import HELP_NAMES, word
+from servobench.harness.cli.loops import analyse
+from servobench.harness.cli.options import FAILED, HELP_NAMES, INTERRUPTED, grouped, word
 
 INPUT_ERROR = 2  # exit code
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
@@ -45,11 +36,11 @@ WITHOUT: dict[tuple[object, object], str] = {  # why a command does not have an 
     ("controllers", "--sensing"): "settings of a controller are the same under all sensing",
 }
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
-    "First steps": (runs.run, runs.compare, show.statistics, show.report, record),
-    "Your own controller": (new, check, shadow),
-    "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, init),
-    "Studies": (sweep, analyse, studies.robustness, studies.claims, studies.tune),
-    "Tools": (runs.train, runs.collect, export, verify),
+    "First steps": (runs.run, runs.compare, results.statistics, results.report, record),
+    "Your own controller": (authoring.new, authoring.check, authoring.shadow),
+    "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
+    "Studies": (studies.sweep, analyse, studies.robustness, studies.claims, studies.tune),
+    "Tools": (runs.train, runs.collect, results.export, results.verify),
 }
 
 app = typer.Typer(context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False)

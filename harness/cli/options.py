@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
+from rich.markup import escape
 
 from servobench.harness.cli import completion
 
@@ -220,3 +223,84 @@ class Overrides:
 
 
 LIMITED, PLACE, RUNNING, JUDGING, OVERRIDES = Limited(), Place(), Running(), Judging(), Overrides()  # as defaults
+
+
+VALUES = {  # what a value is -> the long names of the options that take it
+    "NAME": "controller division estimator format jacobian mismatch plant robot sensing task",
+    "NAMES": "axes controllers kinds plants platforms tasks",
+    "SEEDS": "seeds",
+    "INTEGER": "fmi offset seed study-seed",
+    "COUNT": "robots search studies trials workers",
+    "NUMBER": "never",
+    "NUMBERS": "noise",
+    "SECONDS": "begin latency length limit period run-timeout",
+    "SIZE": "run-memory",
+    "KEY=VALUE": "set",
+    "AXIS=VALUES": "vary",
+    "FILE": "config output",
+    "FOLDER": "folder out",
+    "RUN_ID": "run",
+    "COLUMN": "metric",
+    "ADDRESS": "scheduler",
+}
+WORDS = {option: word for word, options in VALUES.items() for option in options.split()}
+HELP_NAMES = ["-h", "--help"]
+COMPLETION_HELP = {  # by the option that typer adds
+    "install_completion": "Let this shell complete names.",
+    "show_completion": "Print the completion script instead of installing it.",
+}
+
+
+def word(root: Any) -> None:  # noqa: ANN401 - typer's own classes have no public name
+    """Name the values in the help of a command and its subcommands, instead of their types in Python.
+
+    Help texts are taken as they stand: `[s]` is a unit and no markup.
+    """
+    waiting = [root]
+    while waiting:
+        each = waiting.pop()
+        waiting += getattr(each, "commands", {}).values()
+        for option in (*each.params, each.get_help_option(typer.Context(each, help_option_names=HELP_NAMES))):
+            option.help = COMPLETION_HELP.get(option.name) or escape(option.help or "")
+            if option.param_type_name == "argument":
+                option.metavar = option.metavar or option.name.upper()
+                option.display_type_rich = _untyped
+            elif option.is_flag:
+                option.metavar = ""
+            else:
+                option.metavar = option.metavar or WORDS[option.opts[0].removeprefix("--")]
+
+
+def _untyped(ctx: object) -> None:
+    """Return no type: the help of an argument says what it is."""
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that has, for each parameter that is a dataclass, the fields of this class as options."""
+    hints = get_type_hints(command, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    parameters = []
+    for name, parameter in signature(command).parameters.items():
+        if name in groups:
+            own = get_type_hints(groups[name], include_extras=True)
+            options: list[tuple[str, Any, Any]] = [
+                (each.name, each.default, own[each.name]) for each in fields(groups[name])
+            ]
+        else:
+            options = [(name, parameter.default, hints[name])]
+        parameters += [Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=hint)
+                       for key, default, hint in options]  # fmt: skip
+
+    @wraps(command)
+    def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
+        from servobench.harness.config.registry import offering
+
+        for name, group in groups.items():
+            values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
+        with offering():  # a user's own controllers have their names for as long as the command takes
+            command(**values)
+
+    vars(call).update(
+        __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
+    )
+    return call

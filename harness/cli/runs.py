@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import completion, named, options
-from servobench.harness.cli.show import make_report
+from servobench.harness.cli import completion, options, selection
+from servobench.harness.cli.results import judge, make_report, print_faults
 from servobench.harness.cli.terminal import console, print_tables, say
-from servobench.harness.cli.verdict import judge, print_faults
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -79,8 +78,8 @@ def run(
         (task,),
         (mismatch,),
         parse_seeds(f"{seed},"),
-        named.known_robot(robot),
-        (named.one_sensing(sensing),),
+        selection.known_robot(robot),
+        (selection.one_sensing(sensing),),
     )
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
@@ -93,10 +92,10 @@ def _one_plant(plant: str | None, *, view: bool) -> str:
     from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.bench.plant import PlantEntry
 
-    (name,) = [named.default_plant()] if plant is None else choose_plants([plant])
+    (name,) = [selection.default_plant()] if plant is None else choose_plants([plant])
     if view and name != "bullet":
         raise ConfigurationError(f"--view shows the plant bullet only, got --plant {name}")
-    named.tell_unused(PlantEntry, [name])
+    selection.tell_unused(PlantEntry, [name])
     return name
 
 
@@ -110,7 +109,7 @@ def _one_controller(method: str | None, controller: str | None, estimator: str |
         raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     (name,) = choose_controllers([law if estimator is None else f"{law}+{estimator}"])
-    named.tell_unused(ControllerEntry, [name])
+    selection.tell_unused(ControllerEntry, [name])
     return name
 
 
@@ -134,13 +133,13 @@ def compare(
     from servobench.harness.config.settings import ConfigurationError
 
     batch = Batch(
-        named.split_plants(plants, robot=robot),
-        named.split_controllers(controllers, robot),
-        named.split_tasks(tasks),
-        named.split_mismatches(mismatch),
+        selection.split_plants(plants, robot=robot),
+        selection.split_controllers(controllers, robot),
+        selection.split_tasks(tasks),
+        selection.split_mismatches(mismatch),
         parse_seeds(seeds),
-        named.known_robot(robot),
-        named.split_sensings(sensing),
+        selection.known_robot(robot),
+        selection.split_sensings(sensing),
     )
     if running.resume and out is None:
         raise ConfigurationError("--resume needs --out, the folder to continue in")

@@ -41,7 +41,6 @@ ALL = "all"  # stands for every name
 RUN = "run"  # the section of settings that all runs share
 NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY"}
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
-FORMER_NAMES = {"rbfnn_mfac_plus": "map_mfac"}  # understood until 0.3.0
 
 
 Offer: TypeAlias = Own[ControllerEntry] | Own[PlantEntry]
@@ -71,7 +70,7 @@ def offer(own: Offer) -> str:
     """
     name, other = own.name, _OFFERED.get(own.name)
     taken = {RUN: "a section of settings", **dict.fromkeys(plant_names(), "a plant")}
-    taken |= dict.fromkeys([*controller_names(), *FORMER_NAMES], "a controller")
+    taken |= dict.fromkeys(controller_names(), "a controller")
     if name in taken:
         raise ConfigurationError(f"{taken[name]} called {name!r} exists already; {_rename(own)}")
     if other is not None and (other.place, other.file, other.digest) != (own.place, own.file, own.digest):
@@ -149,7 +148,7 @@ def published(entry: type[ControllerEntry | PlantEntry], name: str) -> EntryPoin
 def unused_points(entry: type[ControllerEntry | PlantEntry]) -> list[tuple[str, str]]:
     """Return the names of entry points that are not used, each with a line that says why: others have the name."""
     group, kind = (PLANT_GROUP, PLANT) if entry is PlantEntry else (CONTROLLER_GROUP, CONTROLLER)
-    own = PLANTS if entry is PlantEntry else (*CONTROLLERS, *FORMER_NAMES)
+    own = PLANTS if entry is PlantEntry else CONTROLLERS
     found = dict[tuple[str, str], str]()
     for point in entry_points(group=group):
         used = _points(group).get(point.name)
@@ -193,7 +192,6 @@ def find_controller(name: str) -> ControllerEntry:
             return mapped_controller(user_path(name.removeprefix(MAPPED)), name)
         except ValueError as error:
             raise ConfigurationError(str(error)) from error
-    name = FORMER_NAMES.get(name, name)
     law, plus, estimator = name.partition("+")
     if plus:
         try:
@@ -215,7 +213,7 @@ def is_foreign_plant(name: str, *, trusted: bool = False) -> bool:
 
 def is_foreign_controller(name: str) -> bool:
     """Return whether a controller runs code that is not of this package; pairs of its laws and estimators do not."""
-    law, plus, estimator = FORMER_NAMES.get(name, name).partition("+")
+    law, plus, estimator = name.partition("+")
     return not (law in LAWS and estimator in ESTIMATORS if plus else law in CONTROLLERS)
 
 

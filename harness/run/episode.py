@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from servobench.harness.config.engines import engine_of
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
@@ -172,6 +173,7 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
     outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
     return {
         **request.as_row(),
+        "engine": engine_of(request.plant),
         "robot": OWN_ROBOT if drawn.true is None else request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
@@ -201,6 +203,7 @@ def failed(request: RunRequest, ending: Ending) -> RunResult:
     """Return what is left of a run of which nothing is known but why it failed."""
     row = {
         **request.as_row(),
+        "engine": engine_of(request.plant),
         "status": ending.status,
         "outcome": ending.status,
         "periods": 0,

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, SupportsIndex
+from typing import Any, SupportsIndex
 
-from servobench.harness.config.engines import engine_of
-from servobench.harness.config.registry import FORMER_NAMES
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.cameras.registry import DEFAULT_SENSING, FIXED
@@ -37,11 +34,6 @@ class RunSettings:
     """share of the run after which a mismatch's `camera_move` happens"""
     full_jacobian: bool = False
     """log every entry of the estimated and the true Jacobian"""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "preview": "preview_time, in seconds (a period of 20 Hz is 0.05)",
-        "lost_after_periods": "lost_after, in seconds (a period of 20 Hz is 0.05)",
-    }
 
     @property
     def preview_rows(self) -> int:
@@ -81,12 +73,11 @@ class RunRequest:
     sensing: str = DEFAULT_SENSING  # a set-up, or the path of a file with one; with `:hand` for cameras on the hand
 
     def __post_init__(self) -> None:
-        """Read a mismatch that came as text, and a former name of a controller."""
+        """Check the names and the seed, and read a mismatch that came as text."""
         for name in NAMES:
             if not isinstance(getattr(self, name), str):
                 raise ConfigurationError(f"{name} must be a name, got {getattr(self, name)!r}")
         object.__setattr__(self, "seed", read_seed(self.seed))
-        object.__setattr__(self, "controller", FORMER_NAMES.get(self.controller, self.controller))
         given: object = self.mismatch
         if isinstance(given, str):
             object.__setattr__(self, "mismatch", read_mismatch(given))
@@ -107,7 +98,7 @@ class RunRequest:
     def as_row(self) -> dict[str, Any]:
         """Return the columns by which a run is found in the table of runs."""
         columns = {f"{name}_s" if name in TIMES else name: value for name, value in vars(self).items()}
-        return {"run_id": self.run_id, **columns, "mismatch": str(self.mismatch), "engine": engine_of(self.plant)}
+        return {"run_id": self.run_id, **columns, "mismatch": str(self.mismatch)}
 
 
 def read_mismatch(text: str) -> Mismatch:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 from annotated_types import Ge, Le
 
@@ -70,8 +70,6 @@ class SensingConfig:
                     "occlusion_windows must be pairs of a begin above 0, as the run begins with a valid feature, and a "
                     f"later end, in s; got [{begin:g}, {end:g}]"
                 )
-
-    RENAMED: ClassVar[Mapping[str, str]] = {"latency_periods": "latency, in seconds (a period of 20 Hz is 0.05)"}
 
 
 def without_disturbance(sensing: SensingConfig) -> SensingConfig:

@@ -9,10 +9,6 @@
 
 The string below a field says its meaning, unit and source; the documentation's tables of settings are made from it.
 Rules across fields stand in `__post_init__` and raise `ValueError`. Validation is by pydantic.
-
-A field that got another name or unit leaves its old name behind, so that old files are refused with the remedy:
-
-        RENAMED: ClassVar[Mapping[str, str]] = {"lag_periods": "lag, in seconds"}
 """
 
 from __future__ import annotations
@@ -118,7 +114,6 @@ def settings(kind: Class) -> Class:
 
     @wraps(construct)
     def construct_checked(self: Any, *arguments: Any, **values: Any) -> None:  # noqa: ANN401 - any field
-        _refuse_renamed(kind.__name__, kind, values)
         try:
             construct(self, **dict(zip(names, arguments, strict=False)), **values)
         except ValidationError as error:
@@ -145,7 +140,6 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
     Raises:
         ValueError: an unknown key, a value of the wrong type, or one that the dataclass refuses.
     """
-    _refuse_renamed(name, type(default), values)
     known = [item.name for item in fields(cast(Any, default))]
     changes: dict[str, Any] = {}
     for key, value in values.items():
@@ -162,14 +156,6 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
         return replace(cast(Any, default), **changes) if changes else default
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
-
-
-def _refuse_renamed(name: str, kind: type, values: Iterable[str]) -> None:
-    """Raise a `ValueError` that says the new name of the first of `values` that `kind.RENAMED` lists."""
-    renamed: Mapping[str, str] = getattr(kind, "RENAMED", {})
-    for key in values:
-        if key in renamed:
-            raise ValueError(f"{name} has no setting {key!r} any more: it is now {renamed[key]}")
 
 
 def suggest(word: str, known: Iterable[str]) -> str:

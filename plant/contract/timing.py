@@ -15,11 +15,6 @@ from typing import Final, Self
 from servobench.plant.contract.checks import check_number
 from servobench.plant.contract.sensing import SensingConfig
 
-RENAMED_DELAY: Final = {
-    "command_delay_periods": "command_delay, in seconds (a period of 20 Hz is 0.05)",
-    "latency_periods": "sensing.latency, in seconds (a period of 20 Hz is 0.05)",
-}
-"""For the settings of every plant: their earlier keys."""
 TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
 
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings
-from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 from servobench.plant.robot.sensed import SensedArm
@@ -27,8 +24,6 @@ class FmuConfig:
     """Noise, latency, frame period and lost frames."""
     isolate: bool = True
     """Carry its runs out in a process of their own, with limits; false for an FMU that you trust like servobench."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
 
 def build_fmu(

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Len
 
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, nested, settings
-from servobench.plant.contract.timing import RENAMED_DELAY
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
@@ -69,8 +67,6 @@ class RenderedConfig:
     """Draw the table and the floor; without them a frame costs a fifth."""
     view: bool = False
     """Open a window and run in real time; with PyBullet only."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = RENAMED_DELAY
 
     def boxes(self) -> tuple[Box, ...]:
         """Return the obstacles."""

@@ -24,7 +24,6 @@ from servobench.controllers.laws.pid import PidConfig
 from servobench.controllers.laws.rbfnn import RbfnnConfig
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.nmpc_calibrated import NmpcCalibratedConfig
-from servobench.plant.contract.settings import override
 
 
 def bad(config, **values):
@@ -100,20 +99,3 @@ def test_rules_across_settings_name_both():
     ):
         with pytest.raises(ValueError, match=message):
             config(**values)
-
-
-def test_a_setting_of_the_past_is_refused_with_its_new_name():
-    for config, key, now in (
-        (MfacConfig, "step_factor", "gain, in 1/s"),
-        (MfacConfig, "feedforward", "aids.feedforward"),
-        (PidConfig, "feedforward", "aids.feedforward"),
-        (KalmanConfig, "process_deviation", "walk, per root of a second"),
-        (UkfConfig, "process_deviation", "walk, per root of a second"),
-        (RlsConfig, "forgetting", "memory, in seconds"),
-        (MpcConfig, "delay_periods", "delay, in seconds"),
-    ):
-        message = f"has no setting {key!r} any more: it is now {now}"
-        with pytest.raises(ValueError, match=message):
-            config(**{key: 1.0})
-        with pytest.raises(ValueError, match=f"^a.law {message}"):
-            override("a.law", config(), {key: 1.0})

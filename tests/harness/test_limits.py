@@ -52,7 +52,7 @@ def test_only_foreign_code_has_limits_that_nobody_gave():
 
 
 def test_methods_of_this_package_are_not_foreign_and_everything_else_is():
-    own = [*METHODS, "nmpc_calibrated", "rbfnn_mfac_plus", "mfac+rls"]
+    own = [*METHODS, "nmpc_calibrated", "mfac+rls"]
     assert [name for name in own if is_foreign_controller(name)] == []
     assert is_foreign_controller("mine")
     assert is_foreign_controller("mine+rls")

@@ -258,7 +258,7 @@ def test_broken_entry_points_are_marked_and_spoil_neither_the_list_nor_all(tmp_p
         "from servobench.harness.cli.main import main\n"
         "sys.argv = ['servobench', 'controllers']\n"
         "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
-        "from servobench.harness.cli.named import split_controllers\n"
+        "from servobench.harness.cli.selection import split_controllers\n"
         "print('all:', split_controllers('all'))\n"
     )
     done = subprocess.run(

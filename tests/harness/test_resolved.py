@@ -5,9 +5,8 @@ import pickle
 import pytest
 
 from kit.plants import NEEDS_BULLET
-from servobench.controllers.methods import METHODS
-from servobench.harness.config.defaults import default_config
-from servobench.harness.config.registry import controller_names, find_controller
+from servobench.harness.config.engines import engine_of
+from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import resolve
@@ -48,26 +47,11 @@ def test_a_run_has_whole_periods():
         RunSettings(period=0.0)
 
 
-def test_the_former_name_of_a_method_is_understood():
-    assert find_controller("rbfnn_mfac_plus").name == "map_mfac"
-    run = resolve(RunRequest("kinematic", "rbfnn_mfac_plus", "circle", "none", 0), Settings())
-    assert run.controller == default_config(METHODS["map_mfac"])
-    with pytest.raises(ConfigurationError, match="unknown controller 'rbfnn_bridged'"):
-        find_controller("rbfnn_bridged")
-
-
-def test_a_setting_of_the_past_is_refused_with_its_new_name():
-    request = RunRequest("kinematic", "ukf_mfac", "circle", "none", 0)
-    for section, key, now in (("law", "step_factor", "gain"), ("estimator", "process_deviation", "walk")):
-        with pytest.raises(ConfigurationError, match=f"^ukf_mfac.{section} has no setting '{key}' any more: .*{now}"):
-            resolve(request, Settings({"ukf_mfac": {section: {key: 0.1}}}))
-
-
 @pytest.mark.parametrize(
     ("plant", "engine"),
     [("kinematic", ""), ("there_is_none", ""), pytest.param("bullet", "PyBullet ", marks=NEEDS_BULLET)],
 )
 def test_a_row_names_the_engine_that_renders_its_plant(plant, engine):
-    told = RunRequest(plant, "constant", "exp1", "none", 0).as_row()["engine"]
+    told = engine_of(plant)
     assert told.startswith(engine)
     assert bool(told) == bool(engine)

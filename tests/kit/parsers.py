@@ -28,8 +28,8 @@ from servobench.fmus.information import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.compare import parse_seeds, refuse_tuning_seeds
 from servobench.harness.batch.sweep import parse_variation
-from servobench.harness.cli.named import split_controllers, split_plants, split_tasks
-from servobench.harness.cli.sweep import _numbers, _times
+from servobench.harness.cli.selection import split_controllers, split_plants, split_tasks
+from servobench.harness.cli.studies import _numbers, _times
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, read_settings
 from servobench.harness.run.references import read_waypoints

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import pytest
 
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.contract.settings import Count, Number, Periods, Positive, Share, nested, override, settings
+from servobench.plant.contract.settings import Count, Number, Periods, Positive, Share, nested, settings
 from servobench.plant.kinematic import KinematicConfig
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
@@ -62,25 +61,6 @@ class Outer:
 def test_a_bad_value_is_refused_in_one_line(values, message):
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         Inner(**values)
-
-
-@settings
-class Renamed:
-    RENAMED: ClassVar[Mapping[str, str]] = {"lag_periods": "lag, in seconds"}
-
-    lag: Positive = 0.05
-    inner: Inner = nested(Inner)
-
-
-def test_the_old_name_of_a_setting_is_refused_with_the_new_one():
-    message = "has no setting 'lag_periods' any more: it is now lag, in seconds"
-    with pytest.raises(ValueError, match=f"^Renamed {message}$"):
-        Renamed(lag_periods=3)
-    with pytest.raises(ValueError, match=f"^kinematic {message}$"):
-        override("kinematic", Renamed(), {"lag_periods": 3})
-    assert override("kinematic", Renamed(), {"lag": 1, "inner": {"gain": 2}}) == Renamed(1.0, Inner(2.0))
-    with pytest.raises(ValueError, match="has no setting 'RENAMED'"):
-        override("kinematic", Renamed(), {"RENAMED": {}})
 
 
 def test_settings_are_values():

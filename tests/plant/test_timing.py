@@ -171,16 +171,3 @@ def test_a_bench_refuses_a_world_that_is_too_coarse():
     world = KinematicWorld(KinematicConfig(), setup(period=0.05))
     with pytest.raises(ValueError, match=r"latency must be a multiple of the world's period of 0\.05 s, got 0\.02 s"):
         Bench(world, 0.05, SensingConfig(latency=0.02))
-
-
-@pytest.mark.parametrize("name", ["kinematic", "fmu", "bullet", "mujoco"])
-def test_earlier_keys_are_refused_with_the_new_ones(name):
-    kind = find_plant(name).config
-    with pytest.raises(ValueError, match="no setting 'command_delay_periods' any more: it is now command_delay, in s"):
-        kind(command_delay_periods=1)
-    with pytest.raises(
-        ValueError, match=r"no setting 'latency_periods' any more: it is now sensing\.latency, in seconds"
-    ):
-        kind(latency_periods=1)
-    with pytest.raises(ValueError, match="no setting 'latency_periods' any more: it is now latency, in seconds"):
-        SensingConfig(latency_periods=1)

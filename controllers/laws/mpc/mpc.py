@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import ClassVar, Final, Literal, final
+from typing import Final, Literal, final
 
 import numpy as np
 
@@ -37,13 +36,6 @@ _MIN_MULTIPLIER: Final = 1e-10  # [m²/rad] a limit with a larger multiplier cou
 @settings
 class MpcConfig:
     """Settings of the predictive law; "tuned" = on UR5s with ±15° camera, ±5 % links and 3 periods of delay."""
-
-    RENAMED: ClassVar[Mapping[str, str]] = {
-        "horizon": "horizon_time, in seconds",
-        "alpha": "forgetting, −log(alpha) per second",
-        "rho": "decay, per second",
-        "delay_periods": "delay, in seconds",
-    }
 
     horizon_time: Positive = 0.5
     """[s] how far the prediction reaches; tuned."""

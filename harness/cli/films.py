@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servobench.harness.cli import completion
-from servobench.harness.cli.named import split_names
+from servobench.harness.cli.selection import split_names
 from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
 
 if TYPE_CHECKING:

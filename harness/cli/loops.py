@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import named, options
+from servobench.harness.cli import options, selection
 from servobench.harness.cli.terminal import console, print_tables
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def analyse(
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.contract.faults import RunFault
 
-    source, arm = _source(jacobian), named.known_robot(robot)
+    source, arm = _source(jacobian), selection.known_robot(robot)
     runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
     loops: list[LoopAnalysis] = []
     for run in runs:
@@ -102,7 +102,7 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, sett
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import check_settings, resolve
 
-    names = named.split_controllers(",".join(controllers), robot)
+    names = selection.split_controllers(",".join(controllers), robot)
     check_settings(settings, [PLANT, TASK, *names])
     drawn = read_mismatch(mismatch)
     return [resolve(RunRequest(PLANT, name, TASK, drawn, seed, robot=robot), settings) for name in names]

@@ -1,0 +1,149 @@
+"""The commands on results folders, `statistics | report | export | verify`, and the verdict on failed runs."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from servobench.harness.cli.options import FAILED
+from servobench.harness.cli.terminal import console, print_json, print_markdown, print_tables, say
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
+MAX_FAULTS: Final = 10  # runs that failed, each on a line of its own
+
+
+def statistics(
+    folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
+    metric: Annotated[
+        str | None,
+        typer.Option(
+            help="Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error."
+        ),
+    ] = None,
+    never: Annotated[
+        float | None,
+        typer.Option(help="Value for a run that has none, such as one that never settled; default: twice the largest."),
+    ] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
+) -> None:
+    """Judge the controllers of a folder, with 95 % intervals.
+
+    Rates, medians, tails, failures and paired differences.
+    """
+    from servobench.harness.analysis.cells import as_plain
+    from servobench.harness.analysis.tables import statistics_rows, statistics_tables
+    from servobench.harness.batch import results
+    from servobench.harness.config.settings import ConfigurationError
+
+    if markdown and as_json:
+        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
+    runs = results.load_runs(folder)
+    if as_json:
+        print_json(
+            [
+                {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
+                for place, controllers, pairs in statistics_rows(runs, metric, never)
+            ]
+        )
+        return
+    tables = statistics_tables(runs, metric, never)
+    print_markdown(tables) if markdown else print_tables(tables)
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The page; default: report.html in the folder.")
+    ] = None,
+) -> None:
+    """Write one page about a results folder.
+
+    With figures, sortable tables and paths to turn; it needs no network.
+    """
+    make_report(folder, out)
+
+
+def make_report(folder: Path, out: Path | None = None) -> None:
+    """Write the report and print its path and, if it took long, the time."""
+    from servobench.harness.pictures.report import write_report
+
+    began = time.monotonic()
+    with console.status("making the report"):
+        path = write_report(folder, out)
+    seconds = time.monotonic() - began
+    took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
+    console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})", soft_wrap=True, markup=False)
+
+
+def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
+    """Check that a results folder holds what was written.
+
+    Names each file that is damaged, and what to type. The exit code is 1 if there is one.
+    """
+    from servobench.harness.batch.integrity import examine
+    from servobench.harness.batch.lock import current_holder
+
+    holder = current_holder(folder)
+    if holder is not None:
+        say(f"{folder} is being written by {holder}")
+    found = examine(folder)
+    for finding in found.findings:
+        line = f"{folder / finding.name} {finding.what}: {finding.remedy}"
+        say(line)
+    if found.runs < found.wanted:
+        wanting = f"{found.runs} of {found.wanted} runs are there: --resume carries out the others"
+        say(wanting)
+    if found.findings:
+        sys.exit(FAILED)
+    console.print(f"{found.files} files are what was written, {found.runs} runs", markup=False, highlight=False)
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
+    out: Annotated[Path, typer.Option(help="New folder for the files.")],
+    format_: Annotated[
+        str, typer.Option("--format", help="csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
+    ] = "csv",
+) -> None:
+    """Write the steps of runs for other tools, a file a run."""
+    from servobench.harness.analysis.exports import export_folder
+
+    files = export_folder(folder, out, format_)
+    console.print(f"{len(files)} files in {out}", markup=False, highlight=False)
+
+
+def print_faults(runs: pd.DataFrame) -> None:
+    """Print why runs failed, a line each; of many the first ones."""
+    from servobench.harness.run.ending import COMPLETED
+
+    for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
+        line = f"{row['run_id']}: {row['status']}: {row['reason']}"
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def judge(folder: Path, *, strict: bool) -> None:
+    """Say how many runs of a finished batch failed and where their traces are; end with exit code 1 if that counts.
+
+    Args:
+        folder: its results.
+        strict: whether a run that failed makes the command fail.
+    """
+    from servobench.harness.batch import results
+    from servobench.harness.run.ending import COMPLETED
+
+    statuses = [table["status"] for table in results.iterate_runs(folder, ("status",))]
+    count, failed = sum(map(len, statuses)), sum(int((status != COMPLETED).sum()) for status in statuses)
+    if not failed:
+        return
+    line = f"{failed} of {count} run{'s' if count > 1 else ''} failed; why, with traces: {folder / results.FAILURES}"
+    console.print(line, soft_wrap=True, markup=False, highlight=False)
+    if strict:
+        sys.exit(FAILED)
