@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kit.folder_readers import HOLDER, LEDGER
+from night.folder_readers import HOLDER, LEDGER
 from night.fuzzing import Broken, check, inputs
 from night.parsers import PARSERS, Parser
 from servobench.harness.config.settings import ConfigurationError

@@ -164,15 +164,3 @@ def test_a_study_that_is_killed_while_it_writes_goes_on_without_waiting(tmp_path
         assert len(ledger) == 1
         ledger.add({"gain": 1.5}, [2.0])
         assert path.read_bytes() == whole + line
-
-
-def test_tuning_that_is_killed_goes_on_at_once(tmp_path):
-    arguments = ("tune", "--controllers", "constant", "--robots", "2", "--studies", "1", "--search", "0",
-                 "--workers", "1", "--trials", "3", "--out", str(tmp_path / "out"))  # fmt: skip
-    process, ledger = start(*arguments), tmp_path / "out" / "constant.jsonl"
-    wait_for(lambda: ledger.exists() and ledger.read_text().count('"costs"') >= 1)
-    os.killpg(process.pid, signal.SIGKILL)
-    finish(process)
-    code, output = finish(start(*arguments))
-    assert code == 0, output
-    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".jsonl", ".jsonl", ".toml"]
