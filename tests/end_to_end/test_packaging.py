@@ -32,7 +32,7 @@ def wheel_names(files):
 
 def test_the_wheel_holds_one_package_with_its_types(wheel_names):
     assert {name.split("/")[0].split("-")[0] for name in wheel_names} == {"servobench"}
-    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/signals.py"} <= wheel_names
+    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/contract/signals.py"} <= wheel_names
     assert {name.split("/")[1] for name in wheel_names if name.startswith("servobench/") and name.count("/") > 1} == {
         *FOLDERS
     }
