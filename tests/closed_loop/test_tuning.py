@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,14 +147,6 @@ def test_every_run_has_a_robot_of_its_own_and_every_condition_plain_and_turned_c
     assert twice[0].seed == twice[14].seed
 
 
-def test_conditions_cover_latencies_up_to_150_ms_noise_and_curves_and_moves_weigh_like_curves():
-    assert {condition.latency for condition in CONDITIONS if condition.task == MOVE} == {0.0, 0.05, 0.1, 0.15}
-    assert {condition.noise_factor for condition in CONDITIONS} == {1.0, 4.0}
-    assert {condition.task for condition in CONDITIONS} == {MOVE, "circle", "lemniscate"}
-    weights = [sum(each.weight for each in CONDITIONS if (each.task == MOVE) == moves) for moves in (True, False)]
-    assert weights == pytest.approx([0.5 * len(CONDITIONS)] * 2)
-
-
 def test_on_one_circle_commands_take_effect_at_once_and_on_the_others_with_the_delay_of_the_plant():
     entry = find_tunable("constant")
     circles = [run for run in SMALL.runs() if run.task == "circle"]
@@ -202,15 +193,6 @@ def test_a_better_tuned_controller_has_the_better_score():
     for trial, run, cost in evaluate(trials, runs, Workers()):
         costs[trial, run] = cost
     assert (costs[0] < 0.5 * costs[1]).all()
-
-
-def test_the_delay_of_the_set_reaches_the_plant():
-    entry = find_tunable("calibrated")
-    without = {"law": {"proportional_gain": 6.0}, "aids": {"delay": "ignored", "response": "ignored"}}
-    trial = Trial("calibrated", apply_settings(entry, without))
-    prompt, late = SMALL.runs()[0], replace(SMALL.runs()[0], latency=SMALL.runs()[2].latency)
-    costs = {run: cost for _, run, cost in evaluate([trial], [prompt, late], Workers())}
-    assert costs[0] < costs[1]
 
 
 def checked_score(tuned, settings):

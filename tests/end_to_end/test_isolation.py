@@ -13,8 +13,8 @@ import pandas as pd
 import psutil
 import pytest
 
-from kit import hostile_controllers
 from kit.command import finish, judged, part_count, servobench, start, wait_for
+from night import hostile_controllers
 from servobench.harness.batch import results
 
 HOSTILE = Path(hostile_controllers.__file__)

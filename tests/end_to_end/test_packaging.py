@@ -18,24 +18,21 @@ FOLDERS = ("plant", "controllers", "fmus", "harness")
 CODE = (".py", ".toml", ".c", ".h", ".j2", ".urdf", ".yaml")
 
 
-def build(source: Path, target: str, folder: Path) -> Path:
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)],
-        cwd=source, check=True, capture_output=True,
-    )  # fmt: skip
-    (made,) = [path for path in folder.iterdir() if path.is_file()]
-    return made
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Wheel and source distribution."""
+    return release.build(tmp_path_factory.mktemp("dist"))
 
 
 @pytest.fixture(scope="module")
-def wheel_names(tmp_path_factory):
-    with zipfile.ZipFile(build(ROOT, "wheel", tmp_path_factory.mktemp("wheel"))) as wheel:
+def wheel_names(files):
+    with zipfile.ZipFile(files[0]) as wheel:
         return set(wheel.namelist())
 
 
 def test_the_wheel_holds_one_package_with_its_types(wheel_names):
     assert {name.split("/")[0].split("-")[0] for name in wheel_names} == {"servobench"}
-    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/signals.py"} <= wheel_names
+    assert {"servobench/py.typed", "servobench/__main__.py", "servobench/plant/contract/signals.py"} <= wheel_names
     assert {name.split("/")[1] for name in wheel_names if name.startswith("servobench/") and name.count("/") > 1} == {
         *FOLDERS
     }
@@ -52,17 +49,14 @@ def test_the_wheel_holds_every_file_that_the_package_reads(wheel_names):
     assert "servobench/harness/notebooks/analysis.ipynb" in wheel_names
 
 
-def test_the_source_distribution_makes_the_same_wheel(wheel_names, tmp_path):
-    with tarfile.open(build(ROOT, "sdist", tmp_path / "sdist")) as archive:
+def test_the_source_distribution_makes_the_same_wheel(files, wheel_names, tmp_path):
+    with tarfile.open(files[1]) as archive:
         archive.extractall(tmp_path / "source", filter="data")
     (source,) = (tmp_path / "source").iterdir()
-    with zipfile.ZipFile(build(source, "wheel", tmp_path / "again")) as wheel:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         assert set(wheel.namelist()) == wheel_names
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    return release.build(tmp_path_factory.mktemp("dist"))
 
 
 def test_the_files_of_a_release_have_no_faults(files):
