@@ -7,18 +7,23 @@ A generated part of a page is everything between two comments, of which the firs
     <!-- settings: controllers/laws/mfac.py:MfacConfig -->
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
+    <!-- stored: dynamics -->
     <!-- studies: docs/page_studies -->
     <!-- methods: table -->
     <!-- methods: presets -->
     <!-- end -->
 
 The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
-A measured table is that of docs/tables, which `make results` writes; until it is there the part stays as it is.
+A section of settings that has a table of its own on some page is printed there only: other tables list the defaults
+in which they differ. A measured table is one of docs/tables, which `make results` writes; until it exists the part
+stays as it is. `stored` links to a measured table instead of printing it.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib
+import operator
 import os
 import re
 import sys
@@ -29,11 +34,13 @@ import methods_table
 import stored_tables
 from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
-from servobench.harness.config.describe import describe_settings, toml
+from servobench.harness.config.description import describe_settings, toml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
-PART = re.compile(r"(<!-- (settings|variables|table|studies|methods): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+PART = re.compile(
+    r"(<!-- (settings|variables|table|stored|studies|methods): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL
+)
 
 
 def main() -> None:
@@ -50,6 +57,7 @@ def renewed(page: Path) -> str:
         "studies": lambda _: studies_table(),
         "methods": lambda part: named_methods(part[3]),
         "table": lambda part: measured_table(part[3], page.parent) or part[4].strip("\n"),
+        "stored": lambda part: stored_table(part[3], page.parent) or part[4].strip("\n"),
     }
     text = page.read_text(encoding="utf-8")
     return PART.sub(lambda part: f"{part[1]}\n{make[part[2]](part)}\n\n{part[5]}", text)
@@ -79,11 +87,22 @@ def measured_table(name: str, folder: Path) -> str:
     path = stored_tables.FOLDER / f"{name}.csv"
     if not path.exists():
         return ""
-    stamp, rows = stored_tables.read(path)
-    place = Path(os.path.relpath(path, folder)).as_posix()
-    made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
+    rows = stored_tables.read(path).table
     cells = [tuple(row) for row in rows.itertuples(index=False)]
-    return f"{table(tuple(rows.columns), cells)}\n\n`make results ONLY={stamp['study']}`: {made}; [commands]({place})"
+    return f"{table(tuple(rows.columns), cells)}\n\n{origin(path, folder)}"
+
+
+def stored_table(name: str, folder: Path) -> str:
+    """Return a line that links to a table of docs/tables; nothing before its study was carried out."""
+    path = stored_tables.FOLDER / f"{name}.csv"
+    return f"All {len(stored_tables.read(path).table)} rows: {origin(path, folder)}" if path.exists() else ""
+
+
+def origin(path: Path, folder: Path) -> str:
+    """Return how a stored table was made, with a link to it from a page in `folder`."""
+    stamp = stored_tables.read(path).stamp
+    made = f"commit {stamp['commit'][:12]}, {stamp['date']}, version {stamp['version']}"
+    return f"`make results ONLY={stamp['study']}`: {made}; [commands]({Path(os.path.relpath(path, folder)).as_posix()})"
 
 
 def find(place: str) -> Any:  # noqa: ANN401 - whatever has this name
@@ -99,11 +118,30 @@ def settings_table(kind: type[Any]) -> str:
         ValueError: a field has no string below it.
     """
     rows = []
-    for each in describe_settings(kind()):
+    default = kind()
+    for each in describe_settings(default):
+        section = described_elsewhere(default, each.key)
+        if section and each.value == operator.attrgetter(each.key.removeprefix(f"{section}."))(
+            type(getattr(default, section))()
+        ):
+            continue
         if not each.meaning:
             raise ValueError(f"{kind.__name__}.{each.key} has no string below it that says its meaning")
         rows.append((f"`{each.key}`", toml(each.value), each.unit, each.allowed, each.meaning))
     return table(("setting", "default", "unit", "allowed", "meaning"), rows)
+
+
+def described_elsewhere(config: Any, key: str) -> str:  # noqa: ANN401 - any settings
+    """Return the section of a dotted key if its class has a table of its own on a page, else an empty string."""
+    section, dot, _ = key.partition(".")
+    return section if dot and type(getattr(config, section)) in classes_with_tables() else ""
+
+
+@functools.cache
+def classes_with_tables() -> frozenset[type[Any]]:
+    """Return the classes of settings that have a table on some page."""
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    return frozenset(find(place) for _, kind, place, *_ in PART.findall(text) if kind == "settings")
 
 
 def variables_table() -> str:

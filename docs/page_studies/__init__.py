@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from page_studies.aids import AIDS
-from page_studies.audit import AUDIT
 from page_studies.claims import CLAIMS
 from page_studies.engines import CLAIMS_ENGINES, MAP_ENGINES
 from page_studies.eyes import EYES
@@ -18,7 +17,7 @@ from page_studies.worlds import LEARNING, MAP, PAIRS_STUDY, WORLDS
 STUDIES = {
     study.name: study
     for study in (
-        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, AUDIT, CLAIMS, CLAIMS_ENGINES, RATES_STUDY, LONG, ENDS,
+        HELD_OUT, RENDERED_STUDY, TUNING_STUDIES, AIDS, CLAIMS, CLAIMS_ENGINES, RATES_STUDY, LONG, ENDS,
         DYNAMICS, WORLDS, LEARNING, PAIRS_STUDY, EYES, MAP, MAP_ENGINES, README, FAILURES, PERFORMANCE, *NOISE_STUDIES,
     )
 }  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from servobench.harness.batch import results
-from servobench.harness.config.extras import check_installed
+from servobench.harness.config.installation import check_installed
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.files import reason
 

@@ -17,7 +17,6 @@ from servobench.harness.batch.guard import LOST, End, Task, Tell
 from servobench.harness.batch.pool import Guarded
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.check.report import Finding
-from servobench.harness.config.own import PLACE, folder_of_module
 from servobench.harness.config.registry import (
     MAPPED,
     choose_controller,
@@ -27,7 +26,7 @@ from servobench.harness.config.registry import (
     published,
 )
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.config.source import PACKAGES, is_below, place_in_trace
+from servobench.harness.config.source import PACKAGES, PLACE, folder_of_module, is_below, place_in_trace
 from servobench.harness.run.ending import TIMED_OUT, Ending
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.files import user_path

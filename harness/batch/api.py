@@ -20,8 +20,7 @@ from servobench.harness.batch.campaign import Campaign, Execution, carry_out, co
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.workers import Bounds
-from servobench.harness.config.entries import CONTROLLER, PLANT
-from servobench.harness.config.own import own_object
+from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
 from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings

@@ -12,12 +12,11 @@ from typing import Any
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch.named_files import named_files
 from servobench.harness.batch.survey import Survey
-from servobench.harness.config.own import digest_of_module
+from servobench.harness.config.installation import git_commit, installed_version
 from servobench.harness.config.registry import Offer, find_plant, published
-from servobench.harness.config.robots import find_robot
-from servobench.harness.config.sensing import find_sensing
+from servobench.harness.config.robots import find_robot, find_sensing
 from servobench.harness.config.settings import flatten
-from servobench.harness.config.version import git_commit, installed_version
+from servobench.harness.config.source import digest_of_module
 from servobench.plant.bench.plant import PlantEntry
 
 PACKAGES = (

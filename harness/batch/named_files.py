@@ -8,10 +8,9 @@ from typing import Any, Final
 
 from servobench.harness.batch.checksums import digest
 from servobench.harness.batch.survey import Survey
-from servobench.harness.config.neighbours import neighbours
-from servobench.harness.config.own import PLACE
 from servobench.harness.config.registry import MAPPED, Offer
-from servobench.harness.config.sensing import sensing_file, sensing_place
+from servobench.harness.config.robots import sensing_file, sensing_place
+from servobench.harness.config.source import PLACE, neighbours
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.robot.mismatch import Mismatch
 

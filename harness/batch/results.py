@@ -203,7 +203,7 @@ def load_runs(folder: Path) -> pd.DataFrame:
 
     Raises:
         ConfigurationError: not a results folder, one of another schema, a file of it is not what was written, or the
-            table lacks a column that says which run a row is.
+            table lacks a column that says which run a row is, or a run's identifier is unfit for the name of a file.
     """
     check_folder(folder)
     names = _intact(folder, RUNS)
@@ -211,6 +211,21 @@ def load_runs(folder: Path) -> pd.DataFrame:
     refuse_lacking(folder / names[0], "runs", runs.columns)
     refuse_nameless(folder / names[0], runs)
     return runs
+
+
+def describe_missing(folder: Path) -> str:
+    """Return a line for the user that a batch is unfinished; an empty text if it is finished.
+
+    Raises:
+        ConfigurationError: as for `load_runs`.
+    """
+    count = sum(parquet.row_count(folder, name) for name in _intact(folder, RUNS))
+    return missing_line(count, read_manifest(folder).get("run_count", 0))
+
+
+def missing_line(count: int, wanted: int) -> str:
+    """Return a line for the user that only `count` of the `wanted` runs are finished; an empty text if all are."""
+    return f"{count} of {wanted} runs are there: --resume carries out the others" if count < wanted else ""
 
 
 def iterate_runs(folder: Path, columns: Sequence[str]) -> Iterator[pd.DataFrame]:

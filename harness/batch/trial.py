@@ -21,7 +21,6 @@ from servobench.harness.batch.apart import explain
 from servobench.harness.batch.guard import Task, Tell
 from servobench.harness.batch.pool import Answer, Pool
 from servobench.harness.batch.workers import Bounds
-from servobench.harness.config.own import folder_of_module
 from servobench.harness.config.registry import (
     controller_names,
     find_controller,
@@ -31,7 +30,7 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.config.source import is_below
+from servobench.harness.config.source import folder_of_module, is_below
 from servobench.harness.run.ending import Ending
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch

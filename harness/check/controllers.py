@@ -14,10 +14,9 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.check.drive import Conditions, Driver, at, attributes, differing, watching_draws
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
 from servobench.harness.check.rig import PERIOD, Rig
-from servobench.harness.config.builds import Build, folder_of
+from servobench.harness.config.adapters import Build, folder_of
 from servobench.harness.config.defaults import default_config
-from servobench.harness.config.entries import CONTROLLER
-from servobench.harness.config.own import own_object
+from servobench.harness.config.entries import CONTROLLER, own_object
 from servobench.harness.config.registry import choose_controller, find_controller, offer, offering
 from servobench.harness.config.settings import ConfigurationError
 

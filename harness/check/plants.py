@@ -9,9 +9,8 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
-from servobench.harness.config.builds import Build, folder_of
-from servobench.harness.config.entries import PLANT
-from servobench.harness.config.own import own_object
+from servobench.harness.config.adapters import Build, folder_of
+from servobench.harness.config.entries import PLANT, own_object
 from servobench.harness.config.registry import choose_plant, find_plant, offering
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup
 from servobench.plant.bench.world import World

@@ -72,7 +72,7 @@ def tasks(incomplete: str) -> list[str]:
 
 def sensings(incomplete: str) -> list[str]:
     """Return the sensing set-ups whose names begin so."""
-    from servobench.harness.config.sensing import sensing_names
+    from servobench.harness.config.robots import sensing_names
 
     return _matching(incomplete, sensing_names())
 

@@ -58,7 +58,7 @@ class NewRun:
 
     def asked(self) -> dict[str, Any]:
         """Return what the run is of, with defaults for what was not given."""
-        from servobench.harness.config.engines import rendered_plant
+        from servobench.harness.config.registry import rendered_plant
 
         named = {name: getattr(self, name) for name in ("plant", *RECORDED)}
         chosen = {name: value for name, value in named.items() if value is not None}
@@ -85,7 +85,7 @@ def record(
     They show the rendered arm, its camera's view and the error. Without a folder a new run is carried out.
     """
     from servobench.harness.cli.progress import telling
-    from servobench.harness.config.engines import engine_of, rendered_plant
+    from servobench.harness.config.registry import engine_of, rendered_plant
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
 
@@ -129,7 +129,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
     from servobench.harness.batch.logged import find_run
-    from servobench.harness.config.engines import rendered_plant
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.pictures.replay import logged_run
 
     row = find_run(folder, run_id)
@@ -140,7 +140,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
     from servobench.harness.batch.apart import choose_controllers, choose_plants
-    from servobench.harness.config.engines import rendered_plant
+    from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import flatten, read_settings
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment

@@ -108,8 +108,7 @@ def ssp(
 
 def _arm(fmi: int, robot: str, sensing: str, mismatch: str, seed: int) -> Product:
     from servobench.fmus.export import ExportOptions, default_actuation, product
-    from servobench.harness.config.robots import find_robot
-    from servobench.harness.config.sensing import find_sensing
+    from servobench.harness.config.robots import find_robot, find_sensing
     from servobench.plant.contract.seeds import named_seed
     from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 

@@ -102,9 +102,9 @@ def init(
 
     Each has its value, and as a comment its meaning, unit, range and default. No file is overwritten.
     """
+    from servobench.harness.config.description import configuration_file
     from servobench.harness.config.registry import find_controller, find_plant
     from servobench.harness.config.settings import ConfigurationError, Settings
-    from servobench.harness.config.template import configuration_file
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import known_sections, resolve_sections
     from servobench.harness.run.tasks import find_task
@@ -176,7 +176,7 @@ def _show_settings(section: str, config: object, *, as_json: bool) -> None:
     from rich.padding import Padding
     from rich.text import Text
 
-    from servobench.harness.config.describe import describe_settings, plain, toml
+    from servobench.harness.config.description import describe_settings, plain, toml
 
     found = list(describe_settings(config))
     if as_json:

@@ -51,7 +51,7 @@ app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
 
 
 def _print_version(wanted: bool) -> None:
-    from servobench.harness.config.version import version_line
+    from servobench.harness.config.installation import version_line
 
     if wanted:
         typer.echo(version_line())
@@ -144,7 +144,7 @@ def _line_of_system(error: OSError) -> str | None:
 
 def _line_for_user(error: ValueError | ImportError) -> str | None:
     """Return what a bad input or a missing extra is told with; None for a defect."""
-    from servobench.harness.config.extras import missing_extra
+    from servobench.harness.config.installation import missing_extra
     from servobench.harness.config.settings import ConfigurationError
 
     if isinstance(error, ImportError):

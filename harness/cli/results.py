@@ -46,7 +46,9 @@ def statistics(
     if markdown and as_json:
         raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
     runs = results.load_runs(folder)
+    missing = results.describe_missing(folder)
     if as_json:
+        sys.stderr.write(f"{missing}\n" * bool(missing))
         print_json(
             [
                 {"place": place, "controllers": as_plain(controllers), "pairs": as_plain(pairs)}
@@ -54,6 +56,8 @@ def statistics(
             ]
         )
         return
+    if missing:
+        say(missing)
     tables = statistics_tables(runs, metric, never)
     print_markdown(tables) if markdown else print_tables(tables)
 
@@ -73,8 +77,11 @@ def report(
 
 def make_report(folder: Path, out: Path | None = None) -> None:
     """Write the report and print its path and, if it took long, the time."""
+    from servobench.harness.batch import results
     from servobench.harness.pictures.report import write_report
 
+    if missing := results.describe_missing(folder):
+        say(missing)
     began = time.monotonic()
     with console.status("making the report"):
         path = write_report(folder, out)
@@ -90,6 +97,7 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     """
     from servobench.harness.batch.integrity import examine
     from servobench.harness.batch.lock import current_holder
+    from servobench.harness.batch.results import missing_line
 
     holder = current_holder(folder)
     if holder is not None:
@@ -98,9 +106,8 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
     for finding in found.findings:
         line = f"{folder / finding.name} {finding.what}: {finding.remedy}"
         say(line)
-    if found.runs < found.wanted:
-        wanting = f"{found.runs} of {found.wanted} runs are there: --resume carries out the others"
-        say(wanting)
+    if line := missing_line(found.runs, found.wanted):
+        say(line)
     if found.findings:
         sys.exit(FAILED)
     console.print(f"{found.files} files are what was written, {found.runs} runs", markup=False, highlight=False)
@@ -115,7 +122,10 @@ def export(
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
     from servobench.harness.analysis.exports import export_folder
+    from servobench.harness.batch import results
 
+    if missing := results.describe_missing(folder):
+        say(missing)
     files = export_folder(folder, out, format_)
     console.print(f"{len(files)} files in {out}", markup=False, highlight=False)
 

@@ -224,7 +224,7 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
     """Print the tables of a folder whose runs are finished, and draw its figures and its report."""
     from servobench.harness.analysis.summary import summary_legend, summary_tables
     from servobench.harness.batch import results
-    from servobench.harness.config.extras import missing_extra
+    from servobench.harness.config.installation import missing_extra
     from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.pictures.draw import draw_figures
     from servobench.plant.contract.files import point_latest

@@ -62,7 +62,7 @@ def split_mismatches(text: str) -> tuple[str, ...]:
 
 def one_sensing(word: str) -> str:
     """Return the sensing set-up that a user named; it is looked up, so that a mistyped one is refused at once."""
-    from servobench.harness.config.sensing import find_sensing
+    from servobench.harness.config.robots import find_sensing
 
     find_sensing(word)
     return word
@@ -70,7 +70,7 @@ def one_sensing(word: str) -> str:
 
 def split_sensings(text: str) -> tuple[str, ...]:
     """Return the sensing set-ups that a user named; each is looked up, so that a mistyped one is refused at once."""
-    from servobench.harness.config.sensing import find_sensing, sensing_names
+    from servobench.harness.config.robots import find_sensing, sensing_names
 
     return split_names("sensing", text, sensing_names(), find_sensing)
 
@@ -78,7 +78,7 @@ def split_sensings(text: str) -> tuple[str, ...]:
 def default_plant() -> str:
     """Return the plant of a run for which none is named; a line says if it is not the first choice, and why."""
     from servobench.harness.cli.terminal import say
-    from servobench.harness.config.engines import default_plant
+    from servobench.harness.config.registry import default_plant
 
     name, why = default_plant()
     if why:

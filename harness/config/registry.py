@@ -1,4 +1,4 @@
-"""Plants, controllers and tasks by name: those of this package and those that other distributions publish.
+"""Plants and controllers by name: those of this package and those that other distributions publish.
 
 A third party publishes a `PlantEntry`, a `ControllerEntry`, or a subclass of `Plant`, `World` or `Controller` under the
 entry-point group `servobench.plants` or `servobench.controllers`; a name of this package cannot be taken over. Those
@@ -12,18 +12,29 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose, suggest_pair
 from servobench.controllers.parts import ESTIMATORS, LAWS
-from servobench.harness.config.entries import CONTROLLER, PLANT, Entry, Kind, make_entry
-from servobench.harness.config.extras import check_installed
-from servobench.harness.config.own import Own, describe_import, is_place, read_own
+from servobench.harness.config.entries import (
+    CONTROLLER,
+    PLANT,
+    Entry,
+    Kind,
+    Own,
+    make_entry,
+    read_own,
+)
+from servobench.harness.config.installation import check_installed, has_no_wheel
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import describe_import, is_place
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.settings import suggest
+
+if TYPE_CHECKING:
+    from servobench.plant.rendered.engine import OpenScene
 
 PLANT_GROUP = "servobench.plants"
 CONTROLLER_GROUP = "servobench.controllers"
@@ -285,3 +296,55 @@ def _load(group: str, kind: str, name: str) -> object:
     except (Exception, SystemExit) as error:
         why = describe_import(error, point.module)
         raise ConfigurationError(f"{kind} {name!r} ({point.value}) cannot be loaded: {why}") from error
+
+
+def engine_of(name: str) -> str:
+    """Return which engine computes or renders a plant, in a line; empty where there is none, or no such plant here."""
+    try:
+        return _told(find_plant(name))
+    except (ConfigurationError, ImportError):
+        return ""
+
+
+@cache
+def _told(entry: PlantEntry) -> str:
+    return entry.engine() if entry.engine is not None else ""
+
+
+def default_plant() -> tuple[str, str]:
+    """Return the plant of a run for which none is named, and why it is not a first choice; empty if it is.
+
+    Where PyBullet has no wheel, `mujoco` is as good a choice as `bullet`, and the one to install.
+    """
+    missing = {}
+    for name in RENDERED:
+        try:
+            installed_plant(name)
+        except ConfigurationError as error:
+            missing[name] = str(error)
+        else:
+            return name, "" if has_no_wheel() else missing.get(RENDERED[0], "")
+    return UNRENDERED, missing[RENDERED[has_no_wheel()]]
+
+
+def scene_of(plant: str) -> OpenScene:
+    """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
+    if plant == "mujoco":
+        from servobench.plant.rendered.mujoco.scene import MujocoScene  # noqa: PLC0415
+
+        return MujocoScene
+    from servobench.plant.rendered.bullet.scene import BulletScene  # noqa: PLC0415
+
+    return BulletScene
+
+
+def rendered_plant(named: str | None = None) -> str:
+    """Return the plant whose engine shows runs of the plant `named`: itself if it renders, or else one that is there.
+
+    Raises:
+        ConfigurationError: the engine is missing, or all of them are; the message says what to install.
+    """
+    name, why = (named, "") if named is not None and named in RENDERED else default_plant()
+    if name == UNRENDERED:
+        raise ConfigurationError(why)
+    return installed_plant(name).name

@@ -1,10 +1,15 @@
-"""Robots by the word or file that a user gives."""
+"""Robots and sensing set-ups by the words that users give: names of this package, or files of the user."""
 
 from __future__ import annotations
 
+import re
+from functools import lru_cache
 from typing import Final
 
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import PLACE, SourceFile
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
 from servobench.plant.robot import catalogue
 from servobench.plant.robot.robot import Robot
 
@@ -27,3 +32,60 @@ def find_robot(name: str) -> Robot:
         return catalogue.find_robot(name)
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
+
+
+def sensing_names() -> list[str]:
+    """Return the words of all sensing set-ups of this package, each with fixed cameras and with cameras on the hand."""
+    return [str(Sensing(eye, mount)) for eye in EYES.values() for mount in (FIXED, HAND)]
+
+
+def find_sensing(word: str) -> Sensing:
+    """Return the sensing that a word stands for, such as `pixel`, `stereo:hand` or `./polar.py:hand`.
+
+    Raises:
+        ConfigurationError: an unknown word, or a file that cannot be used.
+    """
+    return _find(word, sensing_file(word))
+
+
+@lru_cache(maxsize=64)
+def _find(word: str, file: SourceFile | None) -> Sensing:
+    place, found = _place(word)
+    own = {} if file is None or found is None else {place: _pick(file, found["file"], found["name"])}
+    try:
+        return Sensing.parse(word, {**EYES, **own})
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+
+
+def sensing_file(word: str) -> SourceFile | None:
+    """Return the file of a user's own set-up; None for one of this package."""
+    _, found = _place(word)
+    return SourceFile.read(found["file"]) if found is not None and found["file"] else None
+
+
+def sensing_place(word: str) -> str:
+    """Return a word without its mount."""
+    place, _, mount = word.rpartition(":")
+    return place if mount in (FIXED, HAND) else word
+
+
+def _place(word: str) -> tuple[str, re.Match[str] | None]:
+    """Return a word without its mount, and the file and the name in it where it is those of a user."""
+    place = sensing_place(word)
+    return place, PLACE.fullmatch(place)
+
+
+def _pick(source: SourceFile, file: str, name: str | None) -> Eye:
+    """Return the set-up called `name` that a file defines, or without a name its only one."""
+    module, known = source.load(), EYES.values()
+    found = {key: value for key, value in vars(module).items() if isinstance(value, Eye) and value not in known}
+    if name is None and len(found) == 1:
+        return next(iter(found.values()))
+    if name in found:
+        return found[name]
+    if not found:
+        raise ConfigurationError(f"{file} defines no sensing set-up: no object of servobench.plant.cameras.eye.Eye")
+    first, *_ = found
+    wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
+    raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")

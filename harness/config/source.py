@@ -1,4 +1,4 @@
-"""Python files of users: read, carried out as modules, sent to other processes; their errors as one line."""
+"""Python files and modules of users: found, read, executed, sent to other processes; their errors as one line."""
 
 from __future__ import annotations
 
@@ -15,11 +15,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
+from typing import Final, TypeAlias
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.files import reason, user_path
 from servobench.plant.contract.settings import suggest
 
+Name: TypeAlias = tuple[str, ...]  # of a module, by its parts
+
+PLACE: Final = re.compile(
+    r"(?:(?P<alias>\w+)=)?(?:(?P<file>.+\.py)(?::(?P<name>\w+))?|(?P<module>[\w.]+):(?P<attribute>\w+))"
+)
 PACKAGE = "servobench"
 PACKAGES = "site-packages"  # folder of installed packages, which may lie below that of a user's file
 
@@ -190,3 +196,100 @@ def show(path: Path) -> str:
     """Return a path as a user reads it best: relative to the present folder where it lies below it."""
     here = Path.cwd()
     return str(path.relative_to(here)) if path.is_relative_to(here) else str(path)
+
+
+def is_place(text: str) -> bool:
+    """Return whether a text says where code stands, and is no name; of a module, whether there is such a one."""
+    found = PLACE.fullmatch(text)
+    if found is None:
+        return False
+    return found["file"] is not None or _can_import(found["module"])
+
+
+def _can_import(module: str) -> bool:
+    make_importable(Path.cwd())
+    try:
+        return importlib.util.find_spec(module.partition(".")[0]) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+def import_user_module(module: str) -> ModuleType:
+    """Import a module that a user named; modules in the present folder can be imported, too.
+
+    Raises:
+        ConfigurationError: it cannot be imported; one line with the place in it.
+    """
+    make_importable(Path.cwd())
+    try:
+        return importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        raise ConfigurationError(describe_import(error, module)) from error
+
+
+def describe_import(error: BaseException, module: str) -> str:
+    """Return why a module cannot be imported, as one line with the place in it where there is one."""
+    return describe_at(error, folder_of_module(module))
+
+
+def digest_of_module(module: str) -> str:
+    """Return the SHA-256 of the file of a module that is imported; empty where it has none."""
+    file = Path(getattr(sys.modules.get(module), "__file__", None) or "")
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+
+
+def folder_of_module(module: str) -> Path:
+    """Return the folder of the top-level package of a module, or of a module without one; else the present folder."""
+    spec = None
+    with contextlib.suppress(ImportError, ValueError):
+        spec = importlib.util.find_spec(module.partition(".")[0])
+    return Path(spec.origin).parent if spec is not None and spec.has_location and spec.origin else Path.cwd()
+
+
+def neighbours(file: Path, root: Path) -> list[Path]:
+    """Return the files below a folder that a file imports, directly or through one of them; not the file itself.
+
+    Args:
+        file: the file.
+        root: the folder from which its imports start.
+    """
+    waiting, found = [file], dict[Path, None]()
+    while waiting:
+        for path in _imported(waiting.pop(), root):
+            if path not in found and path != file:
+                found[path] = None
+                waiting.append(path)
+    return sorted(found)
+
+
+def _imported(file: Path, root: Path) -> Iterator[Path]:
+    """Yield the files below a folder that a file imports itself; nothing of one that cannot be read."""
+    try:
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+    except (OSError, SyntaxError, ValueError):
+        return
+    package = file.parent.relative_to(root).parts
+    for node in ast.walk(tree):
+        for name in _names(node, package):
+            yield from _files(root, name)
+
+
+def _names(node: ast.AST, package: Name) -> Iterator[Name]:
+    """Yield the names that a statement imports, those of modules and of what may be one."""
+    match node:
+        case ast.Import(names=names):
+            yield from (tuple(each.name.split(".")) for each in names)
+        case ast.ImportFrom(module=module, names=names, level=level):
+            begin = package[: len(package) + 1 - level] if level else ()
+            name = (*begin, *module.split(".")) if module else begin
+            yield from ((*name, each.name) for each in names)
+
+
+def _files(root: Path, name: Name) -> Iterator[Path]:
+    """Yield the files that an import of a name carries out: those of its packages and its own."""
+    for length in range(1, len(name) + 1):
+        place = root.joinpath(*name[:length])
+        for path in (place / "__init__.py", place.with_name(f"{place.name}.py")):
+            if path.is_file():
+                yield path
+                break

@@ -7,7 +7,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from servobench.harness.config.engines import rendered_plant, scene_of
+from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.drawn import Drawn

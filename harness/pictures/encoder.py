@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any, cast
 
-from servobench.harness.config.extras import missing_extra
+from servobench.harness.config.installation import missing_extra
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.rendered.detection import ByteArray
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from servobench.harness.config.engines import rendered_plant, scene_of
+from servobench.harness.config.registry import rendered_plant, scene_of
 from servobench.harness.config.robots import DEFAULT_ROBOT, OWN_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.tracks import Track

@@ -156,6 +156,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         tasks={name: [] for name in sections} | {"moves": list(moves), "curves": list(curves)},
         sheet=sheet,
         long_table=LONG_TABLE,
+        missing=results.describe_missing(folder),
         verdict=judge(runs),
         scope=_scope(runs, facts),
         band=settling_band(runs),

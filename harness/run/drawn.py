@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from servobench.harness.config.robots import find_robot
-from servobench.harness.config.sensing import find_sensing
+from servobench.harness.config.robots import find_robot, find_sensing
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.plausible import check_times
 from servobench.harness.run.resolved import ResolvedRun

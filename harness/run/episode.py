@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from servobench.harness.config.engines import engine_of
+from servobench.harness.config.registry import engine_of
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract

@@ -13,8 +13,7 @@ from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
-from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
-from servobench.harness.config.sensing import find_sensing
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.drawn import Drawn, build_scenario, draw
 from servobench.harness.run.ending import ends_batch

@@ -10,8 +10,7 @@ import pytest
 
 from kit import golden
 from kit.plants import plant_parameters
-from servobench.harness.config.engines import engine_of
-from servobench.harness.config.registry import CONTROLLERS, RENDERED
+from servobench.harness.config.registry import CONTROLLERS, RENDERED, engine_of
 
 CHANGELOG = Path(__file__).parents[2] / "CHANGELOG.md"
 MARGIN = 10.0  # times the spread that was measured

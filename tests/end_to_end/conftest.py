@@ -4,8 +4,7 @@ import pytest
 
 from kit import rendered
 from kit.plants import plant_parameters
-from servobench.harness.config.engines import scene_of
-from servobench.harness.config.registry import RENDERED
+from servobench.harness.config.registry import RENDERED, scene_of
 from servobench.plant.rendered.room import Room
 
 

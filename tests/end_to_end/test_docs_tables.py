@@ -23,6 +23,7 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import FmuMapping
 from servobench.plant.robot.mismatch import Mismatch
@@ -37,7 +38,7 @@ def config_classes():
     plants = [registry.find_plant(name).config for name in registry.PLANTS]
     whole = [*plants, FmuConfig, registry.find_controller("nmpc_calibrated").config]
     tasks = [type(entry.default) for entry in TASKS.values()]
-    common = [AidsConfig, InitialConfig, TrainingConfig, RunSettings]
+    common = [AidsConfig, InitialConfig, TrainingConfig, RunSettings, SensingConfig]
     return {kind for kind in (*parts, *whole, *tasks, *common) if dataclasses.fields(kind)}
 
 
@@ -48,6 +49,12 @@ def test_all_settings_have_a_table_and_nothing_else_has():
         f"{kind.__module__.removeprefix('servobench.').replace('.', '/')}.py:{kind.__name__}"
         for kind in config_classes()
     )
+
+
+def test_a_section_with_a_table_of_its_own_is_not_printed_again():
+    shown = generated_tables.settings_table(registry.find_plant("bullet").config)
+    assert "`sensing.latency` | 0.05" in shown  # which differs from the default of the section
+    assert "sensing.noise_share" not in shown
 
 
 @pytest.mark.parametrize("page", generated_tables.PAGES, ids=lambda page: page.name)

@@ -11,8 +11,10 @@ import pytest
 
 from kit.folders import comparison
 from kit.plants import NEEDS_BULLET, NEEDS_MUJOCO
-from servobench.harness.config import engines, extras, registry
-from servobench.harness.config.extras import EXTRAS
+from servobench.harness.config import installation as extras
+from servobench.harness.config import registry
+from servobench.harness.config import registry as engines
+from servobench.harness.config.installation import EXTRAS
 from servobench.harness.config.settings import ConfigurationError
 
 HEAVY = ("numpy", "scipy", "pandas", "matplotlib", "pydantic", "pybullet", "casadi", "fmpy", "cv2", *EXTRAS)

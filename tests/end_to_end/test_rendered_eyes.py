@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from kit.rendered import IDEAL
-from servobench.harness.config.engines import scene_of
-from servobench.harness.config.registry import find_plant
+from servobench.harness.config.registry import find_plant, scene_of
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.registry import Sensing

@@ -17,7 +17,7 @@ import renewal
 import stored_tables
 from kit.command import servobench
 from kit.documents import ROOT
-from page_studies import STUDIES, audit, engines, held_out, physical, readme, side_by_side, worlds
+from page_studies import STUDIES, engines, held_out, physical, readme, side_by_side, worlds
 from page_studies.study import Study, nothing, sweep
 from servobench.harness.batch import results
 from servobench.harness.batch.compare import TUNING, parse_seeds
@@ -71,6 +71,8 @@ def test_a_study_is_stored_with_how_it_was_made_and_stands_on_a_page(toy):
     assert "(tables/counts.csv)" in shown
     page.write_text(shown)
     assert generated_tables.renewed(page) == shown
+    page.write_text("<!-- stored: counts -->\nold\n<!-- end -->\n")
+    assert "All 1 rows: `make results ONLY=toy`: commit" in generated_tables.renewed(page)
 
 
 def test_a_study_that_was_interrupted_goes_on_and_one_of_other_code_begins_anew(toy, monkeypatch):
@@ -134,7 +136,7 @@ def test_an_unknown_study_is_one_line_that_names_them_all():
 
 def test_all_tables_of_pages_belong_to_a_study_and_all_stored_ones_are_on_a_page():
     parts = [part for page in generated_tables.PAGES for part in generated_tables.PART.findall(page.read_text())]
-    shown = {place for _, kind, place, *_ in parts if kind == "table"}
+    shown = {place for _, kind, place, *_ in parts if kind in {"table", "stored"}}
     stored = {path.stem: stored_tables.read(path).stamp["study"] for path in stored_tables.FOLDER.glob("*.csv")}
     assert set(stored) <= shown
     assert set(stored.values()) <= set(STUDIES)
@@ -188,7 +190,7 @@ def toy_runs(words):
     ])  # fmt: skip
 
 
-@pytest.mark.parametrize("module", [audit, held_out, physical, worlds], ids=lambda module: module.__name__)
+@pytest.mark.parametrize("module", [held_out, physical, worlds], ids=lambda module: module.__name__)
 def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path, module):
     steps = pd.DataFrame({"error_norm": np.full(50, 0.001)})
     monkeypatch.setattr(module, "load_steps", lambda *_: steps, raising=False)
@@ -198,7 +200,7 @@ def test_the_tables_of_sweeps_are_text_and_stand_on_a_page(monkeypatch, tmp_path
         for name, table in study.tables(tmp_path).items():
             assert len(table) or name == "held_out_studies"
             assert table.map(lambda cell: isinstance(cell, str)).all(axis=None), name
-            assert f"<!-- table: {name} -->" in shown
+            assert f"<!-- table: {name} -->" in shown or f"<!-- stored: {name} -->" in shown
 
 
 def test_losses_at_a_faster_rate_are_those_beyond_the_paired_interval():

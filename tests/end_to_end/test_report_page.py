@@ -331,7 +331,7 @@ def test_on_paper_tables_are_tables_and_controls_are_gone(browser, pages):
 def test_hostile_texts_stay_texts(browser, tmp_path):
     tasks = ("exp1", HOSTILE)
     rows = [
-        made_up_row(f"{HOSTILE}-{k}", controller=name, task=task, reason=HOSTILE,
+        made_up_row(f"hostile-{k}", controller=name, task=task, reason=HOSTILE,
                     status="completed" if k else HOSTILE, outcome=HOSTILE, plant=HOSTILE)
         for k, (name, task) in enumerate((name, task) for name in (HOSTILE, "b") for task in tasks)
     ]  # fmt: skip

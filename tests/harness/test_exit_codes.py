@@ -15,9 +15,8 @@ from kit.command import PACKAGE, servobench
 from kit.resting import Resting
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch import results
-from servobench.harness.config.builds import NoSettings
-from servobench.harness.config.entries import CONTROLLER
-from servobench.harness.config.own import own_object
+from servobench.harness.config.adapters import NoSettings
+from servobench.harness.config.entries import CONTROLLER, own_object
 from servobench.harness.config.registry import offering
 
 

@@ -12,8 +12,7 @@ import pytest
 from kit.documents import blocks
 from kit.plants import plant_parameters
 from servobench.harness.batch.api import run
-from servobench.harness.config.engines import default_plant
-from servobench.harness.config.registry import RENDERED
+from servobench.harness.config.registry import RENDERED, default_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym import ENVIRONMENT
 from servobench.harness.gym.environment import ServoEnv

@@ -12,7 +12,7 @@ import pytest
 from kit.command import servobench
 from servobench.harness.batch.results import load_runs
 from servobench.harness.cli.main import command_line
-from servobench.harness.config.describe import plain
+from servobench.harness.config.description import plain
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import flatten
 from servobench.harness.run.tasks import TASKS

@@ -10,9 +10,9 @@ import pytest
 import servobench
 from servobench.harness.batch.named_files import named_files
 from servobench.harness.batch.survey import Survey
-from servobench.harness.config.neighbours import neighbours
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import neighbours
 from servobench.plant.robot import ur5
 
 MINE = """

@@ -5,8 +5,7 @@ import pickle
 import pytest
 
 from kit.plants import NEEDS_BULLET
-from servobench.harness.config.engines import engine_of
-from servobench.harness.config.registry import controller_names
+from servobench.harness.config.registry import controller_names, engine_of
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import resolve

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from kit.folders import comparison, made_up_row
+from kit.command import servobench
+from kit.folders import comparison, made_up_row, made_up_steps, write_folder
 from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.summary import summary_legend, summary_tables
@@ -296,3 +298,52 @@ def test_a_table_that_is_none_of_runs_names_all_that_it_lacks(tmp_path):
     pd.DataFrame({"run_id": ["a"], "time_s": [0.0]}).to_parquet(folder / results.STEPS)
     with pytest.raises(ConfigurationError, match="is no table of steps: it lacks the column error_norm$"):
         results.load_steps(folder)
+
+
+@pytest.mark.parametrize("run_id", ["../../escaped", "/tmp/escaped", "..", ".hidden", "a\\b", "a\0b", "a b", "", 3])
+@pytest.mark.parametrize(
+    "command", [("export", "--out", "FILES"), ("record", "--run", "RUN"), ("report",), ("statistics",)]
+)
+def test_a_run_identifier_that_is_unfit_for_a_file_is_refused(monkeypatch, capsys, tmp_path, run_id, command):
+    folder = write_folder(tmp_path / "out", [made_up_row(run_id)], [made_up_steps("a")])
+    words = {"FILES": str(tmp_path / "files"), "RUN": str(run_id) or "a"}
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    if "\0" in words["RUN"]:
+        words["RUN"] = "a"
+    code = servobench(monkeypatch, command[0], str(folder), *(words.get(word, word) for word in command[1:]))
+    assert code == 2
+    error = capsys.readouterr().err
+    assert "runs.parquet is no table of runs: the run_id of row 0" in error
+    assert error.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("command", [("export", "--out", "FILES"), ("report",), ("statistics",), ("verify",)])
+def test_commands_first_say_how_many_runs_of_a_batch_are_missing(monkeypatch, capsys, tmp_path, command):
+    folder = tmp_path / "out"
+    results.create_folder(folder, {"run_count": 3})
+    for index in range(2):
+        run_id = f"run{index}"
+        results.write_part(folder, index, [RunResult(made_up_row(run_id, seed=index), made_up_steps(run_id))])
+    line = "2 of 3 runs are there: --resume carries out the others\n"
+    words = [command[0], str(folder), *(str(tmp_path / "files") if word == "FILES" else word for word in command[1:])]
+    assert servobench(monkeypatch, *words) == 0
+    assert capsys.readouterr().out.startswith(line)
+    if command == ("report",):
+        assert line.strip() in (folder / "report.html").read_text(encoding="utf-8")
+    run_id = "run2"
+    results.write_part(folder, 2, [RunResult(made_up_row(run_id, seed=2), made_up_steps(run_id))])
+    shutil.rmtree(tmp_path / "files", ignore_errors=True)
+    assert servobench(monkeypatch, *words) == 0
+    assert "runs are there" not in capsys.readouterr().out
+
+
+def test_statistics_of_an_unfinished_batch_stay_json(monkeypatch, capsys, tmp_path):
+    folder = tmp_path / "out"
+    results.create_folder(folder, {"run_count": 3})
+    add_part(folder, 0)
+    assert servobench(monkeypatch, "statistics", str(folder), "--json") == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)
+    assert told.err.startswith("1 of 3 runs are there")

@@ -17,7 +17,7 @@ from servobench.harness.batch.manifest import describe_sensing
 from servobench.harness.batch.named_files import named_files
 from servobench.harness.batch.survey import Survey
 from servobench.harness.config.registry import find_plant
-from servobench.harness.config.sensing import find_sensing, sensing_names
+from servobench.harness.config.robots import find_sensing, sensing_names
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment

@@ -193,8 +193,8 @@ def test_moves_and_curves_are_told_apart_and_tasks_that_nobody_began_are_neither
 
 
 def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
-    monkeypatch.setattr(results, "load_runs", lambda folder: runs)
-    assert servobench(monkeypatch, "statistics", str(tmp_path), "--json", "--never", "10") == 0
+    folder = write_folder(tmp_path / "out", runs.to_dict("records"), [])
+    assert servobench(monkeypatch, "statistics", str(folder), "--json", "--never", "10") == 0
     (place,) = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     quick, slow = place["controllers"]
     settled = slow["settled, %"]
@@ -203,7 +203,7 @@ def test_statistics_are_there_for_programs(monkeypatch, capsys, tmp_path, runs):
     assert slow["worst 5 %, mm"] == "inf"
     (pair,) = place["pairs"]
     assert pair["difference in settling time, s"]["value"] < -1.0
-    assert servobench(monkeypatch, "statistics", str(tmp_path), "--json", "--markdown") == 2
+    assert servobench(monkeypatch, "statistics", str(folder), "--json", "--markdown") == 2
 
 
 def test_a_number_that_there_is_not_is_null_for_programs():

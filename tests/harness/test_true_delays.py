@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from servobench.controllers.controller import ControllerEntry, Delays
-from servobench.harness.config.entries import CONTROLLER
-from servobench.harness.config.own import own_object
+from servobench.harness.config.entries import CONTROLLER, own_object
 from servobench.harness.config.registry import find_controller, offering
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build_experiment

@@ -11,10 +11,9 @@ import pytest
 
 from kit.command import servobench
 from servobench.harness.config import registry
-from servobench.harness.config.describe import describe_settings
+from servobench.harness.config.description import configuration_file, describe_settings
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
-from servobench.harness.config.template import configuration_file
 from servobench.harness.run import resolved
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve_sections

@@ -1,9 +1,12 @@
-"""What to install where a package is missing that only an extra brings."""
+"""The installation: version and commit of servobench, and the extras that bring missing packages."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Final
 
 from servobench.harness.config.settings import ConfigurationError
@@ -59,3 +62,40 @@ def _line(module: str, what: str) -> str:
         version = ".".join(map(str, sys.version_info[:2]))
         line += f" (no wheel for Python {version}: this compiles it for about ten minutes and needs a C++ compiler)"
     return line
+
+
+CODE_FOLDERS = ("plant", "controllers", "fmus", "harness")  # whose changes change results
+COMMIT_DIGITS = 12  # that a reader is shown
+
+
+def installed_version(name: str = "servobench") -> str | None:
+    """Return the version of a distribution; None where it is not installed."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def git_commit() -> str | None:
+    """Return the commit of the checkout this code lies in, marked where code differs from it; None outside one."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+    commit, changed = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--", *CODE_FOLDERS)
+    return f"{commit}-dirty" if commit and changed else commit
+
+
+def version_line() -> str:
+    """Return what `servobench --version` prints."""
+    commit = git_commit()
+    hash_, dirty, _ = (commit or "").partition("-dirty")
+    where = f" (commit {hash_[:COMMIT_DIGITS]}{', with changes' if dirty else ''})" if commit else ""
+    return f"servobench {installed_version() or 'not installed'}{where}"
+
+
+def _git(root: Path, *words: str) -> str | None:
+    try:
+        answer = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip() or None
