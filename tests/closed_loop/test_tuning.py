@@ -244,17 +244,3 @@ def test_a_change_that_gains_little_is_no_improvement():
     little, much = (Change("rls", "law.damping", 1.0, 1.2, 1.0, after) for after in (0.975, 0.965))
     assert improvements([little, much]) == [much]
     assert much.gain == pytest.approx(0.035)
-
-
-@pytest.mark.parametrize(
-    ("name", "keys", "count"),
-    [
-        ("calibrated", ("law.damping", "law.integral_gain"), 5),
-        ("map_mfac", ("aids.delay", "aids.filter", "aids.feedforward", "aids.limit"), 6),
-    ],
-)
-def test_a_sample_of_the_whole_check_no_other_value_helps(name, keys, count, tmp_path):
-    """The whole check, of every value of every method, is part of `make nightly`."""
-    check = Check(tmp_path, (name,), TuningSet().second(), keys)
-    assert len(list(check.carry_out(Workers()))) == len(check) == count
-    assert improvements(check.changes()) == []
