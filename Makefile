@@ -64,9 +64,10 @@ tables: $(VENV)/ready
 docs: tables
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet -b html docs build/site
 
-# Build wheel and source distribution into dist, check them, install each alone in a fresh environment and make a run.
+# Build wheel and source distribution of the tagged commit of this version into dist, check them, install each alone in a fresh
+# environment and make a run. REHEARSE=yes takes the checkout as it is.
 release: $(VENV)/ready
-	$(BIN)/python .ci/release.py
+	$(BIN)/python .ci/release.py $(if $(REHEARSE),--rehearse)
 
 # Write docs/performance.md and its pictures: a quarter of an hour on two quiet processors. AGAINST="0.1.0=/path" adds a checkout.
 benchmark: $(VENV)/ready

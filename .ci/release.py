@@ -1,8 +1,9 @@
-"""Rehearses a release: builds both files, checks them, installs each alone in a fresh environment and makes a run.
+"""Builds a release from its commit, checks both files, installs each alone in a fresh environment and makes a run.
 
-    python .ci/release.py [--dist dist] [--python python3.13]
+    python .ci/release.py [--dist dist] [--python python3.13] [--rehearse]
 
-What it leaves in the folder of `--dist` is what would be uploaded. Nothing is uploaded.
+The commit of version X.Y.Z has the tag vX.Y.Z; any other commit, and a checkout with changes, is refused. `--rehearse`
+builds the checkout as it is. The files for an upload are left in the folder of `--dist`. Nothing is uploaded.
 """
 
 from __future__ import annotations
@@ -43,23 +44,56 @@ RUN = ("run", "--plant", "kinematic", "--set", "exp2.duration=1", "--out")
 
 
 def main() -> None:
-    """Carry the rehearsal out; the first thing that is wrong ends it with exit code 1."""
-    parser = argparse.ArgumentParser(description="Rehearse a release.")
+    """Make the files of a release; the first fault ends it with exit code 1."""
+    parser = argparse.ArgumentParser(description="Make the files of a release.")
     parser.add_argument("--dist", type=Path, default=ROOT / "dist", help="folder for the files")
     parser.add_argument("--python", default=sys.executable, help="interpreter of the fresh environment")
-    asked = parser.parse_args()
-    wheel, source = build(asked.dist)
-    faults = [*faults_of_wheel(wheel), *faults_of_source(source), *faults_of_versions(wheel, ROOT)]
-    if faults:
-        sys.exit("\n".join(f"release: {fault}" for fault in faults))
+    parser.add_argument("--rehearse", action="store_true", help="build the checkout as it is, without a tag")
+    options = parser.parse_args()
+    if not options.rehearse:
+        end_with(faults_of_commit(ROOT, version_of(ROOT)))
+    wheel, source = build(options.dist)
+    end_with([*faults_of_wheel(wheel), *faults_of_source(source), *faults_of_versions(wheel, ROOT)])
     with tempfile.TemporaryDirectory(prefix=f"{PACKAGE}-release-") as folder:
-        python = fresh_environment(asked.python, Path(folder))
-        for file, options in ((wheel, ["--only-binary", ":all:"]), (source, ["--no-deps", "--force-reinstall"])):
+        python = fresh_environment(options.python, Path(folder))
+        for file, words in ((wheel, ["--only-binary", ":all:"]), (source, ["--no-deps", "--force-reinstall"])):
             began = time.monotonic()
-            quiet(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *options, str(file))
+            quiet(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *words, str(file))
             print(f"{file.name}: installed in {time.monotonic() - began:.0f} s, {describe(python)}")  # noqa: T201
             rehearse(python, Path(folder) / f"run of {file.name}")
     print(f"release: {wheel.name} and {source.name} install and run from the files alone")  # noqa: T201
+
+
+def end_with(faults: list[str]) -> None:
+    """End with exit code 1 if there are faults, a line each."""
+    if faults:
+        sys.exit("\n".join(f"release: {fault}" for fault in faults))
+
+
+def version_of(root: Path) -> str:
+    """Return the version that the project of a folder has."""
+    return str(tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"])
+
+
+def faults_of_commit(root: Path, version: str) -> list[str]:
+    """Return the differences of a checkout from the commit of a release: tag, changelog, changes since."""
+    tag, head = f"v{version}", git(root, "rev-parse", "HEAD")
+    tagged = git(root, "rev-parse", "--verify", "--quiet", f"{tag}^{{commit}}")
+    faults = []
+    if not tagged:
+        faults.append(f"no commit has the tag {tag}; git tag -a {tag}, or --rehearse")
+    elif tagged != head:
+        faults.append(f"the checkout is at {head[:12]}, {tag} is {tagged[:12]}; git checkout {tag}, or --rehearse")
+    if git(root, "status", "--porcelain"):
+        faults.append("the checkout has changes; commit or remove them, or --rehearse")
+    if f"\n## {version} (" not in (root / "CHANGELOG.md").read_text(encoding="utf-8"):
+        faults.append(f"CHANGELOG.md has no section {version} with its date")
+    return faults
+
+
+def git(root: Path, *words: str) -> str:
+    """Return the output of a git command in a folder; empty if it fails."""
+    return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def build(dist: Path) -> tuple[Path, Path]:
@@ -72,7 +106,7 @@ def build(dist: Path) -> tuple[Path, Path]:
 
 
 def faults_of_wheel(path: Path) -> list[str]:
-    """Return what is wrong with the names of files and the metadata of a wheel."""
+    """Return the faults of a wheel: names of files, metadata."""
     with zipfile.ZipFile(path) as wheel:
         names = set(wheel.namelist())
     faults = [f"{path.name} lacks {PACKAGE}/{name}" for name in NEEDED if f"{PACKAGE}/{name}" not in names]
@@ -88,17 +122,17 @@ def faults_of_wheel(path: Path) -> list[str]:
 
 
 def faults_of_source(path: Path) -> list[str]:
-    """Return what a source distribution lacks."""
+    """Return the faults of a source distribution: missing files."""
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     return [f"{path.name} lacks {name}" for name in IN_SOURCE if name not in names]
 
 
 def faults_of_versions(wheel: Path, root: Path) -> list[str]:
-    """Return where another version is told than in the wheel."""
+    """Return the files that say another version than the wheel."""
     version = metadata(wheel)["Version"]
     told = {
-        "pyproject.toml": tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"],
+        "pyproject.toml": version_of(root),
         "CITATION.cff": next(
             line.partition(":")[2].strip()
             for line in (root / "CITATION.cff").read_text(encoding="utf-8").splitlines()
@@ -129,7 +163,7 @@ def describe(python: Path) -> str:
 
 
 def rehearse(python: Path, folder: Path) -> None:
-    """Make a run in an empty folder with what is installed."""
+    """Make a run in an empty folder with the installed package."""
     folder.mkdir()
     quiet(python, "-m", PACKAGE, "--version", folder=folder)
     quiet(python, "-m", PACKAGE, *RUN, "out", folder=folder)

@@ -16,8 +16,8 @@ from servobench.fmus.compile import this_platform
 from servobench.harness.config.adapters import NoSettings
 from servobench.harness.config.fmu_controller import mapped_controller
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.controller_fmu import controller_model
 from servobench.harness.run.experiment import build
+from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
 from servobench.plant.contract.signals import Command

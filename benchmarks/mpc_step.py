@@ -15,7 +15,7 @@ import numpy as np
 
 from measuring import asked_to_be_quick, processor_time, table
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.contract.checks import FloatArray

@@ -28,9 +28,9 @@ from measuring import (
     write_picture,
 )
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.estimator import Motion
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.networks.rbf import JacobianNetwork
 from servobench.harness.config.defaults import default_config

@@ -1,11 +1,17 @@
-"""The aids of a composed controller: what any estimator and any law can have in addition to what its paper gives it.
+"""The aids of a composed controller: optional stages that any estimator and any law can have beside their papers' own.
 
 An aid is a stage of the chain that can be left out; all of them are off by default, which is a method as published.
+
+An aid is declared once, by the field of `AidsConfig` that switches it: name, type, default and help as for any setting,
+and in its type a `Switch` with the value that a best equipped method has and the values that tuning tries. The tables
+of methods, the study of the aids and the spaces of tuning are made from these declarations.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_type_hints
 
 from annotated_types import Le
 
@@ -13,27 +19,58 @@ from servobench.plant.contract.settings import NonNegative, Positive, Share, set
 
 Known: TypeAlias = Literal["ignored", "identified", "given"]
 """Whether a quantity is left out, identified from the motions of the run, or given by a number."""
+Mark = TypeVar("Mark")
+
+
+@dataclass(frozen=True)
+class Switch:
+    """Declares a setting that switches an aid; its default leaves the aid out.
+
+    Attributes:
+        equipped: its value in a best equipped method.
+        tuned: the values among which tuning chooses; empty where tuning has no choice.
+    """
+
+    equipped: object
+    tuned: tuple[object, ...] = ()
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Declares the range in which a number is tuned.
+
+    Attributes:
+        low: smallest value.
+        high: largest value.
+        log: whether it is searched by factor.
+    """
+
+    low: float
+    high: float
+    log: bool = False
 
 
 @settings
 class AidsConfig:
     """The aids of a composed controller; by default there are none."""
 
-    delay: Known = "ignored"
+    delay: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
     """The camera's latency: which joint motion belongs to a feature's motion, and where the feature is by now."""
-    response: Known = "ignored"
+    response: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
     """How joints answer to commands: the law acts on where the arm will be when all of them are carried out."""
-    noise: Literal["given", "identified"] = "given"
+    noise: Annotated[Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))] = "given"
     """The standard deviation of the feature, as `feature_noise` or identified."""
-    filter: bool = False
+    filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
     """Filter the feature with the motion of the joints."""
-    model: Literal["own", "nominal", "map"] = "own"
+    model: Annotated[Literal["own", "nominal", "map"], Switch("map", tuned=("own", "nominal", "map"))] = "own"
     """The estimator's own Jacobian, its deviation from the nominal one, or from the nominal one seen through a map."""
-    feedforward: bool = False
+    feedforward: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
     """Add the reference's own motion; needs a preview."""
-    posture: bool = False
+    posture: Annotated[bool, Switch(equipped=True)] = False
     """Move towards the middle of the working region in the null space of the Jacobian."""
-    limit: Literal["scale", "clip", "redistribute"] = "scale"
+    limit: Annotated[
+        Literal["scale", "clip", "redistribute"], Switch("redistribute", tuned=("scale", "clip", "redistribute"))
+    ] = "scale"
     """A command beyond the limits is shrunk, cut joint by joint, or taken over by joints with room."""
     longest_delay: Annotated[NonNegative, Le(1.0)] = 0.25
     """[s] the longest delay that is considered; for an identified one."""
@@ -49,9 +86,10 @@ class AidsConfig:
     """[unit of the feature] standard deviation of a feature; the first guess where it is identified."""
     map_deviation: Positive = 1.0
     """[1] of an entry of the map from the identity at first; 1: any camera is possible."""
-    map_walk: NonNegative = 0.1
+    map_walk: Annotated[NonNegative, Tuned(0.03, 3.0, log=True)] = 0.1
     """[1/√m] deviation of an entry of the map after the feature has moved by a metre."""
-    map_error: NonNegative = 0.1
+    # Tuned up to 0.1: with more the identified noise would be too small, and the delay biased.
+    map_error: Annotated[NonNegative, Tuned(0.01, 0.1, log=True)] = 0.1
     """[1] share of a step that nominal model and map do not explain."""
     rotation_deviation: NonNegative = 0.2
     """[1] of an entry of the map from the nearest rotation; 0: the map is a rotation."""
@@ -67,25 +105,29 @@ class AidsConfig:
     """[1] sum of innovations (CUSUM) beyond which it seems so."""
     filter_error: NonNegative = 0.2
     """[1] error of the Jacobian as a share of its size, as the filter sees it."""
-    posture_gain: NonNegative = 0.6
+    posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0)] = 0.6
     """[1/s] gain of the posture."""
     damping: Positive = 0.02
     """[m/rad] of the inverse in feedforward, posture and redistribution."""
 
     @property
-    def looks_back(self) -> bool:
+    def needs_past(self) -> bool:
         """Whether a stage needs past joint positions."""
         away = (self.delay, self.response, self.noise, self.filter, self.model)
         return away != ("ignored", "ignored", "given", False, "own")
 
 
-EQUIPPED: Final[dict[str, Any]] = {
-    "delay": "identified",
-    "response": "identified",
-    "noise": "identified",
-    "filter": True,
-    "model": "map",
-    "feedforward": True,
-    "posture": True,
-    "limit": "redistribute",
-}
+def _marked(mark: type[Mark]) -> dict[str, Mark]:
+    """Return the declarations of this type by setting, in the order of the settings."""
+    hints = get_type_hints(AidsConfig, include_extras=True)
+    return {
+        key: each for key, hint in hints.items() for each in getattr(hint, "__metadata__", ()) if isinstance(each, mark)
+    }
+
+
+SWITCHES: Final[Mapping[str, Switch]] = _marked(Switch)
+"""The aids by name."""
+RANGES: Final[Mapping[str, Tuned]] = _marked(Tuned)
+"""The numbers of the aids that are tuned, by name."""
+EQUIPPED: Final[Mapping[str, Any]] = {name: switch.equipped for name, switch in SWITCHES.items()}
+"""The value of each aid in a best equipped method."""

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from servobench.controllers.sight import Sight
+from servobench.controllers.camera_model import CameraModel
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.signals import Command, Observation, PlantSpec
 
@@ -60,7 +60,7 @@ class RobotKnowledge:
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
             needs the training defines both types. None: it is run when the controller is built.
         unit: what one of the features here is in the unit of the plant's; see `servobench.controllers.units`.
-        nominal_sight: how the nominal cameras see points, of which the features are made; None where these are not
+        nominal_cameras: how the nominal cameras see points, of which the features are made; None where these are not
             features of single points in images, or no model exists.
     """
 
@@ -73,7 +73,7 @@ class RobotKnowledge:
     region: tuple[FloatArray, FloatArray] | None = None
     train: Callable[[Any], Any] | None = None
     unit: float = 1.0
-    nominal_sight: Sight | None = None
+    nominal_cameras: CameraModel | None = None
 
     def check(self, observation: Observation, reference: FloatArray | None = None) -> None:
         """Check what a controller is given.

@@ -12,9 +12,8 @@ import numpy as np
 from servobench.controllers.controller import Controller, ControllerEntry, Diagnostics, RobotKnowledge
 from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targets, move_weights
-from servobench.controllers.laws.mpc.limits import joint_bounds
-from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver
-from servobench.controllers.laws.preview import check_preview, sampled
+from servobench.controllers.laws.mpc.qp import QpProgram, QpShape, QpSolution, Solver, joint_bounds
+from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import SolverFailed

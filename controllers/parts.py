@@ -7,19 +7,23 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
-from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
-from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
+from servobench.controllers.estimators.constant import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.correntropy import (
+    GmckfConfig,
+    ImcckfConfig,
+    MckfConfig,
+    RmckfConfig,
+    gmckf_estimator,
+    imcckf_estimator,
+    mckf_estimator,
+    rmckf_estimator,
+)
 from servobench.controllers.estimators.estimator import Estimator
-from servobench.controllers.estimators.fixed import ConstantConfig, ConstantEstimator, TrueConfig, TrueEstimator
-from servobench.controllers.estimators.gmckf import GmckfConfig, gmckf_estimator
-from servobench.controllers.estimators.imcckf import ImcckfConfig, imcckf_estimator
-from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
-from servobench.controllers.estimators.mckf import MckfConfig, mckf_estimator
-from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
-from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
+from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
+from servobench.controllers.estimators.projection import BroydenConfig, BroydenEstimator, CfdlConfig, CfdlEstimator
+from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator, RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator
-from servobench.controllers.estimators.rmckf import RmckfConfig, rmckf_estimator
-from servobench.controllers.estimators.robust import RobustConfig, RobustEstimator
+from servobench.controllers.estimators.robust_filter import RobustConfig, RobustEstimator
 from servobench.controllers.estimators.ukf import UkfConfig, ukf_estimator
 from servobench.controllers.laws.law import Law
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw
@@ -51,7 +55,7 @@ ESTIMATORS: dict[str, Part[Estimator[Any]]] = {
     "constant": Part(ConstantConfig, ConstantEstimator),
     "true": Part(TrueConfig, TrueEstimator, needs_truth=True),
     "ukf": Part(UkfConfig, ukf_estimator),
-    "kalman": Part(KalmanConfig, KalmanEstimator),
+    "kalman": Part(KalmanConfig, kalman_estimator),
     "mckf": Part(MckfConfig, mckf_estimator),
     "imcckf": Part(ImcckfConfig, imcckf_estimator),
     "gmckf": Part(GmckfConfig, gmckf_estimator),

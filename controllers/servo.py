@@ -15,10 +15,9 @@ import numpy as np
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Controller, Delays, Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import Estimate
 from servobench.controllers.estimators.estimator import Estimator
 from servobench.controllers.initial import InitialJacobian
-from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.law import Estimate, Law
 from servobench.controllers.stages.estimation import Estimation, EstimationState
 from servobench.controllers.stages.finish import Finish
 from servobench.controllers.stages.pairing import PairState
@@ -180,7 +179,7 @@ class Servo:
     def _past(self, predictor: Predictor, pair: PairState, observation: Observation) -> Past:
         pairing = self.estimation.pairing
         if pairing is None:
-            raise ValueError("a predictor needs the pair stage, which looks back")
+            raise ValueError("a predictor needs the pair stage, which keeps past joint positions")
         exposed, before = pairing.exposed(pair)
         window = observation.joint_position - pair.past[..., predictor.window, : self.knowledge.spec.n]
         return Past(pairing.delay(pair), exposed, before, window)

@@ -2,7 +2,7 @@
 
     y' = y / s,   J' = J / s          s the scale of the feature's channel: 1 m of a place, pixels per metre of a pixel
 
-With s = 1 nothing is changed. Settings in metres are therefore metres of a ball that moves across the camera's sight.
+With s = 1 nothing is changed. Settings in metres are therefore metres of a ball that moves across the optical axis.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
         knowledge,
         spec=replace(knowledge.spec, feature=natural),
         nominal_jacobian=_divided(knowledge.nominal_jacobian, scale),
-        nominal_sight=None if knowledge.nominal_sight is None else knowledge.nominal_sight.in_unit(scale),
+        nominal_cameras=None if knowledge.nominal_cameras is None else knowledge.nominal_cameras.in_unit(scale),
         true_jacobian=_divided(knowledge.true_jacobian, scale),
         true_symbolic=_divided_expression(knowledge.true_symbolic, scale),
         unit=scale * knowledge.unit,

@@ -30,7 +30,7 @@ from page_studies import STUDIES
 from page_studies.study import Study
 from servobench.harness.batch import results
 from servobench.harness.batch.results import read_manifest
-from servobench.harness.run.ending import CRASHED
+from servobench.harness.run.result import CRASHED
 
 ROOT: Final = Path(__file__).parents[1]
 CODE: Final = ("plant", "controllers", "fmus", "harness")  # what results depend on

@@ -11,12 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from servobench.fmus.model_description import Description
+from servobench.fmus.model_description import Description, sampled_sections
 from servobench.fmus.product import Product, c_files, committed, tool, word
 from servobench.fmus.reference import table
-from servobench.fmus.source import generated_source
-from servobench.fmus.structure import sampled_sections
-from servobench.fmus.trace.faults import NOT_DEFINITE
+from servobench.fmus.sources import generated_source
+from servobench.fmus.trace.branches import NOT_DEFINITE
 from servobench.fmus.trace.record import Recorded
 from servobench.fmus.variables import INPUT, SAMPLED, Group, Layout
 from servobench.plant.contract.checks import FloatArray

@@ -11,18 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from servobench.fmus.compile import Platform, this_platform
-from servobench.fmus.eye_variables import View
-from servobench.fmus.generate import arm_constants, kinematics_source
-from servobench.fmus.model_description import Description
+from servobench.fmus.model_description import Description, arm_sections
 from servobench.fmus.product import Product, c_files, check_version, committed, tool, word
 from servobench.fmus.reference import input_csv, output_csv, reference_run
-from servobench.fmus.structure import arm_sections
-from servobench.fmus.variables import Actuation, ArmLayout, arm_groups, parameters_of
+from servobench.fmus.sources import arm_constants, kinematics_source
+from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 
 MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
 CORE = "kinematics"

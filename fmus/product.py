@@ -27,7 +27,7 @@ from servobench.fmus.model_description import (
     write_references,
 )
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
-from servobench.fmus.source import layout_header
+from servobench.fmus.sources import layout_header
 from servobench.plant.contract.files import reason
 
 MACHINERY: Final = "fmi"  # folder of the FMI functions, which know no model

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servobench.fmus.eye_variables import FEATURE, SEEN
-from servobench.fmus.variables import Actuation, Layout
+from servobench.fmus.variables import FEATURE, SEEN, Actuation, Layout
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.kinematic import discretise_lag
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm
 
 STEP = 0.05  # [s]
 STEPS = 200

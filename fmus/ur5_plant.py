@@ -10,8 +10,7 @@ from typing import Literal
 import numpy as np
 
 from servobench.fmus.export import export_fmu, fingerprint, nominal_options
-from servobench.fmus.eye_variables import FEATURE, SEEN, View
-from servobench.fmus.variables import Actuation, parameters_of
+from servobench.fmus.variables import FEATURE, SEEN, Actuation, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.cameras.model import EyeModel

@@ -1,4 +1,4 @@
-"""The variables of the exported arm, as one table.
+"""The variables of the exported arm, with those of a sensing set-up, as one table.
 
 The model description, the C header and the documentation are generated from it.
 
@@ -8,24 +8,27 @@ group as an array, `lag`. Both use the group's offset in one flat vector of valu
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import prod
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from servobench.fmus.eye_variables import SEEN, View, view_parameters
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.model import EyeModel, Mount
 from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
-from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.limits import JointLimits, narrowed
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.arm import JointLimits, narrowed, rpy_from_rotation
+from servobench.plant.robot.hand_eye import SensedArm
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
+
+
+FEATURE: Final = "feature"
+SEEN: Final = "seen"
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,77 @@ class Group:
         for index in product(*(range(1, size + 1) for size in self.shape)):
             scalar = f"{inner}[{','.join(map(str, index))}]"
             yield f"der({scalar})" if self.role == DERIVATIVE else scalar
+
+
+class View(NamedTuple):
+    """The part of a sensing set-up that the equations fix; all else is a parameter.
+
+    A set-up takes the place of the ball, its fixed camera and its position in the table of variables.
+
+    Attributes:
+        eye: the set-up.
+        mount: of its cameras.
+        size: width and height of the images [px].
+    """
+
+    eye: Eye
+    mount: Mount
+    size: tuple[float, float]
+
+    @classmethod
+    def of(cls, model: EyeModel) -> Self:
+        """Return the view of an arm and its cameras."""
+        return cls(model.eye, model.mount, model.optics.size)
+
+    @property
+    def word(self) -> str:
+        """Name of set-up and mount, as a word of C begins."""
+        return self.eye.name if self.mount == "fixed" else f"{self.eye.name}_{self.mount}"
+
+    @property
+    def setting(self) -> str:
+        """Features and place of the cameras, for descriptions."""
+        return f"{self.eye.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
+
+    def parameters(self) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
+        """Return name, shape, unit and description of each kinematic parameter of target and cameras, in order."""
+        c, p = self.eye.cameras, len(self.eye.target)
+        on, off = ("base", "flange") if self.mount == "fixed" else ("flange", "base")
+        return (
+            ("target", (p, 3), "m", f"Points of the target in the {off} frame."),
+            ("camera_position", (c, 3), "m", f"Cameras in the {on} frame."),
+            ("camera_rpy", (c, 3), "rad", f"Roll, pitch and yaw of the cameras in the {on} frame."),
+            ("focal_length", (c,), "px", "Focal length of each camera."),
+            ("principal_point", (c, 2), "px", "Principal point, from the upper left corner of the image."),
+            ("distortion", (c,), "1", "First coefficient of radial distortion."),
+        )
+
+    def outputs(self, n: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
+        """Return the same of the outputs of an arm with `n` joints."""
+        m, unit = self.eye.m, self.eye.unit
+        names = ", ".join(self.eye.features)
+        return (
+            (FEATURE, (m,), unit, f"Measured features: {names}."),
+            (SEEN, (m,), "1", "1 where a camera sees the feature, with nothing in between; 0 elsewhere."),
+            ("jacobian", (m, n), f"{unit}/rad", "Derivative of feature by joint_position; for evaluation."),
+        )
+
+
+def view_parameters(model: EyeModel) -> dict[str, FloatArray]:
+    """Return the values of the parameters of target and cameras by name, (..., size)."""
+
+    def flat(values: FloatArray, axes: int) -> FloatArray:
+        return np.reshape(values, (*values.shape[: values.ndim - axes], -1))
+
+    optics = model.optics
+    return {
+        "target": flat(model.target, 2),
+        "camera_position": flat(model.cameras[..., :3, 3], 2),
+        "camera_rpy": flat(rpy_from_rotation(model.cameras[..., :3, :3]), 2),
+        "focal_length": optics.focal,
+        "principal_point": flat(optics.centre, 2),
+        "distortion": optics.distortion,
+    }
 
 
 def arm_groups(n: int, view: View | None = None) -> tuple[Group, ...]:
@@ -233,14 +307,3 @@ def _sensing_parameters(model: SensedArm) -> dict[str, FloatArray]:
         "camera_position": pose[..., :3, 3],
         "camera_rpy": rpy_from_rotation(pose[..., :3, :3]),
     }
-
-
-def model_of(parameters: Mapping[str, FloatArray], joint_names: tuple[str, ...]) -> HandEyeModel:
-    """Return the arm and camera that the FMU's parameters describe."""
-    p = parameters
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation_from_rpy(p["camera_rpy"]), p["camera_position"]
-    translation = np.vstack([p["base_position"], np.column_stack([p["a"], p["y"], p["d"]])])
-    rpy = np.vstack([p["base_rpy"], np.column_stack([p["alpha"], p["pitch"], p["yaw"]])])
-    arm = SerialArm(joint_names, translation, rpy, p["joint_offset"], p["gear_ratio"], p["tool"])
-    return HandEyeModel(arm, pose)

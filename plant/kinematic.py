@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.bench.bench import Bench, build_bench
-from servobench.plant.bench.plant import PlantEntry, PlantSetup
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import PlantEntry, PlantSetup, World
 from servobench.plant.contract.checks import FloatArray, is_finite
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.lanes import take, where
@@ -26,8 +25,7 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
-from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm, hand_eye_spec
 
 
 @settings

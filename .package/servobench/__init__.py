@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from servobench.harness.batch.api import Results, compare, load, run
     from servobench.harness.check.controllers import check_controller
     from servobench.harness.check.plants import check_plant
-    from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup
-    from servobench.plant.bench.world import World
+    from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
     from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 __all__ = [
@@ -46,9 +45,8 @@ _HOMES = {
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.check.controllers": ("check_controller",),
     "servobench.harness.check.plants": ("check_plant",),
-    "servobench.plant.bench.plant": ("Plant", "PlantEntry", "PlantSetup"),
+    "servobench.plant.bench.plant": ("Plant", "PlantEntry", "PlantSetup", "World"),
     "servobench.plant.contract.signals": ("Command", "Observation", "PlantSpec", "Truth"),
-    "servobench.plant.bench.world": ("World",),
 }
 
 

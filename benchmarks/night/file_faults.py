@@ -44,8 +44,8 @@ from servobench.harness.batch.lock import is_unused
 from servobench.harness.batch.sweep import SweepPlan
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import Settings
-from servobench.harness.run import network_cache
-from servobench.harness.run.network_cache import NETWORKS, network_source
+from servobench.harness.run import knowledge as network_cache
+from servobench.harness.run.knowledge import NETWORKS, network_source
 from servobench.plant.contract import cache
 from servobench.plant.fmu.archive import extract_fmu
 

@@ -22,8 +22,8 @@ from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import LOCK, current_holder, locked
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.episode import RunResult
-from servobench.harness.studies.tuning.ledger import Ledger
+from servobench.harness.run.result import RunResult
+from servobench.harness.studies.tuning.scoring import Ledger
 from servobench.plant.contract import cache as entries
 
 SCORES = {"objective": 3, "robots": 2}

@@ -53,7 +53,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "statistics": (("harness/analysis/statistics.py",), ("harness/test_statistics.py",)),
     "results": (
         ("harness/batch/results.py", "harness/batch/columns.py"),
-        ("harness/test_results.py", "harness/test_ending.py", "harness/test_integrity.py"),
+        ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
     ),
     "folders": (
         ("harness/batch/parquet.py", "harness/batch/checksums.py", "harness/batch/integrity.py",

@@ -24,7 +24,7 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
 from servobench.fmus.compile import parse_platforms
-from servobench.fmus.information import read_information
+from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
 from servobench.harness.batch.compare import parse_seeds, refuse_tuning_seeds
 from servobench.harness.batch.sweep import parse_variation
@@ -41,8 +41,7 @@ from servobench.plant.fmu.description import read_description, read_exchange
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping
 from servobench.plant.robot.hand_eye import FEATURE
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
-from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.robot.mismatch_axes import AXES, PROFILES
+from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
 PART, OTHER_PART = "parts/00000000.runs.parquet", "parts/00000001.runs.parquet"
 RUN = RunRequest("kinematic", "rbfnn_mfac", "target", Mismatch(), 0)

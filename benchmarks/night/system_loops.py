@@ -17,7 +17,7 @@ from servobench.fmus.compile import this_platform
 from servobench.fmus.ssp import write_loop
 from servobench.harness.batch.api import run
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.loop_ssp import loop_products
+from servobench.harness.run.export import loop_products
 from servobench.harness.run.request import RunRequest
 
 PERIOD, ROWS = 0.05, 100

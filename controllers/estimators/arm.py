@@ -89,7 +89,7 @@ class ArmEstimator(Estimator[ArmState]):
         """
         if knowledge.nominal_jacobian is None:
             raise ValueError("nominal_jacobian must be known for the estimator 'arm'; this plant has none")
-        self._config, self._nominal, self._sight = config, knowledge.nominal_jacobian, knowledge.nominal_sight
+        self._config, self._nominal, self._cameras = config, knowledge.nominal_jacobian, knowledge.nominal_cameras
         self._n = knowledge.spec.n
 
     def start(self, jacobian: FloatArray) -> ArmState:
@@ -118,17 +118,17 @@ class ArmEstimator(Estimator[ArmState]):
         long = norm(state.joint_step) >= self._config.min_joint_step
         noise = np.asarray(self._config.feature_noise)[()] if motion.noise is None else motion.noise
         noise = np.broadcast_to(noise, np.shape(state.duration))[()]
-        return branch(long, self._correct, state._replace(updated=long), noise, motion.seen)
+        return branch(long, self._correct, state._replace(updated=long), noise, motion.interaction)
 
-    def _correct(self, state: ArmState, noise: FloatArray, seen: FloatArray | None) -> ArmState:
+    def _correct(self, state: ArmState, noise: FloatArray, interaction: FloatArray | None) -> ArmState:
         config, n, way = self._config, self._n, state.joint_step
         g, offset = state.x[..., :n], state.x[..., n:]
         poses = state.begin[..., None, :] + SHARES[:, None] * way[..., None, :]
         at = g[..., None, :] * poses + offset[..., None, :]
         J = (
             self._nominal(at)
-            if seen is None or self._sight is None
-            else seen[..., None, :, :] @ self._sight.motions(at)
+            if interaction is None or self._cameras is None
+            else interaction[..., None, :, :] @ self._cameras.motions(at)
         )
         moved = np.matvec(J[..., 1:-1, :, :], (g * way)[..., None, :])
         predicted = np.vecmat(HALVES, moved)
@@ -152,10 +152,10 @@ class ArmEstimator(Estimator[ArmState]):
 
     def motions(self, state: ArmState, joint_position: FloatArray) -> FloatArray | None:
         """Return how the points that cameras see move, (..., 3p, n) m/rad; None where that is not known."""
-        if self._sight is None:
+        if self._cameras is None:
             return None
         g, offset = state.x[..., : self._n], state.x[..., self._n :]
-        return np.asarray(self._sight.motions(g * joint_position + offset) * g[..., None, :])
+        return np.asarray(self._cameras.motions(g * joint_position + offset) * g[..., None, :])
 
     def diagnostics(self, state: ArmState) -> Diagnostics:
         """Return whether the last motion ended a way, and the largest gear error (1) and offset (rad)."""

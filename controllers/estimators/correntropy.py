@@ -1,9 +1,9 @@
-"""What the correntropy filters share: a random walk of J, seen through motions whose noise has outliers.
+"""Maximum correntropy Kalman filters for the Jacobian (MCKF, GMCKF, IMCC-KF, RMCKF), for noise with outliers.
 
-All of them are the Kalman filter of `controllers.estimators.kalman` with weights in (0, 1] on the measurement, and some
-on the prior: a large normalised error e gets a small weight, such as G(e) = exp(−e²/(2b²)) with the bandwidth b. With
-P₀ = p₀ I, Q = q I and R = r I each row of J, one a feature, has a covariance of its own, (n, n), so that the matrices
-of size mn of the papers fall apart into rows, exactly; only the weights may join them:
+Each is the Kalman filter of `controllers.estimators.kalman` with weights in (0, 1] on the measurement, and some also
+weight the prior: a large normalised error e gets a small weight, such as G(e) = exp(−e²/(2b²)) with the bandwidth b.
+With P₀ = p₀ I, Q = q I and R = r I each row of J, one per feature, has a covariance of its own, (n, n). The matrices of
+size mn in the papers thus split exactly into rows; only the weights may couple them:
 
     P ← P + q I,   B Bᵀ = P,   ν_i = Δy_i − J_i Δq,   h_i = B_iᵀ Δq
     K_i = w_i B_i X_i⁻¹ h_i / (w_i h_iᵀ X_i⁻¹ h_i + r)          w_i weight of Δy_i, X_i diagonal, weights of the prior
@@ -15,50 +15,40 @@ A weight of 0 leaves the row as it was. As b grows without limit all of them bec
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, final
+from functools import partial
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics
-from servobench.controllers.estimators.estimator import Estimator, Motion
-from servobench.controllers.estimators.kalman import KalmanState, cholesky_of
+from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.estimators.kalman import RandomWalk, RandomWalkEstimator, cholesky_of
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, outer, transposed
+from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
-MAX_EXPONENT = 40.0  # a weight of exp(−40) is as good as none, and can be divided by
+MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is as good as none, and can be divided by
+MIN_ERROR: Final = 0.1  # [1] in standard deviations
 
 
-class Update(Protocol):
-    """The formula of a filter.
-
-    Args:
-        J: Ĵ before the motion, (..., m, n), m/rad.
-        P: covariance of each row with the walk added, (..., m, n, n), (m/rad)².
-        joint_step: Δq, (..., n), rad.
-        feature_step: Δy, (..., m), m.
-        r: variance of each component of Δy, (...), m².
-
-    Returns:
-        Ĵ and P after the motion.
-    """
+class Correction(Protocol):
+    """The formula of one of these filters; see `kalman.Update`, with the walk already added to P (..., m, n, n)."""
 
     def __call__(  # noqa: D102 - of the class
         self, J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
     ) -> tuple[FloatArray, FloatArray]: ...
 
 
-class WalkSettings(Protocol):
-    """What the settings of every filter have; see `KalmanConfig`."""
+def _by_rows(config: RandomWalk, correction: Correction) -> RandomWalkEstimator:
+    """Return the estimator that adds the walk to the covariance of each row, and then corrects."""
 
-    @property
-    def initial_deviation(self) -> float: ...  # noqa: D102 - of the class
-    @property
-    def walk(self) -> float: ...  # noqa: D102
-    @property
-    def feature_noise(self) -> float: ...  # noqa: D102
-    @property
-    def min_joint_step(self) -> float: ...  # noqa: D102
+    def update(
+        J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        P = P + q[..., None, None, None] * np.eye(P.shape[-1])
+        return correction(J, P, joint_step, feature_step, r=np.broadcast_to(r, q.shape)[()])
+
+    return RandomWalkEstimator(config, update, "by_rows")
 
 
 def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
@@ -69,7 +59,7 @@ def gaussian_weight(error: FloatArray, bandwidth: float) -> FloatArray:
 def corrected(
     J: FloatArray, P: FloatArray, gain: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `Update`."""
+    """Return Ĵ and P after a motion with a gain K of each row, (..., m, n), P in Joseph form; see `Correction`."""
     dq = joint_step[..., None, :]
     A = P - outer(gain, np.matvec(P, dq))
     P = A + outer(r[..., None, None] * gain - np.matvec(A, dq), gain)
@@ -110,7 +100,7 @@ def fixed_point_update(
     tolerance times its norm; it begins at J⁻.
 
     Args:
-        J: J⁻; see `Update`, as for the others up to `r`.
+        J: J⁻; see `Correction`, as for the others up to `r`.
         P: its covariance.
         joint_step: Δq.
         feature_step: Δy.
@@ -145,41 +135,144 @@ def fixed_point_update(
     return corrected(J, P, at.gain, joint_step, feature_step, r=r)
 
 
-@final
-class CorrentropyEstimator(Estimator[KalmanState]):
-    """The random walk of J, corrected by the formula of a filter; motions below a minimum ‖Δq‖ are left out."""
+@settings
+class MckfConfig(RandomWalk):
+    """Settings of the maximum correntropy Kalman filter (`mckf_estimator`)."""
 
-    def __init__(self, config: WalkSettings, update: Update) -> None:
-        """Take the settings of the walk and the formula."""
-        self._config, self._formula = config, update
-        self._walk = config.walk**2
-        self._noise: FloatArray = np.asarray(config.feature_noise)[()]
+    bandwidth: Positive = 3.0
+    """[1] b, error in standard deviations at which the weight has sunk to exp(−1/2)."""
+    tolerance: Positive = 1e-6
+    """[1] the iteration ends when J changes by less than this share of its norm."""
+    iterations: Count = 20
+    """[1] the most of them in an update."""
 
-    def start(self, jacobian: FloatArray) -> KalmanState:
-        """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance of each row."""
-        *lead, m, n = jacobian.shape
-        P = np.broadcast_to(np.eye(n) * self._config.initial_deviation**2, (*lead, m, n, n))
-        return KalmanState(jacobian, P, np.full(lead, False))
 
-    def update(self, state: KalmanState, motion: Motion) -> KalmanState:
-        """Correct by one motion.
+def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+    """Return the maximum correntropy Kalman filter (MCKF); nothing about the robot is needed.
 
-        Raises:
-            FilterDiverged: a covariance is no longer positive definite.
-        """
-        large = norm(motion.joint_step) >= self._config.min_joint_step
-        return branch(large, self._correct, state._replace(updated=large), motion)
+    Chen, Liu, Zhao and Príncipe, "Maximum correntropy Kalman filter", Automatica 76 (2017) 70-77: the sum of the
+    kernels G of all errors, of the prior and of the measurement, is maximised by a fixed-point iteration,
 
-    def _correct(self, state: KalmanState, motion: Motion) -> KalmanState:
-        noise: FloatArray = self._noise if motion.noise is None else motion.noise
-        q, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
-        P = state.P + q[..., None, None, None] * np.eye(state.P.shape[-1])
-        r = np.broadcast_to(r, q.shape)[()]
-        J, P = self._formula(state.J, P, motion.joint_step, motion.feature_step, r=r)
-        cholesky_of(P)
-        return state._replace(J=J, P=P)
+        e = [B_P⁻¹ (x⁻ − x), B_R⁻¹ (Δy − H x)],   B_P B_Pᵀ = P⁻,  B_R B_Rᵀ = R,   C = diag(G(e))
+        P̃ = B_P C_x⁻¹ B_Pᵀ,   R̃ = B_R C_y⁻¹ B_Rᵀ,   K = P̃ Hᵀ (H P̃ Hᵀ + R̃)⁻¹,   x ← x⁻ + K (Δy − H x⁻)
 
-    def diagnostics(self, state: KalmanState) -> Diagnostics:
-        """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
-        variance = state.P.trace(axis1=-2, axis2=-1).mean(axis=-1) / state.P.shape[-1]
-        return {"estimator_updated": state.updated, "jacobian_deviation": np.sqrt(variance)}
+    until x stays. Then P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ. Ren and Li applied it to visual servoing.
+    """
+    weight = partial(gaussian_weight, bandwidth=config.bandwidth)
+    fixed_point = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
+    return _by_rows(config, fixed_point)
+
+
+@settings
+class GmckfConfig(RandomWalk):
+    """Settings of the generalised maximum correntropy Kalman filter."""
+
+    shape: Positive = 1.5
+    """[1] α, exponent of the kernel: 2 is Gaussian, 1 is Laplacian."""
+    bandwidth: Positive = 4.0
+    """[1] β, error in standard deviations at which the kernel has sunk to exp(−1)."""
+    tolerance: Positive = 1e-6
+    """[1] the iteration ends when J changes by less than this share of its norm."""
+    iterations: Count = 20
+    """[1] the most of them in an update."""
+
+
+def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> FloatArray:
+    """Return |e|^(α−2) exp(−|e/β|^α), above 0, for normalised errors of any shape."""
+    size = np.maximum(np.abs(error), MIN_ERROR)
+    return np.asarray(size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)))
+
+
+def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+    """Return the generalised maximum correntropy Kalman filter (GMCKF); nothing about the robot is needed.
+
+    Mo, Wang, Yang, Chen, Li and Jiang, "Generalized Maximum Correntropy Kalman Filter for Target Tracking in TianGong-2
+    Space Laboratory", Space: Science & Technology 2022, 9796015: the filter of `mckf_estimator` with the generalised
+    Gaussian density exp(−|e/β|^α) as kernel, whose gradient gives the weights
+
+        w(e) = |e|^(α−2) exp(−|e/β|^α)
+
+    Common factors of all weights cancel in the gain, so α = 2 with β = √2 b is the MCKF of bandwidth b. For α ≠ 2 the
+    factor |e|^(α−2) has no finite or no positive value at e = 0, where the iteration begins: |e| is taken as at least
+    `MIN_ERROR`. The paper's choice of α by an estimate of the kurtosis is left out; α is a setting.
+    """
+    weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
+    fixed_point = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
+    return _by_rows(config, fixed_point)
+
+
+@settings
+class ImcckfConfig(RandomWalk):
+    """Settings of the improved maximum correntropy criterion Kalman filter."""
+
+    bandwidth: Positive = 5.0
+    """[1] b, norm of the innovation in standard deviations at which the weight has sunk to exp(−1/2)."""
+
+
+def imcckf_update(
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, r: FloatArray, bandwidth: float
+) -> tuple[FloatArray, FloatArray]:
+    """Correct by one motion; see `Correction`."""
+    innovation = feature_step - np.matvec(J, joint_step)
+    weight = gaussian_weight(norm(innovation) / np.sqrt(r), bandwidth)[..., None]
+    PH = np.matvec(P, joint_step[..., None, :])
+    gain = weight[..., None] * PH / (weight * np.vecdot(PH, joint_step[..., None, :]) + r[..., None])[..., None]
+    P = P - outer(gain, PH)
+    return J + innovation[..., None] * gain, (P + transposed(P)) / 2
+
+
+def imcckf_estimator(config: ImcckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+    """Return the improved maximum correntropy criterion Kalman filter; nothing about the robot is needed.
+
+    Kulikova, "Square-root algorithms for maximum correntropy estimation of linear discrete-time systems in presence of
+    non-Gaussian noise", Systems & Control Letters 108 (2017) 8-15, algorithm 1: one weight for the whole measurement,
+    and no iteration,
+
+        λ = G(‖Δy − H x⁻‖_R⁻¹),   K = λ P⁻ Hᵀ (λ H P⁻ Hᵀ + R)⁻¹,   x = x⁻ + K (Δy − H x⁻),   P = (I − K H) P⁻
+    """
+    return _by_rows(config, partial(imcckf_update, bandwidth=config.bandwidth))
+
+
+@settings
+class RmckfConfig(RandomWalk):
+    """Settings of the regularised maximum correntropy criterion Kalman filter."""
+
+    bandwidth: Positive = 3.0
+    """[1] b, innovation in standard deviations at which the weight has sunk to exp(−1/2)."""
+    regularisation: Positive = 1e-6
+    """[1] ε, added to every weight; the authors'."""
+
+
+def rmckf_update(
+    J: FloatArray,
+    P: FloatArray,
+    joint_step: FloatArray,
+    feature_step: FloatArray,
+    *,
+    r: FloatArray,
+    bandwidth: float,
+    regularisation: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Correct by one motion; see `Correction`."""
+    innovation = feature_step - np.matvec(J, joint_step)
+    weight = gaussian_weight(innovation / np.sqrt(r)[..., None], bandwidth) + regularisation
+    PH = np.matvec(P, joint_step[..., None, :])
+    gain = weight[..., None] * PH / (weight * np.vecdot(PH, joint_step[..., None, :]) + r[..., None])[..., None]
+    return corrected(J, P, gain, joint_step, feature_step, r=r)
+
+
+def rmckf_estimator(config: RmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+    """Return the regularised maximum correntropy criterion Kalman filter; nothing about the robot is needed.
+
+    Leite, Araújo and Martins, "Regularized Maximum Correntropy Criterion Kalman Filter for Uncalibrated Visual Servoing
+    in the Presence of Non-Gaussian Feature Tracking Noise", Sensors 23 (2023) 8518; their public code calls it GMCKF.
+    Each feature has a weight of its own, of its innovation, and there is no iteration:
+
+        C = diag(G(B_R⁻¹ (Δy − H x⁻))),   R̃ = B_R (C + ε I)⁻¹ B_Rᵀ,   K = P⁻ Hᵀ (H P⁻ Hᵀ + R̃)⁻¹
+        x = x⁻ + K (Δy − H x⁻),   P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ
+
+    Departures: their law multiplies each feature's error by the same weight, which no estimator can do here, and their
+    annealing of the bandwidth, off in their settings, is left out.
+    """
+    update = partial(rmckf_update, bandwidth=config.bandwidth, regularisation=config.regularisation)
+    return _by_rows(config, update)

@@ -28,8 +28,8 @@ class Motion:
         error: e = y_ref − y at the end of the motion, (..., m), m.
         duration: (...), s.
         noise: (...), standard deviation of the feature per axis, m; None where it is not identified.
-        seen: B, (..., m, 3p), the change of the features with the places of p points by what is known of the cameras;
-            None where the features' own Jacobian is all that is known.
+        interaction: B, (..., m, 3p), the change of the features with the places of p points by the camera model; None
+            without a camera model.
     """
 
     joint_position: FloatArray
@@ -38,7 +38,7 @@ class Motion:
     error: FloatArray
     duration: FloatArray
     noise: FloatArray | None = None
-    seen: FloatArray | None = None
+    interaction: FloatArray | None = None
 
 
 class Estimator(ABC, Generic[State]):
@@ -75,7 +75,7 @@ class Estimator(ABC, Generic[State]):
     def motions(self, state: State, joint_position: FloatArray) -> FloatArray | None:
         """Return how points move with the joints, (..., 3p, n) m/rad, where it estimates the arm itself; else None.
 
-        They are seen through `Motion.seen`.
+        `Motion.interaction` maps them to features.
         """
         return None
 

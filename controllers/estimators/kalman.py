@@ -1,4 +1,4 @@
-"""Kalman filter for the Jacobian: a random walk that is seen through every motion.
+"""Kalman filter for the Jacobian: a random walk that every motion measures; and the estimator of all such filters.
 
 State x = vec(J) by rows, (mn,), so that entry i·n + j is ∂y_i/∂q_j:
 
@@ -11,8 +11,7 @@ With P₀ = p₀ I, Q = q I and R = r I it splits into m filters of n states, on
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple, final
+from typing import Literal, NamedTuple, Protocol, TypeAlias, final
 
 import numpy as np
 
@@ -26,17 +25,23 @@ from servobench.plant.contract.signals import BoolArray
 
 
 @settings
-class KalmanConfig:
-    """Settings of the Kalman filter."""
+class RandomWalk:
+    """Settings of every filter in which the Jacobian is a random walk."""
 
     initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""
+    """[m/rad] of an entry of Ĵ₀; tuned for the Kalman filter: with a larger one latency spoils the first motions."""
     walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; tuned on mismatched kinematic plants."""
+    """[m/rad/√s] deviation of an entry after a second of motion; tuned for the Kalman filter."""
     feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
+    """[m] standard deviation σ of the feature per axis, unless it is identified."""
     min_joint_step: NonNegative = 0.002
     """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
+
+
+@settings
+class KalmanConfig(RandomWalk):
+    """Settings of the Kalman filter."""
+
     form: Literal["split", "full"] = "split"
     """Two computations of the same numbers; "full" is the readable reference."""
 
@@ -117,25 +122,57 @@ def split_update(
 
 
 def full_update(
-    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, Q: FloatArray, R: FloatArray
+    J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Do the same by `kalman_update`, for P, (..., mn, mn), of all entries.
-
-    Raises:
-        FilterDiverged: the covariance is no longer positive definite.
-    """
+    """Do the same by `kalman_update`, for P, (..., mn, mn), of all entries."""
     H = measurement_matrix(joint_step, J.shape[-2])
-    x, P = kalman_update(J.reshape(*J.shape[:-2], -1), P, H, feature_step, Q=Q, R=R)
-    cholesky_of(P)
+    x, P = kalman_update(J.reshape(*J.shape[:-2], -1), P, H, feature_step, **full_covariances(J, q, r))
     return x.reshape(J.shape), P
 
 
-class KalmanState(NamedTuple):
-    """The state of the filter.
+def full_covariances(J: FloatArray, q: FloatArray, r: FloatArray) -> dict[str, FloatArray]:
+    """Return Q = q I, (..., mn, mn), and R = r I, (..., m, m), by name, for J (..., m, n)."""
+    m, n = J.shape[-2:]
+    return {"Q": q[..., None, None] * np.eye(m * n), "R": r[..., None, None] * np.eye(m)}
+
+
+class Update(Protocol):
+    """The formula by which a filter corrects the Jacobian and its covariance.
+
+    Args:
+        J: Ĵ before the motion, (..., m, n), m/rad.
+        P: its covariance, (m/rad)²; its shape depends on the filter.
+        joint_step: Δq, (..., n), rad.
+        feature_step: Δy, (..., m), m.
+        q: variance of the walk during the motion, (...), (m/rad)².
+        r: variance of each component of Δy, (...), m².
+
+    Returns:
+        Ĵ and P after the motion.
+    """
+
+    def __call__(  # noqa: D102 - of the class
+        self,
+        J: FloatArray,
+        P: FloatArray,
+        joint_step: FloatArray,
+        feature_step: FloatArray,
+        *,
+        q: FloatArray,
+        r: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]: ...
+
+
+Covariance: TypeAlias = Literal["shared", "by_rows", "full"]
+"""One P, (n, n), that all rows of J share; one of each row, (m, n, n); or one of all entries, (mn, mn)."""
+
+
+class WalkState(NamedTuple):
+    """The state of a filter.
 
     Attributes:
         J: Ĵ, (..., m, n), m/rad.
-        P: covariance, (m/rad)², of every row, (..., n, n), or of all entries, (..., mn, mn).
+        P: covariance, (m/rad)²; see `Covariance`.
         updated: (...), whether the last motion was used.
     """
 
@@ -145,31 +182,27 @@ class KalmanState(NamedTuple):
 
 
 @final
-class KalmanEstimator(Estimator[KalmanState]):
-    """x ← x + K (Δy − H x), K = P Hᵀ (H P Hᵀ + R)⁻¹, P in Joseph form; motions below a minimum ‖Δq‖ are left out.
+class RandomWalkEstimator(Estimator[WalkState]):
+    """The random walk of J, corrected by the formula of a filter; motions below a minimum ‖Δq‖ are left out.
 
     J changes only where the arm moves, so a motion that is left out adds no process noise either.
     """
 
-    def __init__(
-        self,
-        config: KalmanConfig,
-        knowledge: RobotKnowledge | None = None,
-        update: Callable[..., tuple[FloatArray, FloatArray]] = full_update,
-    ) -> None:
-        """Take the settings and what the form "full" calls, as `full_update`; nothing about the robot is needed."""
-        self._config, self._full_update = config, update
+    def __init__(self, config: RandomWalk, update: Update, covariance: Covariance) -> None:
+        """Take the settings of the walk, the formula, and the form of its covariance."""
+        self._config, self._formula, self._covariance = config, update, covariance
         self._walk = config.walk**2
         self._noise: FloatArray = np.asarray(config.feature_noise)[()]
 
-    def start(self, jacobian: FloatArray) -> KalmanState:
+    def start(self, jacobian: FloatArray) -> WalkState:
         """Start from Ĵ₀, (..., m, n), m/rad, with the configured covariance."""
         *lead, m, n = jacobian.shape
-        size = n if self._config.form == "split" else m * n
-        P = np.broadcast_to(np.eye(size) * self._config.initial_deviation**2, (*lead, size, size))
-        return KalmanState(jacobian, P, np.full(lead, False))
+        shapes: dict[Covariance, tuple[int, ...]] = {"shared": (n, n), "by_rows": (m, n, n), "full": (m * n, m * n)}
+        shape = shapes[self._covariance]
+        P = np.broadcast_to(np.eye(shape[-1]) * self._config.initial_deviation**2, (*lead, *shape))
+        return WalkState(jacobian, P, np.full(lead, False))
 
-    def update(self, state: KalmanState, motion: Motion) -> KalmanState:
+    def update(self, state: WalkState, motion: Motion) -> WalkState:
         """Correct by one motion.
 
         Raises:
@@ -178,19 +211,26 @@ class KalmanEstimator(Estimator[KalmanState]):
         large = norm(motion.joint_step) >= self._config.min_joint_step
         return branch(large, self._correct, state._replace(updated=large), motion)
 
-    def _correct(self, state: KalmanState, motion: Motion) -> KalmanState:
-        dq, dy = motion.joint_step, motion.feature_step
+    def _correct(self, state: WalkState, motion: Motion) -> WalkState:
         noise: FloatArray = self._noise if motion.noise is None else motion.noise
         q, r = self._walk * np.asarray(motion.duration), 2.0 * noise * noise
-        if self._config.form == "split":
-            J, P = split_update(state.J, state.P, dq, dy, q=q, r=r)
-            cholesky_of(P)
-        else:
-            Q, R = (x[..., None, None] * np.eye(size) for x, size in ((q, state.P.shape[-1]), (r, state.J.shape[-2])))
-            J, P = self._full_update(state.J, state.P, dq, dy, Q=Q, R=R)
+        J, P = self._formula(state.J, state.P, motion.joint_step, motion.feature_step, q=q, r=r)
+        cholesky_of(P)
         return state._replace(J=J, P=P)
 
-    def diagnostics(self, state: KalmanState) -> Diagnostics:
+    def diagnostics(self, state: WalkState) -> Diagnostics:
         """Return whether the last motion was used and the mean deviation of an entry of the Jacobian, m/rad."""
-        deviation = np.sqrt(state.P.trace(axis1=-2, axis2=-1) / state.P.shape[-1])
-        return {"estimator_updated": state.updated, "jacobian_deviation": deviation}
+        trace: FloatArray = state.P.trace(axis1=-2, axis2=-1)
+        if self._covariance == "by_rows":
+            trace = trace.mean(axis=-1)
+        return {"estimator_updated": state.updated, "jacobian_deviation": np.sqrt(trace / state.P.shape[-1])}
+
+
+def kalman_estimator(config: KalmanConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
+    """Return the Kalman filter: x ← x + K (Δy − H x), K = P Hᵀ (H P Hᵀ + R)⁻¹, P in Joseph form.
+
+    Nothing about the robot is needed.
+    """
+    if config.form == "split":
+        return RandomWalkEstimator(config, split_update, "shared")
+    return RandomWalkEstimator(config, full_update, "full")

@@ -22,24 +22,22 @@ from typing import Literal
 import numpy as np
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator, cholesky_of
+from servobench.controllers.estimators.kalman import (
+    RandomWalk,
+    RandomWalkEstimator,
+    cholesky_of,
+    full_covariances,
+    split_update,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import transposed
 from servobench.plant.contract.settings import NonNegative, Positive, settings
 
 
 @settings
-class UkfConfig:
+class UkfConfig(RandomWalk):
     """Settings of the unscented Kalman filter."""
 
-    initial_deviation: Positive = 0.05
-    """[m/rad] of an entry of Ĵ₀; tuned: with a larger one latency spoils the first motions."""
-    walk: NonNegative = 0.089443
-    """[m/rad/√s] deviation of an entry after a second of motion; tuned on mismatched kinematic plants."""
-    feature_noise: Positive = 0.001
-    """[m] standard deviation σ of the feature per axis, unless it is identified; R = 2σ² I."""
-    min_joint_step: NonNegative = 0.002
-    """[rad] smaller motions are left out: they hold little but 1 mm of noise."""
     alpha: Positive = 1.0
     """[1] spread of the sigma points; 1 keeps all weights from being negative."""
     beta: NonNegative = 2.0
@@ -119,17 +117,19 @@ def unscented_update(
     return J + np.matvec(K, feature_step - z).reshape(J.shape), (P + transposed(P)) / 2
 
 
-def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> KalmanEstimator:
+def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the random-walk estimator whose gain is that of the unscented transform.
 
     The paper does not say how P₀, Q and R are chosen, nor what happens at rest; R is kept honest here (2σ² of the
     feature's noise), and motions below a minimum ‖Δq‖ are left out.
     """
+    if config.form == "split":
+        return RandomWalkEstimator(config, split_update, "shared")
 
-    def update(J: FloatArray, *arguments: FloatArray, **noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-        weights = sigma_weights(J.shape[-2] * J.shape[-1], config.alpha, config.beta, config.kappa)
-        return unscented_update(J, *arguments, **noise, weights=weights)
+    def update(
+        J: FloatArray, P: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, q: FloatArray, r: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        weights = sigma_weights(P.shape[-1], config.alpha, config.beta, config.kappa)
+        return unscented_update(J, P, joint_step, feature_step, **full_covariances(J, q, r), weights=weights)
 
-    walk = config.initial_deviation, config.walk, config.feature_noise, config.min_joint_step
-    form: Literal["split", "full"] = "split" if config.form == "split" else "full"
-    return KalmanEstimator(KalmanConfig(*walk, form), knowledge, update)
+    return RandomWalkEstimator(config, update, "full")

@@ -7,15 +7,26 @@ Laws are pure, as estimators are: the state goes in and comes out, a tree of arr
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import ClassVar, Generic, Literal, TypeAlias, TypeVar
 
 from servobench.controllers.controller import Diagnostics
-from servobench.controllers.estimate import Estimate
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray, Observation
 
 Stage: TypeAlias = Literal["predict", "preview", "limit"]
 State = TypeVar("State")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Estimate:
+    """What the law gets in each period.
+
+    Attributes:
+        jacobian: Ĵ, (..., m, n), m/rad, at the present joint position.
+    """
+
+    jacobian: FloatArray
 
 
 class Law(ABC, Generic[State]):

@@ -14,8 +14,7 @@ from typing import NamedTuple, final
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law
+from servobench.controllers.laws.law import Estimate, Law
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import plus_diagonal, transposed
 from servobench.plant.contract.settings import Positive, PositiveOrInfinite, settings

@@ -17,10 +17,9 @@ from typing import NamedTuple, final
 
 import numpy as np
 
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law
-from servobench.controllers.stages.inverses import damped_inverse
+from servobench.controllers.laws.law import Estimate, Law
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm
 from servobench.plant.contract.settings import NonNegative, Positive, settings

@@ -8,15 +8,13 @@ from typing import Annotated, Literal, NamedTuple, final
 import numpy as np
 from annotated_types import Lt
 
+from servobench.controllers.algebra import project_to_row_space
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law, Stage
-from servobench.controllers.laws.preview import check_preview, sampled
+from servobench.controllers.laws.law import Estimate, Law, Stage
 from servobench.controllers.laws.roll_out import RollOut, descent_direction, roll_out, sum_of_squares, update_step
 from servobench.controllers.networks.file import TrainedNetworks
 from servobench.controllers.networks.rbf import controller_output
-from servobench.controllers.periods import in_periods
-from servobench.controllers.stages.inverses import project_to_row_space
+from servobench.controllers.periods import check_preview, in_periods, sampled
 from servobench.controllers.stages.joint_response import pushed
 from servobench.controllers.stages.limit import largest_excess
 from servobench.plant.contract.checks import FloatArray

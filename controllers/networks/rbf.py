@@ -1,4 +1,4 @@
-"""The two radial-basis networks of the proposed method, as pure functions and frozen records.
+"""The two radial-basis-function networks of the proposed method, as pure functions and frozen records.
 
 Jacobian network (eqs. 28–30, 40, 41), one network for each joint column i:
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal, final, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -289,3 +289,34 @@ def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, .
         object.__setattr__(network, name, array)
     if not (network.widths > 0.0).all():
         raise ValueError(f"widths must be positive, the smallest is {network.widths.min()}")
+
+
+@final
+class LatestFeatures:
+    """θ and Ĵ at the joint positions that were asked for last.
+
+    An estimator asks for the same ones in `estimate` and in the next `update`. This saves time only: it is a memo of
+    pure functions, and rows of weights never change.
+    """
+
+    def __init__(self, network: JacobianNetwork) -> None:
+        """Take the network; nothing is known yet."""
+        self._network = network
+        self._position, self._shape = b"", (-1,)
+        self._theta, self._rows, self._jacobian = (np.empty(0),) * 3
+
+    def at(self, q: FloatArray) -> FloatArray:
+        """Return θ, (..., U, L), at q, (..., n), rad."""
+        position = q.tobytes()
+        if position != self._position or q.shape != self._shape:
+            self._theta = self._network.features(q)
+            self._position, self._shape, self._rows = position, q.shape, np.empty(0)
+        return self._theta
+
+    def jacobian(self, rows: FloatArray, q: FloatArray) -> FloatArray:
+        """Return Ĵ, (..., m, n), m/rad, at q, (..., n), rad, with weights by rows, (..., m, n, L)."""
+        theta = self.at(q)
+        if rows is not self._rows:
+            self._jacobian = self._network.output(rows, theta[..., None, :, :])[..., 0, :, :]
+            self._rows = rows
+        return self._jacobian

@@ -1,7 +1,7 @@
 """The contract of a map: what the pair stage learns about a camera, for each candidate delay.
 
 Two forms exist: a matrix between features (`feature_map`), and the turn of each camera before its interaction matrix
-(`sight_map`). Both hold the map, the noise e of the last frame and their covariance, one of them a candidate delay.
+(`point_map`). Both hold the map, the noise e of the last frame and their covariance, one of them a candidate delay.
 """
 
 from __future__ import annotations

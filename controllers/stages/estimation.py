@@ -6,7 +6,7 @@
     map        Ĵ(q) = M̄ E(q)                   E learns from (Δq, RᵀΔy), where E brings a model itself
 
 Where it is known how cameras see points, with L(y, z) of the features as they are seen and G(q) the nominal motions of
-the points (`sight_map`), a map stands between them:
+the points (`point_map`), a map stands between them:
 
     map        Ĵ(q) = L M̄ G(q) + E             E learns from (Δq, Δy − L M̄ x)
     map        Ĵ(q) = L M̄ G(q) + E(q) − E₀(q)  E learns from (Δq, Δy − L M̄ x + E₀ Δq), where E brings a model E₀
@@ -25,24 +25,24 @@ from typing import Any, NamedTuple, final
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.camera_model import block_diagonal, feature_jacobian, turned_interaction
 from servobench.controllers.controller import Delays, Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import MOTION_TIME, Estimator, Motion
 from servobench.controllers.periods import whole_periods
-from servobench.controllers.sight import of_points, seen_through, through
 from servobench.controllers.stages.pairing import NO_DEPTH, Paired, Pairing, PairState
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, transposed
 from servobench.plant.contract.signals import BoolArray, Observation
 
 
-class Seen(NamedTuple):
+class LastFrame(NamedTuple):
     """What was seen when the last motion ended.
 
     Attributes:
         time: (...) [s]; NaN before there is a valid feature.
         joint_position: (..., n) [rad].
         feature: (..., m).
-        valid: (..., m), which features were seen.
+        valid: (..., m), which features were last.
         jacobian: Ĵ, (..., m, n), which predicts the next motion; NaN before.
     """
 
@@ -72,12 +72,12 @@ class EstimationState(NamedTuple):
 
     Attributes:
         learned: from motions.
-        seen: when the last motion ended.
+        last: the frame at which the last motion ended.
         jacobian: Ĵ, (..., m, n), of this period; NaN before.
     """
 
     learned: Learned
-    seen: Seen
+    last: LastFrame
     jacobian: FloatArray
 
 
@@ -87,7 +87,7 @@ class Estimation:
 
     Attributes:
         estimator: E.
-        pairing: the pair stage; None where no aid looks back.
+        pairing: the pair stage; None where no aid needs past joint positions.
     """
 
     def __init__(self, estimator: Estimator[Any], knowledge: RobotKnowledge, aids: AidsConfig, delays: Delays) -> None:
@@ -101,10 +101,10 @@ class Estimation:
         self.estimator, self._model, self._spec = estimator, aids.model, knowledge.spec
         self._adds = aids.model != "own" and not estimator.brings_model
         self._shortest = (max(1, whole_periods(MOTION_TIME, knowledge.spec.period)) - 0.5) * knowledge.spec.period
-        self._sight = knowledge.nominal_sight if aids.model == "map" else None
-        self.pairing = Pairing(aids, knowledge.spec, delays.latency, self._sight) if aids.looks_back else None
+        self._cameras = knowledge.nominal_cameras if aids.model == "map" else None
+        self.pairing = Pairing(aids, knowledge.spec, delays.latency, self._cameras) if aids.needs_past else None
         shape = knowledge.spec.m, knowledge.spec.n
-        self._first = estimator.start(np.zeros(shape)) if self._sight and estimator.brings_model else None
+        self._first = estimator.start(np.zeros(shape)) if self._cameras and estimator.brings_model else None
         at_rest = np.zeros(knowledge.spec.n)
         self._estimates_arm = self._first is not None and estimator.motions(self._first, at_rest) is not None
         asked = aids.model != "own" or (self.pairing is not None and self.pairing.learns)
@@ -117,15 +117,15 @@ class Estimation:
         pair, own = None, jacobian
         if self.pairing is not None:
             given = self._given_base(q, jacobian)
-            depth, motions = self._look(q)
-            pair = self.pairing.start(observation, given if self._sight is None else motions, depth)
+            depth, motions = self._depths_and_motions(q)
+            pair = self.pairing.start(observation, given if self._cameras is None else motions, depth)
             own = jacobian - given if self._adds else jacobian
         estimator = self.estimator.start(own)
-        if pair is not None and self.estimator.brings_model and self._sight is None:
+        if pair is not None and self.estimator.brings_model and self._cameras is None:
             pair = pair._replace(base=self.estimator.jacobian(estimator, q))
         unknown, never = np.full(jacobian.shape, np.nan), np.full(lead, np.nan)[()]
-        seen = Seen(never, q, observation.feature, observation.valid, unknown)
-        return EstimationState(Learned(estimator, pair, never), seen, unknown)
+        last = LastFrame(never, q, observation.feature, observation.valid, unknown)
+        return EstimationState(Learned(estimator, pair, never), last, unknown)
 
     def update(self, state: EstimationState, observation: Observation, desired: FloatArray) -> EstimationState:
         """Return the state at an observation; without a valid feature nothing is learned.
@@ -135,21 +135,21 @@ class Estimation:
             observation: of this period.
             desired: y_ref, (..., m), of this period.
         """
-        learned, seen, q = state.learned, state.seen, observation.joint_position
-        pairing, (depth, motions) = self.pairing, self._look(q)
+        learned, last, q = state.learned, state.last, observation.joint_position
+        pairing, (depth, motions) = self.pairing, self._depths_and_motions(q)
         if pairing is not None:
             learned = learned._replace(pair=pairing.advance(learned.pair, q, depth))
-        duration, both = observation.time - seen.time, observation.valid & seen.valid
+        duration, both = observation.time - last.time, observation.valid & last.valid
         due = np.logical_or.reduce(observation.valid, axis=-1) & ~(duration < self._shortest)  # also the first one
         known = due & np.logical_or.reduce(both, axis=-1) & (duration > 0.0) & (duration < self._longest)
-        learned = branch(known, self._learn, learned, seen, observation, desired, both)
+        learned = branch(known, self._learn, learned, last, observation, desired, both)
         if pairing is not None:
             pair = branch(due & np.logical_not(known), pairing.interrupt, learned.pair)
             learned = learned._replace(pair=pair)
         jacobian = own = self.estimator.jacobian(learned.estimator, q)
-        if pairing is not None and self._sight is not None:
-            base, jacobian = self._seen_jacobian(
-                learned, self._sight.rates(observation.feature, depth), motions, own, q
+        if pairing is not None and self._cameras is not None:
+            base, jacobian = self._point_jacobian(
+                learned, self._cameras.rates(observation.feature, depth), motions, own, q
             )
             learned = learned._replace(pair=learned.pair._replace(base=base))
         elif pairing is not None:
@@ -160,8 +160,8 @@ class Estimation:
                 jacobian = jacobian + own if self._adds else jacobian
         lead = observation.feature.shape[:-1]
         time: Any = np.full(lead, observation.time) if lead else np.float64(observation.time)
-        seen = branch(due, _newer, seen, Seen(time, q, observation.feature, observation.valid, jacobian))
-        return EstimationState(learned, seen, jacobian)
+        last = branch(due, _newest, last, LastFrame(time, q, observation.feature, observation.valid, jacobian))
+        return EstimationState(learned, last, jacobian)
 
     def into_model_frame(self, state: EstimationState, observation: Observation) -> FloatArray:
         """Return T, (..., m, m), that turns features as they are seen into those of the nominal cameras.
@@ -170,26 +170,27 @@ class Estimation:
         sight.
         """
         rotation: FloatArray = state.learned.pair.rotation
-        if self._sight is None:
+        if self._cameras is None:
             return rotation.mT
-        depth = self._sight.depths_and_motions(observation.joint_position)[0]
-        rates = self._sight.rates(observation.feature, depth)
-        return np.asarray(seen_through(rates, transposed(rotation)) @ of_points(np.asarray(np.linalg.pinv(rates))))
+        depth = self._cameras.depths_and_motions(observation.joint_position)[0]
+        rates = self._cameras.rates(observation.feature, depth)
+        inverse = block_diagonal(np.asarray(np.linalg.pinv(rates)))
+        return np.asarray(turned_interaction(rates, transposed(rotation)) @ inverse)
 
-    def _look(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return depths (..., c p) [m] and G (..., 3 c p, n) [m/rad]; nothing without a sight."""
-        return (NO_DEPTH, NO_DEPTH) if self._sight is None else self._sight.depths_and_motions(joint_position)
+    def _depths_and_motions(self, joint_position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return depths (..., c p) [m] and G (..., 3 c p, n) [m/rad]; empty without a camera model."""
+        return (NO_DEPTH, NO_DEPTH) if self._cameras is None else self._cameras.depths_and_motions(joint_position)
 
-    def _seen_jacobian(
+    def _point_jacobian(
         self, learned: Learned, rates: FloatArray, motions: FloatArray, own: FloatArray, joint_position: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return G by what is known now, and Ĵ."""
         base = self.estimator.motions(learned.estimator, joint_position)
         if base is not None:
-            return base, through(rates, learned.pair.map, base)
+            return base, feature_jacobian(rates, learned.pair.map, base)
         if self._first is not None:
             own = own - self.estimator.jacobian(self._first, joint_position)
-        return motions, through(rates, learned.pair.map, motions) + own
+        return motions, feature_jacobian(rates, learned.pair.map, motions) + own
 
     def _given_base(self, joint_position: FloatArray, otherwise: FloatArray) -> FloatArray:
         if self._nominal is None:
@@ -197,24 +198,24 @@ class Estimation:
         return np.asarray(self._nominal(joint_position), dtype=np.float64)
 
     def _learn(
-        self, learned: Learned, seen: Seen, observation: Observation, desired: FloatArray, valid: BoolArray
+        self, learned: Learned, last: LastFrame, observation: Observation, desired: FloatArray, valid: BoolArray
     ) -> Learned:
         """Learn from a motion; features that were not `valid` at both ends are taken to move as predicted."""
-        dy, error = observation.feature - seen.feature, desired - observation.feature
-        duration = observation.time - seen.time
+        dy, error = observation.feature - last.feature, desired - observation.feature
+        duration = observation.time - last.time
         if self.pairing is None:
-            q = seen.joint_position
+            q = last.joint_position
             step = observation.joint_position - q
-            predicted = np.matvec(seen.jacobian, step)
+            predicted = np.matvec(last.jacobian, step)
             dy = np.where(valid, dy, predicted)
             return Learned(
                 self.estimator.update(learned.estimator, Motion(q, step, dy, error, duration)),
                 None,
                 norm(dy - predicted),
             )
-        middle = 0.5 * (seen.feature + observation.feature)
+        middle = 0.5 * (last.feature + observation.feature)
         pair, paired = self.pairing.learn(learned.pair, dy, duration, middle, valid)
-        predicted = np.matvec(seen.jacobian, paired.joint_step)
+        predicted = np.matvec(last.jacobian, paired.joint_step)
         dy = np.where(valid, dy, predicted)
         motion = self._own_motion(pair, paired, Motion(*paired[:2], dy, error, duration, self.pairing.noise(pair)))
         known = self.pairing.is_known(pair)
@@ -222,8 +223,8 @@ class Estimation:
 
     def _own_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
         """Return the motion as the estimator is to explain it."""
-        if self._sight is not None:
-            return self._seen_motion(pair, paired, motion)
+        if self._cameras is not None:
+            return self._point_motion(pair, paired, motion)
         dy, error = motion.feature_step, motion.error
         if self._model == "map":
             if self._adds:
@@ -234,15 +235,15 @@ class Estimation:
             dy = dy - paired.predicted
         return replace(motion, feature_step=dy, error=error)
 
-    def _seen_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
+    def _point_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
         rates, x = paired.rates, paired.predicted[..., None]
         if self._first is None:
-            explained = through(rates, pair.map, x)[..., 0]
+            explained = feature_jacobian(rates, pair.map, x)[..., 0]
         elif self._estimates_arm:
-            return replace(motion, seen=seen_through(rates, pair.map))
+            return replace(motion, interaction=turned_interaction(rates, pair.map))
         else:
             nominal = self.estimator.jacobian(self._first, motion.joint_position)
-            explained = through(rates, pair.map, x)[..., 0] - np.matvec(nominal, motion.joint_step)
+            explained = feature_jacobian(rates, pair.map, x)[..., 0] - np.matvec(nominal, motion.joint_step)
         return replace(motion, feature_step=motion.feature_step - explained)
 
     def diagnostics(self, state: EstimationState) -> Diagnostics:
@@ -252,5 +253,5 @@ class Estimation:
         return found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}
 
 
-def _newer(seen: Seen, now: Seen) -> Seen:
+def _newest(last: LastFrame, now: LastFrame) -> LastFrame:
     return now

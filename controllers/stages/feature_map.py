@@ -1,4 +1,28 @@
-"""A map between features: one matrix M (m, m), with Δy ≈ M x and x what the model's Jacobian predicts."""
+"""A map between features, one matrix M (m, m), and a delay, both estimated online by a filter bank.
+
+For each of D candidate delays d a filter of its own holds a map M, (m, m), and the noise e, (m,), of the last
+frame, with a covariance P, (m+1, m+1), that the rows of [M e] share. x_d is the feature step that the model predicts
+for the joint motion d periods ago. A step Δy holds the noise of both its frames, of the new one e₊ ~ N(0, σ² I):
+
+    Δy = M x_d + e₊ − e + v,   v ~ N(0, c² ‖x_d‖² I)                   v the error of the model
+    h = [x_d; −1],   ν = Δy − [M e] h,   s = σ² + c² ‖x_d‖² + hᵀ P h
+    M ← M + ν (P h)_Mᵀ / s,   P_M ← P_M − (P h)_M (P h)_Mᵀ / s          if ‖x_d‖ ≥ σ
+    e ← ν σ²/s,   P_ee ← σ² (1 − σ²/s),   P_Me ← −(P h)_M σ²/s          e₊ takes the place of e
+
+Without e the filter would be biased: a closed loop turns the noise of a frame into joint motion, which at a shorter
+delay than the true one seems to explain that this noise is gone from the next frame.
+
+This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. Steps
+shorter than the noise do not change M and P_M, but P_M counts in s (a Schmidt–Kalman filter). An arm at rest makes many
+such steps: the posture stage moves the joints, x is how a wrong model thinks that this moves the feature, and the law
+removes the motion that is seen. Learned from, they would teach M that x moves nothing.
+
+The candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
+
+    ℓ_d = Σ ‖ν‖² / s + m ln s
+
+All functions are pure; the axis of the candidates follows the leading axes of runs side by side.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +31,97 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.algebra import nearest_rotation
 from servobench.controllers.stages.camera_map import CameraMap, Innovation, Step
-from servobench.controllers.stages.map_bank import fresh_bank, map_update, near_rotation
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.faults import FilterDiverged
+from servobench.plant.contract.lanes import norm, outer, plus_diagonal
+
+
+def fresh_bank(M: FloatArray, P_M: FloatArray, frame: FloatArray | float) -> FloatArray:
+    """Return a bank, [M e] above P, in which nothing is known of the last frame.
+
+    Args:
+        M: (..., m, m).
+        P_M: covariance of a row of M, (m, m).
+        frame: σ², (...), m².
+
+    Returns:
+        (..., 2m+1, m+1).
+    """
+    m = M.shape[-1]
+    bank = np.zeros((*M.shape[:-2], 2 * m + 1, m + 1))
+    bank[..., :m, :m], bank[..., m:-1, :m], bank[..., -1, -1] = M, P_M, frame
+    return bank
+
+
+def map_update(
+    bank: FloatArray, x: FloatArray, feature_step: FloatArray, frame: FloatArray, model: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Learn from one motion under every candidate delay.
+
+    Args:
+        bank: each [M e] above its P, (..., D, 2m+1, m+1): what multiplies h in both is one product.
+        x: feature steps that the model predicts, (..., D, m), m.
+        feature_step: Δy, (..., m), m.
+        frame: σ², (..., 1), m², positive.
+        model: c² ‖x_d‖², (..., D), m².
+
+    Returns:
+        The new bank; ‖ν‖²/s, (..., D), what was seen against what was expected; and s, (..., D), m².
+    """
+    m = feature_step.shape[-1]
+    h = np.concatenate([x, np.full((*x.shape[:-1], 1), -1.0)], axis=-1)
+    known = np.matvec(bank, h)
+    Ph = known[..., m:]
+    s = frame + model + np.vecdot(h, Ph)
+    known[..., :m] -= feature_step[..., None, :]  # −ν above P h: minus their products with the gain is the change
+    nu, share = known[..., :m], frame / s
+    gain = Ph / s[..., None]
+    gain[..., :-1] *= (np.vecdot(x, x) >= frame)[..., None]
+    learned = bank - outer(known, gain)
+    learned[..., -1] = -share[..., None] * known
+    learned[..., -1, :-1] = learned[..., m:-1, -1]
+    learned[..., -1, -1] = frame * (1.0 - share)
+    return learned, np.vecdot(nu, nu) / s, s
+
+
+def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:
+    """Complete a map by the belief that it is nearly a rotation: where P is large, M says little.
+
+    With the belief that an entry of the map is N(R, ς²) what is measured is M ~ N(R, P + ς² I) by rows, so that
+
+        R = argmin ‖(M − R) (P + ς² I)^(−½)‖_F, the rotation nearest to M (P + ς² I)⁻¹
+        M̄ = R + (M − R) ς² (P + ς² I)⁻¹
+
+    Directions count by what is known of them: two known directions of three give the third.
+
+    Args:
+        M: (..., m, m).
+        P: (..., m, m), positive definite.
+        deviation: ς, of an entry of the map from the rotation; 0 for the rotation itself.
+
+    Returns:
+        M̄ and R.
+
+    Raises:
+        FilterDiverged: a P is not positive definite.
+    """
+    believed = plus_diagonal(P, deviation**2)
+    try:
+        np.linalg.cholesky(believed)
+        information = np.linalg.inv(believed)
+    except np.linalg.LinAlgError as error:
+        raise FilterDiverged(f"covariance of the map is not positive definite: {P.tolist()}") from error
+    R = nearest_rotation(M @ information)
+    if deviation == 0.0:
+        return R, R
+    return R + (M - R) @ (deviation**2 * information), R
 
 
 @final
 class FeatureMap(CameraMap[FloatArray]):
-    """M with the filters of `map_bank`; a bank is (..., D, 2m+1, m+1)."""
+    """The map M with a filter for each candidate delay; a bank is (..., D, 2m+1, m+1)."""
 
     def __init__(self, aids: AidsConfig, features: int) -> None:
         """Take the settings and m."""

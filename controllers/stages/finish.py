@@ -14,12 +14,27 @@ from typing import final
 import numpy as np
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.stages.inverses import damped_inverse
 from servobench.controllers.stages.limit import largest_excess, redistribute
-from servobench.controllers.stages.posture import step_with_posture
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray
+
+
+def step_with_posture(
+    inverse: FloatArray, jacobian: FloatArray, feature_step: FloatArray, away: FloatArray, share: float
+) -> FloatArray:
+    """Return J⁺ v + κ (I − J⁺J)(q_c − q), (..., n), rad.
+
+    Args:
+        inverse: J⁺, damped or not, (..., n, m), rad/m.
+        jacobian: J, (..., m, n), m/rad.
+        feature_step: v, (..., m), m.
+        away: q_c − q, from the present joint position to the wanted posture, (..., n), rad.
+        share: κ, of that distance; 0 for no posture.
+    """
+    step: FloatArray = np.matvec(inverse, feature_step - share * np.matvec(jacobian, away)) + share * away
+    return step
 
 
 @final

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servobench.controllers.stages.inverses import damped_inverse
+from servobench.controllers.algebra import damped_inverse
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, repeat
 from servobench.plant.contract.signals import BoolArray

@@ -4,7 +4,7 @@
     Δy ≈ M x_d                                                             M a map (m, m), of a turned camera
 
 Where it is known how cameras see points, x_d has the motions of the points, and a map turns those of each camera
-(`sight_map`); else a map is a matrix between features (`feature_map`). For each candidate delay d, in periods and not
+(`point_map`); else a map is a matrix between features (`feature_map`). For each candidate delay d, in periods and not
 always a whole number of them, a filter holds a map; the delay is that of the filter that predicts best:
 
     P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← update(x_d, Δy)        for each delay d
@@ -18,20 +18,20 @@ gate. M stays, as the best guess. The first sample of the noise σ is a guess (`
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.controllers.aids import AidsConfig
+from servobench.controllers.camera_model import CameraModel
 from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import in_periods, whole_periods
-from servobench.controllers.sight import Sight
 from servobench.controllers.stages.camera_map import CameraMap, Step, of_delay
-from servobench.controllers.stages.candidates import Candidates
 from servobench.controllers.stages.feature_map import FeatureMap
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.sight_map import SightMap
+from servobench.controllers.stages.point_map import PointMap
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
@@ -44,8 +44,58 @@ BIASED = 0.25  # [1] error of the model over noise, above which it decides betwe
 NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), of one motion in the score of a delay
 CUSUM_DRIFT = 3.0  # [1] NIS per feature that is subtracted at each motion; 1 is its expectation
 CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier cannot reach the gate
+RESOLUTION = 0.0125  # [s] between candidate delays, about
+LAST_THREE = np.array([0, 1, 2])
 NO_DEPTH = np.zeros(0)
+IntArray: TypeAlias = npt.NDArray[np.int_]
 Bank: TypeAlias = Any  # of either form of map
+
+
+@final
+class Candidates:
+    """Candidate delays and rows of the past at them; between two rows the arm is taken to have moved evenly.
+
+    Attributes:
+        delays: (D,), periods.
+        beside: (D,), a neighbour of each.
+        longest: whole periods of the last one.
+    """
+
+    def __init__(self, delays: FloatArray) -> None:
+        """Take the delays, (D,), periods, in order."""
+        self.delays = delays
+        self.beside = np.abs(np.arange(len(delays)) - 1) % len(delays)
+        self._whole = delays.astype(np.int_)
+        self.longest = int(self._whole[-1])
+        self._share = delays - self._whole
+        self._around = (self._whole, self._whole + 1) if self._share.any() else (self._whole,)
+
+    @classmethod
+    def up_to(cls, longest: float, period: float) -> Candidates:
+        """Return delays from 0 to the longest one [s], with control periods of `period` [s].
+
+        They lie about `RESOLUTION` apart: a whole number of periods, or a period divided by a whole number.
+        """
+        spacing = max(1, whole_periods(RESOLUTION, period)) / max(1, whole_periods(period, RESOLUTION))
+        count = 1 + math.floor(whole_periods(longest, period) / spacing)
+        return cls(np.asarray(spacing * np.arange(count), dtype=np.float64))
+
+    def ends(self, past: FloatArray) -> FloatArray:
+        """Return the past (..., H, columns) at each delay, (..., D, columns)."""
+        return self._between(*(past[..., rows, :] for rows in self._around))
+
+    def begins(self, past: FloatArray, periods: IntArray) -> FloatArray:
+        """Return the past (..., H, columns) at each delay and `periods` (...) before, (..., D, columns)."""
+        return self._between(*(pick(past, rows + periods[..., None], axes=1) for rows in self._around))
+
+    def exposed(self, past: FloatArray, candidate: IntArray) -> FloatArray:
+        """Return the past (..., H, columns) at a candidate delay (...) and a period before, (..., 2, columns)."""
+        whole, share = (np.take(each, candidate)[..., None] for each in (self._whole, self._share))
+        rows = pick(past, whole + LAST_THREE, axes=1)
+        return np.asarray(rows[..., :2, :] + share[..., None] * (rows[..., 1:, :] - rows[..., :2, :]))
+
+    def _between(self, row: FloatArray, before: FloatArray | None = None) -> FloatArray:
+        return row if before is None else np.asarray(row + self._share[:, None] * (before - row))
 
 
 class PairState(NamedTuple):
@@ -70,10 +120,10 @@ class PairState(NamedTuple):
     bank: Bank
     scores: FloatArray
     noise: NoiseLevel
-    candidate: npt.NDArray[np.int_]
+    candidate: IntArray
     map: FloatArray
     rotation: FloatArray
-    moves: npt.NDArray[np.int_]
+    moves: IntArray
     nis: FloatArray
     cusum: FloatArray
 
@@ -85,7 +135,7 @@ class Paired(NamedTuple):
         joint_position: (..., n), rad, where the joint motion began.
         joint_step: Δq, (..., n), rad.
         predicted: x, (..., columns), the step that the base predicts.
-        rates: L, (..., c, p, k, 3), during it; empty without a sight.
+        rates: L, (..., c, p, k, 3), during it; empty without a camera model.
     """
 
     joint_position: FloatArray
@@ -105,14 +155,14 @@ class Pairing:
         maps: the form of the map.
     """
 
-    def __init__(self, aids: AidsConfig, spec: PlantSpec, latency: float, sight: Sight | None = None) -> None:
+    def __init__(self, aids: AidsConfig, spec: PlantSpec, latency: float, cameras: CameraModel | None = None) -> None:
         """Take settings, sizes and period.
 
         Args:
             aids: the settings.
             spec: of the plant.
             latency: s, of a given delay.
-            sight: how cameras see points, where a map is to turn what they see.
+            cameras: model of the cameras, where a map is to turn the motions of points; None for a map of features.
         """
         self._aids, self._n, self._m, self._period = aids, spec.n, spec.m, spec.period
         motion = max(1, whole_periods(MOTION_TIME, spec.period))
@@ -126,8 +176,8 @@ class Pairing:
         self._rows = self._candidates.longest + self.gap + 3
         self._aligns = aids.model == "map"
         self.learns = self._aligns or aids.delay == "identified" or aids.noise == "identified"
-        self._sight = sight
-        self.maps: CameraMap[Any] = FeatureMap(aids, spec.m) if sight is None else SightMap(aids, sight, spec.m)
+        self._cameras = cameras
+        self.maps: CameraMap[Any] = FeatureMap(aids, spec.m) if cameras is None else PointMap(aids, cameras, spec.m)
         self._end = spec.n + self.maps.columns
 
     def start(self, observation: Observation, base: FloatArray, depth: FloatArray = NO_DEPTH) -> PairState:
@@ -197,8 +247,8 @@ class Pairing:
         passed = end - begin
         x, depth = passed[..., n : self._end], 0.5 * (begin + end)[..., self._end :]
         rates = np.zeros((*feature.shape[:-1], 0))
-        if self._sight is not None:
-            rates = self._sight.rates(feature[..., None, :], depth)
+        if self._cameras is not None:
+            rates = self._cameras.rates(feature[..., None, :], depth)
         if self.learns:
             now = state.candidate
             explained = self.maps.explained(state.map, pick(x, now), self._now(rates, now))
@@ -208,8 +258,8 @@ class Pairing:
         begin, rates = pick(begin, now)[..., :n], self._now(rates, now)
         return state, Paired(begin, passed[..., :n], passed[..., n : self._end], rates)
 
-    def _now(self, rates: FloatArray, candidate: npt.NDArray[np.int_]) -> FloatArray:
-        return rates if self._sight is None else pick(rates, candidate)
+    def _now(self, rates: FloatArray, candidate: IntArray) -> FloatArray:
+        return rates if self._cameras is None else pick(rates, candidate)
 
     def interrupt(self, state: PairState) -> PairState:
         """Return the state after a frame in which no motion ended: nothing is known of its noise."""
@@ -232,7 +282,7 @@ class Pairing:
             R = state.rotation
             turned = (R - np.eye(R.shape[-1])).reshape(*R.shape[:-2], -1)
             angle = np.arccos(np.maximum(1.0 - 0.25 * np.vecdot(turned, turned), -1.0))
-            found["map_rotation"] = angle if self._sight is None else np.maximum.reduce(angle, axis=-1)
+            found["map_rotation"] = angle if self._cameras is None else np.maximum.reduce(angle, axis=-1)
             found["map_deviation"] = self.deviation(state)
         return found
 

@@ -4,8 +4,15 @@
     q̂ = q(k) + flight                               and the joints
     compared with the reference at k + lead
 
-z is the feature at its exposure, d periods ago (`feature_filter`); flight and lead follow from the part of the commands
-that is still to come (`joint_response`). Both halves can be left out.
+flight and lead follow from the part of the commands that is still to come (`joint_response`). z is the feature at its
+exposure, d periods ago, as measured or filtered by the motion of the joints between frames (`FeatureFilter`):
+
+    z ← z + Ĵ Δq(k−d),   p ← p + c² ‖Ĵ‖² ‖Δq(k−d)‖²/n + r²        as far as the arm moved until the exposure
+    L = p / (p + σ²),   z ← z + L (y − z),   p ← (1 − L) p               with a valid feature y
+
+It is a Kalman filter with one variance p for all axes. In motion the Jacobian's error c makes it follow the camera,
+whether or not Ĵ predicts a motion of the feature; at rest it averages: L tends to r/σ. A frame outside the innovation
+gate (a camera that was moved) restarts it. Prediction and filter can each be left out.
 """
 
 from __future__ import annotations
@@ -19,8 +26,8 @@ import numpy as np
 
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
+from servobench.controllers.estimators.estimator import MOTION_TIME
 from servobench.controllers.periods import whole_periods
-from servobench.controllers.stages.feature_filter import FeatureFilter
 from servobench.controllers.stages.joint_response import WINDOW, JointResponse
 from servobench.controllers.stages.noise_level import NoiseLevel
 from servobench.plant.contract.checks import FloatArray
@@ -28,6 +35,61 @@ from servobench.plant.contract.lanes import branch
 from servobench.plant.contract.signals import BoolArray, Observation
 
 SETTLED_LAGS = 15.0  # [1] time constants after which nothing of a given response is left
+REST_DRIFT = 4.472136e-4  # [m/√s] process noise of z at rest; r in the formula is that of a period
+RESTART_RATIO = 25.0  # [1] squared innovation over its variance; above it the filter restarts at y
+
+
+class FeatureFilter(NamedTuple):
+    """The state of the feature filter, and its steps.
+
+    Attributes:
+        feature: z, (..., m), m.
+        variance: p, (...), m².
+        noise: σ, standard deviation of the feature per axis.
+    """
+
+    feature: FloatArray
+    variance: FloatArray
+    noise: NoiseLevel
+
+    def restart(self, feature: FloatArray) -> FeatureFilter:
+        """Return the filter at a feature y, (..., m), m."""
+        return self._replace(feature=feature, variance=self.noise.variance)
+
+    def advance(self, jacobian: FloatArray, joint_step: FloatArray, model_error: float, period: float) -> FeatureFilter:
+        """Return the filter one period later, before the frame of that period.
+
+        Args:
+            jacobian: Ĵ, (..., m, n), m/rad.
+            joint_step: Δq, (..., n), rad.
+            model_error: c, error of the Jacobian as a share of ‖Ĵ‖, which lasts for `MOTION_TIME`.
+            period: s.
+        """
+        flat = jacobian.reshape(*jacobian.shape[:-2], -1)
+        uncertainty = np.vecdot(flat, flat) * np.vecdot(joint_step, joint_step) / joint_step.shape[-1]
+        error = model_error**2 * (MOTION_TIME / period)
+        return self._replace(
+            feature=self.feature + np.matvec(jacobian, joint_step),
+            variance=self.variance + error * uncertainty + REST_DRIFT**2 * period,
+        )
+
+    def correct(self, feature: FloatArray, valid: BoolArray, find_noise: bool) -> FeatureFilter:
+        """Return the filter after a frame in which at least one feature was seen; the others stay as predicted.
+
+        Args:
+            feature: y, (..., m), m.
+            valid: which of them were seen, (..., m).
+            find_noise: learn σ from y − z.
+        """
+        z, p, noise = self
+        feature = np.where(valid, feature, z)
+        error, innovation_variance = feature - z, p + noise.variance
+        square = np.vecdot(error, error) / np.add.reduce(valid, axis=-1)
+        share = p / innovation_variance
+        if find_noise:
+            noise = noise.learn(square, 1.0, p)
+        corrected = FeatureFilter(z + share[..., None] * error, (1.0 - share) * p, noise)
+        return branch(square > RESTART_RATIO * innovation_variance, FeatureFilter.restart, corrected, feature)
 
 
 class Prediction(NamedTuple):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from servobench import Command, Controller
-from servobench.harness.gym.view import View
+from servobench.harness.gym.spaces import View
 
 POLICY = Path(__file__).with_name("policy.npz")
 

@@ -11,15 +11,13 @@ import pandas as pd
 from page_studies.held_out import LOST
 from page_studies.methods import MOVE, SIX, difference, paired, quoted
 from page_studies.study import Study, Words, sweep
+from servobench.controllers.aids import SWITCHES, AidsConfig
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller
 
 USUAL: Final = "all"
-LESS: Final[Mapping[str, Any]] = {
-    "delay": "ignored", "response": "ignored", "noise": "given", "filter": False, "model": "own", "feedforward": False,
-    "posture": False, "limit": "scale",
-}  # fmt: skip
+LESS: Final[Mapping[str, Any]] = {aid: getattr(AidsConfig(), aid) for aid in SWITCHES}
 """The value of each aid that leaves it out."""
 METRICS: Final = (
     ("aids", "random", "settling_time_s", MOVE, 1.0, 2),

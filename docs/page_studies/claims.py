@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from page_studies.study import Study
-from servobench.harness.studies.claims.table import ANSWERS
+from servobench.harness.studies.reproduction import ANSWERS
 
 
 def claims_tables(folder: Path) -> dict[str, pd.DataFrame]:

@@ -13,9 +13,9 @@ from page_studies.study import Study
 from page_studies.worlds import MAPPED
 from servobench.harness.analysis.comparison import settling_times
 from servobench.harness.batch.results import load_runs
-from servobench.harness.studies.claims.measurements import UNDECIDED
-from servobench.harness.studies.claims.table import ANSWERS
-from servobench.harness.studies.map_lines import KNOWN_LINES
+from servobench.harness.studies.claims import UNDECIDED
+from servobench.harness.studies.reproduction import ANSWERS
+from servobench.harness.studies.robustness import KNOWN_LINES
 
 FIRST, SECOND = ENGINES
 AXES = "camera_rotation,latency,noise,camera_move"  # those on which methods fail; see the map on `fmu`

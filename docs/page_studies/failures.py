@@ -25,10 +25,10 @@ from servobench.harness.analysis.statistics import success_rate
 from servobench.harness.batch.results import load_runs
 from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import figure_style, method_styles
-from servobench.harness.run.drawn import draw
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve_sections, select
+from servobench.harness.run.result import COMPLETED
 
 CAUSES = {
     "camera_angle": "camera turned by [deg]",

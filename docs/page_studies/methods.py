@@ -12,7 +12,7 @@ from servobench.controllers.methods import METHODS
 from servobench.controllers.methods import PUBLISHED as SUFFIX
 from servobench.harness.analysis.comparison import Comparison, column_of, compare_pairs, settled_share, settling_times
 from servobench.harness.analysis.statistics import MISSING, Estimate, median_with_interval, tail_mean
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 
 BETTER: Final = "arm_mfac"
 FOUR: Final = ("rbfnn_mfac", "ukf_mfac", "ukf_mpc", "rbf_pid")  # those of the paper

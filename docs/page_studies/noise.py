@@ -40,7 +40,7 @@ from servobench.harness.pictures.style import (
     WIDTH,
     figure_style,
 )
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import find_robot
 

@@ -28,7 +28,7 @@ from page_studies.study import Study, sweep
 from servobench.harness.analysis.comparison import column_of, outcomes, settling_times
 from servobench.harness.analysis.statistics import median_with_interval
 from servobench.harness.batch.results import load_runs
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 
 RATES: Final = (10, 20, 50, 125, 250)  # [Hz]
 NOWHERE: Final = "nowhere"

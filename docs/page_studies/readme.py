@@ -11,9 +11,10 @@ from page_studies.methods import SIX
 from page_studies.study import Study
 from page_studies.worlds import small
 from servobench.harness.batch import results
-from servobench.harness.pictures.draw import folder_figures, picture_of
+from servobench.harness.pictures.figures import folder_figures
 from servobench.harness.pictures.film import draw_frame
 from servobench.harness.pictures.replay import logged_run
+from servobench.harness.pictures.style import picture_of
 
 SHOWN = "circle"  # the task whose film gives a frame
 PERIOD = 150  # of the run shown: three quarters of a lap

@@ -12,7 +12,7 @@ from page_studies.methods import difference, paired
 from page_studies.study import Words
 from servobench.harness.analysis.comparison import Comparison, column_of, differences_of_pairs
 from servobench.harness.analysis.statistics import Estimate, median_with_interval, success_rate
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 
 ENGINES: Final = ("bullet", "mujoco")
 

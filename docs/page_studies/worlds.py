@@ -16,7 +16,7 @@ from servobench.controllers.aids import EQUIPPED
 from servobench.controllers.parts import ESTIMATORS, LAWS
 from servobench.harness.analysis.statistics import median_with_interval
 from servobench.harness.batch.results import load_runs
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 
 SEEDS = "500:600"
 MISMATCHES = (

@@ -1,20 +1,75 @@
-"""Decisions of `plant.contract.lanes` over arrays of expressions: C takes one of two ways, as the code did."""
+"""Decisions and faults of recorded code: C takes one of two ways, as the code did, and reports a fault by its code.
+
+Decisions are those of `plant.contract.lanes`. Numpy code raises where its numbers are of no use. A recorded step cannot
+be left in its middle: it goes on, and returns a code of `MESSAGES` beside its results, 0 for none. Functions that are
+recorded on their own, such as the ways of a branch, collect their faults in a frame each.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from itertools import count
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import casadi
 import numpy as np
 
-from servobench.fmus.trace.array import NotTraceable, Traced, as_traced
-from servobench.fmus.trace.faults import frame, note_code
+from servobench.fmus.trace.arrays import Expression, NotTraceable, Traced, as_traced
 from servobench.plant.contract.lanes import map_arrays, take
 
 Tree = TypeVar("Tree")
+NOT_FINITE: Final = 1
+NOT_DEFINITE: Final = 2
+MESSAGES: Final = {
+    NOT_FINITE: "the estimate or the command is not finite",
+    NOT_DEFINITE: "a covariance is not positive definite",
+}
 _NUMBERS = count()
+
+
+@dataclass
+class Frame:
+    """The faults of a function that is being recorded.
+
+    Attributes:
+        code: of the worst one, an expression.
+    """
+
+    code: Expression = field(default_factory=lambda: casadi.MX(0.0))
+
+
+_FRAMES: list[Frame] = []
+
+
+@contextmanager
+def frame() -> Iterator[Frame]:
+    """Collect the faults within."""
+    _FRAMES.append(Frame())
+    try:
+        yield _FRAMES[-1]
+    finally:
+        _FRAMES.pop()
+
+
+def note_fault(wrong: Any, code: int) -> None:  # noqa: ANN401 - an array of truth
+    """Note that something is wrong where an entry is true."""
+    note_code(casadi.mmax(code * as_traced(wrong).flat()))
+
+
+def note_code(code: Expression) -> None:
+    """Note a fault by its code, 0 for none."""
+    _FRAMES[-1].code = casadi.fmax(_FRAMES[-1].code, code)
+
+
+def is_finite(array: Any) -> bool:  # noqa: ANN401 - an array
+    """Return that an array is finite; an expression that is not is a fault."""
+    if isinstance(array, Traced) and not array.constant:
+        wrong: Any = np.logical_not(np.isfinite(array))
+        note_fault(wrong, NOT_FINITE)
+        return True
+    return bool(np.isfinite(np.asarray(array)).all())
 
 
 def leaves_of(tree: Any) -> list[Any]:  # noqa: ANN401 - any tree

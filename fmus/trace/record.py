@@ -1,23 +1,129 @@
-"""A system in discrete time as CasADi functions, recorded from a pure step of numpy code."""
+"""A system in discrete time as CasADi functions, recorded from a pure step of numpy code.
+
+Most of numpy asks its arguments for their implementation (`__array_ufunc__`, `__array_function__`). Functions that make
+arrays, the decisions of `plant.contract.lanes` and memos do not: while code is recorded, these names are replaced in
+all modules of this package but its FMUs.
+"""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import _lru_cache_wrapper
 from pathlib import Path
-from typing import Any
+from threading import RLock
+from typing import Any, Final
 
 import casadi
 import numpy as np
 
-from servobench.fmus.trace.array import Expression, NotTraceable, Traced, as_traced
-from servobench.fmus.trace.branches import leaves_of, symbols_like, with_leaves
-from servobench.fmus.trace.faults import frame
-from servobench.fmus.trace.namespace import recording
+from servobench.fmus.trace import branches
+from servobench.fmus.trace.arrays import Expression, NotTraceable, Traced, as_traced, spread
+from servobench.fmus.trace.branches import frame, leaves_of, symbols_like, with_leaves
+from servobench.fmus.trace.functions import carry_out
+from servobench.plant.contract import checks, lanes
 
 Inputs = Mapping[str, Any]
+PACKAGE: Final = "servobench."
+OWN: Final = "servobench.fmus."
+_LOCK = RLock()
+Traced.function = staticmethod(carry_out)
+
+
+class _Numpy:
+    """numpy, except for what makes arrays."""
+
+    ndarray = (np.ndarray, Traced)  # for isinstance
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - anything of numpy
+        return getattr(np, name)
+
+    @staticmethod
+    def asarray(value: Any, dtype: Any = None, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
+        if isinstance(value, Traced):
+            return value
+        if isinstance(value, (list, tuple)) and any(isinstance(each, Traced) for each in value):
+            return np.stack([as_traced(each) for each in value])
+        return np.asarray(value, dtype=_real(dtype), **options)
+
+    @staticmethod
+    def array(value: Any, dtype: Any = None, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
+        same = _Numpy.asarray(value, dtype)
+        return same.copy() if isinstance(same, Traced) else np.array(value, dtype=_real(dtype), **options)
+
+    @staticmethod
+    def ascontiguousarray(value: Any) -> Any:  # noqa: ANN401 - as numpy's
+        return value if isinstance(value, Traced) else np.ascontiguousarray(value)
+
+    @staticmethod
+    def float64(value: Any) -> Any:  # noqa: ANN401 - as numpy's
+        return value if isinstance(value, Traced) else np.float64(value)
+
+    @staticmethod
+    def zeros(shape: Any, dtype: Any = np.float64) -> Traced:  # noqa: ANN401 - as numpy's
+        return Traced.plain(np.zeros(shape, dtype=_real(dtype)))
+
+    empty = zeros
+
+    @staticmethod
+    def full(shape: Any, value: Any, dtype: Any = None) -> Traced:  # noqa: ANN401 - as numpy's
+        if isinstance(value, Traced):
+            return value.arranged(np.broadcast_to(value.places, shape)).copy()
+        return Traced.plain(np.full(shape, value, dtype=_real(dtype)))
+
+    @staticmethod
+    def take(array: Any, indices: Any, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
+        return np.take(as_traced(array) if isinstance(indices, Traced) else array, indices, **options)
+
+    @staticmethod
+    def broadcast_to(array: Any, shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
+        return spread(as_traced(array), tuple(np.atleast_1d(shape)) if isinstance(shape, int) else shape)
+
+
+def _real(dtype: Any) -> Any:  # noqa: ANN401 - as numpy's
+    return np.float64 if dtype is _Numpy.float64 else dtype
+
+
+_NUMPY: Final = _Numpy()
+
+
+_MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
+    (np, _NUMPY),
+    (lanes.branch, branches.branch),
+    (lanes.repeat, branches.repeat),
+    (checks.is_finite, branches.is_finite),
+)
+
+
+@contextmanager
+def recording() -> Iterator[None]:
+    """Let numpy code of this package compute with expressions within."""
+    changed: list[tuple[dict[str, Any], str, Any]] = []
+    meanings = {id(old): new for old, new in _MEANINGS}
+    with _LOCK:
+        try:
+            for name, module in list(sys.modules.items()):
+                if not name.startswith(PACKAGE) or name.startswith(OWN):
+                    continue
+                space = vars(module)
+                for key, value in list(space.items()):
+                    new = meanings.get(id(value), _without_memo(value))
+                    if new is not None:
+                        changed.append((space, key, value))
+                        space[key] = new
+            yield
+        finally:
+            for space, key, value in changed:
+                space[key] = value
+
+
+def _without_memo(value: Any) -> Callable[..., Any] | None:  # noqa: ANN401 - anything in a module
+    """Return the function behind a memo, which must not keep expressions."""
+    return value.__wrapped__ if isinstance(value, _lru_cache_wrapper) else None
 
 
 @dataclass(frozen=True)
@@ -26,7 +132,7 @@ class Recorded:
 
     Attributes:
         start: CasADi function u -> x, code.
-        step: CasADi function x, u -> x, y, code; a code that is not 0 is one of `faults.MESSAGES`.
+        step: CasADi function x, u -> x, y, code; a code that is not 0 is one of `branches.MESSAGES`.
     """
 
     start: Any
@@ -64,10 +170,10 @@ def record(
             first, begin = _recorded_start(own, start, inputs)
             advance = _recorded_step(own, step, inputs, first)
     except NotTraceable as error:
-        raise NotTraceable(f"{_place(error)}: {error}") from error
+        raise NotTraceable(f"{_where_it_failed(error)}: {error}") from error
     except RuntimeError as error:  # of CasADi
         said = str(error).partition("\n")[0]
-        raise NotTraceable(f"{_place(error)}: CasADi cannot express it ({said})") from error
+        raise NotTraceable(f"{_where_it_failed(error)}: CasADi cannot express it ({said})") from error
     return Recorded(begin, advance)
 
 
@@ -121,7 +227,7 @@ def _column(leaf: Any) -> Expression:  # noqa: ANN401 - an array
     return as_traced(leaf).flat()
 
 
-def _place(error: BaseException) -> str:
+def _where_it_failed(error: BaseException) -> str:
     """Return the innermost function outside of the recorder that an error came through."""
     found, trace = "the code", error.__traceback__
     own = Path(__file__).parent

@@ -29,8 +29,8 @@ from servobench.harness.analysis.statistics import (
     signed_rank_p_value,
     success_rate,
 )
-from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 

@@ -1,4 +1,4 @@
-"""Takes the steps of runs elsewhere: CSV, MCAP for Foxglove and other readers, time responses for python-control."""
+"""Export of the steps of runs: as CSV, and as MCAP for Foxglove and other readers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Hashable, Iterator, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -17,9 +17,6 @@ from servobench.harness.batch import results
 from servobench.harness.config.installation import check_installed
 from servobench.harness.config.settings import ConfigurationError
 from servobench.plant.contract.files import reason
-
-if TYPE_CHECKING:
-    from control import TimeResponseData
 
 CSV, MCAP = "csv", "mcap"
 FORMATS: Final = (CSV, MCAP)
@@ -76,27 +73,6 @@ def _write_runs(folder: Path, runs: pd.DataFrame, out: Path, kind: str) -> list[
             else:
                 write_mcap(files[-1], steps, row)
     return files
-
-
-def time_response(steps: pd.DataFrame) -> TimeResponseData:
-    """Return a run as python-control's `TimeResponseData`: inputs are commands, states joints, outputs features.
-
-    Args:
-        steps: the table of steps of one run.
-
-    Raises:
-        ConfigurationError: steps of several runs, or none.
-    """
-    from control import TimeResponseData  # noqa: PLC0415 - a second of imports, for the caller who wants it
-
-    if steps["run_id"].nunique() != 1:
-        raise ConfigurationError(f"steps must be those of one run, got {steps['run_id'].nunique()}")
-    topics = _topics(steps)
-    parts = {role: topics[name] for role, name in (
-        ("output", "feature"), ("state", "joint_position"), ("input", "joint_velocity_command"))}  # fmt: skip
-    values = {f"{role}s": steps[list(columns)].to_numpy().T for role, columns in parts.items()}
-    labels = {f"{role}_labels": list(columns) for role, columns in parts.items()}
-    return TimeResponseData(steps["time_s"].to_numpy(), **values, **labels, title=str(steps["run_id"].iloc[0]))
 
 
 def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> None:

@@ -11,7 +11,7 @@ from pyarrow import ArrowException
 
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 
 DESCRIBED: Final = {
     "plant": "plant",

@@ -25,7 +25,6 @@ from servobench.harness.analysis.comparison import (
 from servobench.harness.analysis.measures import MEASURES, in_handy_units
 from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, success_rate
 from servobench.harness.analysis.verdict import scores
-from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import (
     ACHIEVED,
     JOINT_AT_LIMIT,
@@ -34,6 +33,7 @@ from servobench.harness.run.outcome import (
     OUTCOMES,
     TARGET_UNREACHABLE,
 )
+from servobench.harness.run.result import COMPLETED
 
 WHICH: Final = ""  # the group of columns that say which runs a row is about
 CONDITIONS: Final = {

@@ -1,14 +1,18 @@
-"""Tables of runs for a reader: in the terminal, on a page, in the report. Numbers are in handy units."""
+"""Tables of runs for the terminal: statistics of a results folder, and the summary that follows a command.
+
+A cell is text for a reader and a plain value for a program. Numbers are in handy units.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Final
+from typing import Final, TypeAlias
 
 import pandas as pd
 
-from servobench.harness.analysis.cells import Cell, Row, as_text
 from servobench.harness.analysis.comparison import (
     achieved_share,
     achievement,
@@ -18,25 +22,75 @@ from servobench.harness.analysis.comparison import (
     settling_times,
     split_conditions,
     split_tasks,
+    with_places,
 )
-from servobench.harness.analysis.measures import MEASURES, Measure
+from servobench.harness.analysis.measures import MEASURES, Measure, settling_band
 from servobench.harness.analysis.statistics import (
+    MISSING,
     NO_ESTIMATE,
     Estimate,
     median_with_interval,
     tail_mean,
 )
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import COMPLETED
-from servobench.harness.run.outcome import ACHIEVED
+from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
-
-
 SWEPT: Final = ("noise_factor", "latency_s", "period_s")  # shown where they vary
 CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
 TAIL: Final = 0.95
+Row: TypeAlias = "dict[str, Cell]"
+BAND: Final = ("settling_band", "feature_unit")
+SWEEP_COLUMNS: Final = (
+    *CONDITIONS,
+    "sensing",
+    "task",
+    "controller",
+    "status",
+    "outcome",
+    "settling_time_s",
+    "task_kind",
+    "rms_error_evaluated",
+    *BAND,
+)  # what `sweep_tables` and `outcome_legend` read
+LATE: Final = "*"  # mark of a controller of which a step took longer than the period
+SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value and how it is written."""
+
+    value: str | float | Estimate
+    spec: str = ""  # of `format`
+
+    def __str__(self) -> str:
+        """Return it as a reader gets it."""
+        text = format(self.value, self.spec)
+        return text.replace("inf", "∞") if isinstance(self.value, float) else text
+
+    def plain(self) -> object:
+        """Return it as JSON can have it: an estimate with its ends, None for no number, "inf" for infinity."""
+        if isinstance(self.value, Estimate):
+            ends = {"value": self.value.value, "low": self.value.low, "high": self.value.high}
+            return {name: _plain(number) for name, number in ends.items()} | {"count": self.value.count}
+        return self.value if isinstance(self.value, str) else _plain(self.value)
+
+
+def _plain(number: float) -> object:
+    return None if math.isnan(number) else number if math.isfinite(number) else str(float(number))
+
+
+def as_text(rows: list[Row]) -> pd.DataFrame:
+    """Return a table of text."""
+    return pd.DataFrame([{name: str(cell) for name, cell in row.items()} for row in rows])
+
+
+def as_plain(rows: list[Row]) -> list[dict[str, object]]:
+    """Return rows of plain values."""
+    return [{name: cell.plain() for name, cell in row.items()} for row in rows]
 
 
 def statistics_tables(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> Tables:
@@ -53,18 +107,6 @@ def statistics_rows(
     """Yield for each plant, task and condition its words, a row for each controller and one for each pair of them."""
     for words, place in split_conditions(runs):
         yield words, _controller_rows(place), _pair_rows(place, metric, never)
-
-
-def judge_controllers(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a row for each controller: how often and when it settled, its worst runs, and how runs failed.
-
-    Args:
-        runs: of one plant, task and condition.
-
-    Returns:
-        Text; medians and rates have 95 % intervals. Errors are in the unit of the plant's feature or a handier one.
-    """
-    return as_text(_controller_rows(runs))
 
 
 def _controller_rows(runs: pd.DataFrame) -> list[Row]:
@@ -87,20 +129,6 @@ def _controller_rows(runs: pd.DataFrame) -> list[Row]:
             }
         )
     return rows
-
-
-def compare_controllers(runs: pd.DataFrame, metric: str | None = None, never: float | None = None) -> pd.DataFrame:
-    """Return a row for each pair of controllers: the median of their paired difference and Wilcoxon's p-value.
-
-    Args:
-        runs: of one plant, task and condition.
-        metric: column that is compared; by default the settling time, on a curve the error along it.
-        never: stands for the value of a run without one, or that did not complete; by default twice the largest value.
-
-    Raises:
-        ConfigurationError: no such column of numbers.
-    """
-    return as_text(_pair_rows(runs, metric, never))
 
 
 def _pair_rows(runs: pd.DataFrame, metric: str | None, never: float | None) -> list[Row]:
@@ -133,3 +161,118 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None, never: float | None) -> l
 def _median(values: pd.Series[float]) -> Estimate:
     """Return the median of a column, a missing value counting as ∞; no estimate where all are missing."""
     return median_with_interval(values) if values.notna().any() else NO_ESTIMATE
+
+
+def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
+    """Return what the good outcomes of runs mean, whose table comes in pieces."""
+    bands = pd.concat([part.reindex(columns=list(BAND)).drop_duplicates() for part in parts])
+    return (
+        f"{SETTLED}: came within {settling_band(bands)} and stayed; "
+        f"{FOLLOWED}: RMS error of the judged part at most {settling_band(bands, FOLLOWING_BANDS)}"
+    )
+
+
+def summary_legend(runs: pd.DataFrame) -> str:
+    """Return what the words in `summary_tables` mean."""
+    late = f"; {LATE} some steps took longer than the period" if _is_late(runs) else ""
+    switches = "switches: joint commands that change sign between large values within two periods"
+    return f"{outcome_legend([runs])}; over: overshoot; {switches}; numbers are medians over runs{late}"
+
+
+def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
+    """Return what the words in `sweep_tables` mean."""
+    return f"{outcome_legend(parts)}; noise: factor; latency, period: ms, – as configured"
+
+
+def summary_tables(runs: pd.DataFrame) -> Tables:
+    """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
+    for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
+        rows = []
+        for name, own in place.groupby("controller", sort=False):
+            unit, factor = MEASURES["rms_error_evaluated"].scale(place)
+            if achievement(place) == FOLLOWED:
+                special = {
+                    f"RMS lap 2\n{unit}": _middle(own, "rms_error_second_lap", factor, 1),
+                    "joints\nrad": _middle(own, "max_joint_position_rad", 1.0, 2),
+                }
+            else:
+                special = {
+                    "after\ns": _middle(own, "settling_time_s", 1.0, 2),
+                    "over\n%": _middle(own, "overshoot", 100.0, 0),
+                }
+            rows.append(
+                {
+                    "controller": str(name),
+                    "outcome": _shares(own),
+                    **special,
+                    f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
+                    "switches": _middle(own, "command_switches", 1.0, 0),
+                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0) + (LATE if _is_late(own) else ""),
+                }
+            )
+        yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
+
+
+def _shares(runs: pd.DataFrame) -> str:
+    """Return the outcome that all runs have, or a line for each outcome with its share."""
+    shares = 100.0 * outcomes(runs).value_counts(normalize=True)
+    return shares.index[0] if len(shares) == 1 else "\n".join(f"{share:.0f} % {word}" for word, share in shares.items())
+
+
+def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
+    """Yield what a sweep ends with, for each plant and task.
+
+    That is the share of settled runs, or of those that followed their curve, a row for each condition; and where there
+    are others, the share of each outcome over all conditions.
+
+    Args:
+        parts: pieces of the table of runs; only numbers of runs are kept of each.
+    """
+    counted, curves = [], set[str]()
+    for part in parts:
+        counted.append(_count_outcomes(part))
+        curves |= set(split_tasks(part)[1]["task"])
+    counts = pd.concat(counted).groupby([*SWEEP_KEYS, "outcome"], sort=False, as_index=False)["runs"].sum()
+    for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
+        good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
+        sums = place.assign(good=good).groupby(SWEEP_KEYS[2:], sort=False)[["good", "runs"]].sum()
+        table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(_percent)
+        table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
+        word = FOLLOWED if task in curves else SETTLED
+        shares = table.rename_axis(columns=None).reset_index()
+        if (shares["period"] == MISSING).all():
+            del shares["period"]
+        yield f"{task} on {plant}: {word}, %", shares
+        if good.sum() < place["runs"].sum():
+            kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
+            table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(_percent)
+            yield f"{task} on {plant}: what came of the runs, %", table.rename_axis(columns=None).reset_index()
+
+
+def _percent(value: float) -> str:
+    return MISSING if pd.isna(value) else f"{value:.1f}"
+
+
+def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return how many runs of each condition had which outcome."""
+    runs = with_places(runs).assign(
+        outcome=outcomes(runs),
+        noise=runs["noise_factor"].map("{:g}".format),
+        latency=_milliseconds(runs["latency_s"]),
+        period=_milliseconds(runs["period_s"]),
+    )
+    return runs.groupby([*SWEEP_KEYS, "outcome"], sort=False).size().rename("runs").reset_index()
+
+
+def _milliseconds(times: pd.Series[float]) -> list[str]:
+    return [MISSING if pd.isna(time) else f"{1e3 * time:g}" for time in times]
+
+
+def _is_late(runs: pd.DataFrame) -> bool:
+    """Return whether a step of a controller took longer than the control period."""
+    return bool((column_of(runs, "controller_time_overruns") > 0.0).any())
+
+
+def _middle(runs: pd.DataFrame, name: str, factor: float, digits: int) -> str:
+    value = column_of(runs, name).median()
+    return MISSING if pd.isna(value) else f"{factor * value:.{digits}f}"

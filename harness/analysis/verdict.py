@@ -27,8 +27,8 @@ from servobench.harness.analysis.measures import MEASURES
 from servobench.harness.analysis.statistics import Estimate, holm, median_with_interval, signed_rank_p_value
 from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import COMPLETED
 from servobench.harness.run.outcome import ACHIEVED
+from servobench.harness.run.result import COMPLETED
 
 LEVEL: Final = 0.05  # of the test by which two controllers are told apart
 NOBODY: Final = "nobody"

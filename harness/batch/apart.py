@@ -27,7 +27,7 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import PACKAGES, PLACE, folder_of_module, is_below, place_in_trace
-from servobench.harness.run.ending import TIMED_OUT, Ending
+from servobench.harness.run.result import TIMED_OUT, Ending
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.files import user_path
 

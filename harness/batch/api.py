@@ -24,11 +24,11 @@ from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
 from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.episode import RunResult, run_experiment
+from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolved import check_settings
-from servobench.plant.bench.plant import Plant, PlantEntry
-from servobench.plant.bench.world import World
+from servobench.harness.run.result import RunResult
+from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 
 AnyController: TypeAlias = str | type[Controller] | Controller | ControllerEntry

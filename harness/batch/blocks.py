@@ -36,11 +36,10 @@ from servobench.harness.config.registry import (
 )
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run import episode
-from servobench.harness.run.ending import CRASHED, Ending, ends_batch
-from servobench.harness.run.episode import RunResult, failed
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
 
 BLOCK: Final = 128  # [runs] that advance together: more of them leave the cache of a processor
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
@@ -286,4 +285,4 @@ def _with_columns(cell: Cell, result: RunResult) -> RunResult:
 
 
 def _failed(cell: Cell, ending: Ending) -> RunResult:
-    return _with_columns(cell, failed(cell.request, ending))
+    return _with_columns(cell, RunResult.failed(episode.identity(cell.request), ending))

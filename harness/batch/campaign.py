@@ -38,11 +38,11 @@ from servobench.harness.batch.survey import Survey, survey
 from servobench.harness.batch.workers import Bounds, Workers, open_workers
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.episode import RunResult
 from servobench.harness.run.experiment import build_once
+from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve_sections, select
-from servobench.harness.run.together import side_by_side_key
+from servobench.harness.run.result import RunResult
 
 Row = dict[str, Any]
 

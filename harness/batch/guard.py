@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import IO, Any, Final, TypeAlias
 
 from servobench.harness.batch import processes
-from servobench.harness.run.ending import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
+from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
 
 LOST: Final = "the run killed the process that carried it out"
 LOOK_EVERY: Final = 0.25  # [s] between two looks at time, memory and processes

@@ -23,7 +23,7 @@ from servobench.harness.batch.columns import lacking
 from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import log_entry
+from servobench.harness.run.result import log_entry
 from servobench.plant.contract.files import PARTIAL
 
 AGAIN: Final = "repeat the command that made the folder with --resume"

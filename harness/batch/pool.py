@@ -22,7 +22,7 @@ from typing import Any, Final
 from servobench.harness.batch import processes
 from servobench.harness.batch.guard import ALIVE, DONE, ENDED, LOST, START_TIME, End, Limits, Task, keep_guard
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import CRASHED, TIMED_OUT, Ending
+from servobench.harness.run.result import CRASHED, TIMED_OUT, Ending
 
 GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
 GRACE: Final = 30.0  # [s] more than the time limit, after which a guard that says nothing is ended, too

@@ -36,11 +36,10 @@ from servobench.harness.batch.columns import refuse_lacking, refuse_nameless
 from servobench.harness.batch.lock import PARTS, check_empty
 from servobench.harness.batch.manifest_text import decode, encode
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import log_entry
+from servobench.harness.run.result import RunResult, log_entry
 from servobench.plant.contract.files import PARTIAL, write_atomically
 
 if TYPE_CHECKING:
-    from servobench.harness.run.episode import RunResult
     from servobench.plant.bench.plant import ImageArray
 
 PICTURES = "pictures"

@@ -12,8 +12,7 @@ from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.grid import Grid
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.plant.robot.mismatch import Mismatch, parse_magnitudes
-from servobench.plant.robot.mismatch_axes import Magnitude
+from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
 
 Variation: TypeAlias = tuple[str, tuple[Magnitude, ...]]
 

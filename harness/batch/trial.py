@@ -31,10 +31,10 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.config.source import folder_of_module, is_below
-from servobench.harness.run.ending import Ending
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolved import resolve
+from servobench.harness.run.result import Ending
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.contract.faults import RunFault

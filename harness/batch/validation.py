@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from servobench.fmus.validate import Validation, validate_fmu
+from servobench.fmus.inspection import Validation, validate_fmu
 from servobench.harness.batch.guard import Task
 from servobench.harness.batch.pool import Pool
 from servobench.harness.batch.workers import Bounds

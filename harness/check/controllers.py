@@ -11,9 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from servobench.controllers.controller import Controller, ControllerEntry
-from servobench.harness.check.drive import Conditions, Driver, at, attributes, differing, watching_draws
 from servobench.harness.check.report import Check, CheckFailed, Finding, Report, findings_of
-from servobench.harness.check.rig import PERIOD, Rig
+from servobench.harness.check.rig import PERIOD, Conditions, Driver, Rig, at, attributes, differing, watching_draws
 from servobench.harness.config.adapters import Build, folder_of
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.entries import CONTROLLER, own_object

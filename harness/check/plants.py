@@ -12,8 +12,7 @@ from servobench.harness.check.report import Check, CheckFailed, Finding, Report,
 from servobench.harness.config.adapters import Build, folder_of
 from servobench.harness.config.entries import PLANT, own_object
 from servobench.harness.config.registry import choose_plant, find_plant, offering
-from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch

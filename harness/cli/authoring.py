@@ -11,13 +11,13 @@ from typing import Annotated, Final
 
 import typer
 
-from servobench.harness.cli import completion, options
-from servobench.harness.cli.selection import known_robot, one_sensing
-from servobench.harness.cli.terminal import console, print_tables, say
+from servobench.harness.cli import options
+from servobench.harness.cli.options import CONTROLLER, Option
+from servobench.harness.cli.terminal import FAILED, console, print_tables, refuse, say, writing
 
 TEMPLATES: Final = "servobench.harness.cli"
 PREFIX: Final = "test_"
-NEXT: Final = {  # what to do with a new file, by what it is
+NEXT: Final = {  # kind of a new file -> the next commands
     "controller": ("check {}", "run --controller {} --plant kinematic"),
     "plant": ("check plant {}", "run --plant {}"),
 }
@@ -28,30 +28,25 @@ LEGEND: Final = "The log does not answer to the controller, so that this does no
 def new(
     kind: Annotated[str, typer.Argument(help="What to write: controller or plant.")],
     name: Annotated[str, typer.Argument(help="Name of the file and, as MyLaw for my_law, of the class in it.")],
-    folder: Annotated[Path, typer.Option(help="Folder for the files.")] = Path(),
+    folder: Annotated[Path, Option("--folder", "FOLDER", "Folder for the files.")] = Path(),
 ) -> None:
     """Write a commented controller or plant, and its test."""
-    from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.contract.files import reason
-
     if kind not in NEXT:
         commands = " or ".join(f"servobench new {word} NAME" for word in NEXT)
-        raise ConfigurationError(f"{kind!r} is nothing to begin with; the command is {commands}")
+        refuse(f"{kind!r} is nothing to begin with; the command is {commands}")
     module = name.removesuffix(".py")
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", module) or keyword.iskeyword(module) or module.startswith(PREFIX):
-        raise ConfigurationError(f"the name must be one of a Python module, such as my_law, got {name!r}")
+        refuse(f"the name must be one of a Python module, such as my_law, got {name!r}")
     class_name = "".join(part[:1].upper() + part[1:] for part in module.split("_"))
     wanted = {folder / f"{module}.py": kind, folder / f"{PREFIX}{module}.py": f"{PREFIX}{kind}"}
     for path in wanted:
         if path.exists():
-            raise ConfigurationError(f"{path} exists already and is left as it is; take another name or --folder")
-    try:
+            refuse(f"{path} exists already and is left as it is; take another name or --folder")
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for path, template in wanted.items():
             text = (files(TEMPLATES) / "templates" / f"{template}.py.txt").read_text(encoding="utf-8")
             path.write_text(text.replace("{{module}}", module).replace("{{Class}}", class_name), encoding="utf-8")
-    except OSError as error:
-        raise ConfigurationError(f"{error.filename} cannot be written: {reason(error)}") from error
     file, test = wanted
     place = file if file.is_absolute() else f"./{file}"
     lines = [f"wrote {file} and {test}; next:", *(f"    servobench {command.format(place)}" for command in NEXT[kind])]
@@ -62,11 +57,11 @@ def check(
     subject: Annotated[
         list[str], typer.Argument(metavar="CONTROLLER | plant PLANT", help="As ./mine.py:Mine, or plant kinematic.")
     ],
-    limit: Annotated[float, typer.Option(min=1.0, help="Time limit of one check [s].")] = 60.0,
+    limit: Annotated[float, Option("--limit", "SECONDS", "Time limit of one check [s].", least=1.0)] = 60.0,
 ) -> None:
     """Check a controller or a plant against its contract.
 
-    Each failure says what to change.
+    Each failure names its remedy.
     """
     from rich.text import Text
 
@@ -74,17 +69,16 @@ def check(
     from servobench.harness.check.controllers import check_controller
     from servobench.harness.check.plants import check_plant
     from servobench.harness.check.report import Finding
-    from servobench.harness.config.settings import ConfigurationError
 
     if subject == ["plant"]:
-        raise ConfigurationError("check plant needs a plant, such as servobench check plant ./cell.py")
+        refuse("check plant needs a plant, such as servobench check plant ./cell.py")
     if subject[0] == "plant" and len(subject) == 2:
         checks: Checks = check_plant
         name = subject[1]
     elif len(subject) == 1:
         checks, name = check_controller, subject[0]
     else:
-        raise ConfigurationError(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
+        refuse(f"check needs a controller, or the word plant and a plant, got {' '.join(subject)!r}")
     findings: list[Finding] = []
 
     def hear(finding: Finding) -> None:
@@ -98,57 +92,49 @@ def check(
     failed = sum(finding.verdict == "failed" for finding in findings)
     console.print(f"{name}: " + (f"{failed} of {len(findings)} checks failed" if failed else "keeps its contract"))
     if failed:
-        sys.exit(options.FAILED)
+        sys.exit(FAILED)
 
 
 def shadow(
     log: Annotated[
-        Path,
-        typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps."),
+        Path, typer.Argument(help="Results folder, or a table (.csv, .parquet) with the columns of its steps.")
     ],
     controller: Annotated[
-        str | None,
-        typer.Option(
-            help="Name or file of the controller; default: that of the run.", autocompletion=completion.controllers
-        ),
+        str | None, Option("--controller", CONTROLLER, "Name or file of the controller; default: that of the run.")
     ] = None,
-    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
+    run: options.RunIdOption = None,
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV file for what it would have commanded at each instant.")
+        Path | None, Option("--out", "FILE", "CSV file for the commands of the controller at each instant.")
     ] = None,
 ) -> None:
     """Show a controller a logged run and compare commands.
 
-    Nothing is simulated: it sees what was logged, whatever it commands.
+    Nothing is simulated: its commands do not change the log.
     """
     from servobench.harness.batch.logged import logged_in_file, logged_in_folder
     from servobench.harness.config.registry import choose_controller
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see
-    from servobench.plant.contract.files import reason
 
     if not log.exists():
-        raise ConfigurationError(f"{log} does not exist; wanted a results folder or a table")
+        refuse(f"{log} does not exist; wanted a results folder or a table")
     chosen = None if controller is None else choose_controller(controller)
     if log.is_dir():
         resolved, table = logged_in_folder(log, run, chosen)
     elif chosen is None:
-        raise ConfigurationError(f"{log} does not say which controller to show it to; name one with --controller")
+        refuse(f"{log} does not say which controller to show it to; name one with --controller")
     else:
-        resolved, table = logged_in_file(log, chosen, known_robot(robot), one_sensing(sensing))
+        resolved, table = logged_in_file(log, chosen, robot, sensing)
     with console.status(f"showing {len(table)} rows to {resolved.request.controller}"):
         seen = see(resolved, table)
     if out is not None:
-        try:
+        with writing(out):
             seen.to_csv(out, index=False)
-        except OSError as error:
-            raise ConfigurationError(f"{out} cannot be written: {reason(error)}") from error
         say(f"table in {out}")
     elif not has_commands(seen):
-        raise ConfigurationError(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
+        refuse(f"{log} has no commands to compare with; --out FILE.csv keeps those of the controller")
     if has_commands(seen):
         rows = differences(seen).map(lambda each: each if isinstance(each, str) else f"{each:.3g}")
         print_tables([(f"{resolved.request.controller} beside the log", rows)], LEGEND)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servobench.harness.cli import completion
-from servobench.harness.cli.selection import split_names
-from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, say
+from servobench.harness.cli import selection
+from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Option, RunIdOption, Value
+from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, refuse, say
 
 if TYPE_CHECKING:
     from servobench.harness.pictures.replay import LoggedRun
@@ -28,8 +27,8 @@ RECORDED = {
 RECORDINGS = "recordings"
 
 
-def _new(what: str, complete: Callable[[str], list[str]] | None = None) -> Any:  # noqa: ANN401 - typer's word for it
-    return typer.Option(help=f"New run: {what}, default {RECORDED[what]}.", autocompletion=complete)
+def _new(name: str, value: Value | str) -> Option:
+    return Option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.")
 
 
 @dataclass(frozen=True)
@@ -38,46 +37,47 @@ class NewRun:
 
     plant: Annotated[
         str | None,
-        typer.Option(
-            help="New run: plant, default bullet, or mujoco without PyBullet.", autocompletion=completion.plants
-        ),
+        Option("--plant", PLANT, "New run: plant, default bullet, or mujoco without PyBullet."),
     ] = None
-    controller: Annotated[str | None, _new("controller", completion.controllers)] = None
-    task: Annotated[str | None, _new("task", completion.tasks)] = None
-    mismatch: Annotated[str | None, _new("mismatch", completion.mismatches)] = None
-    robot: Annotated[str | None, _new("robot", completion.robots)] = None
-    seed: Annotated[int | None, _new("seed")] = None
+    controller: Annotated[str | None, _new("controller", CONTROLLER)] = None
+    task: Annotated[str | None, _new("task", TASK)] = None
+    mismatch: Annotated[str | None, _new("mismatch", MISMATCH)] = None
+    robot: Annotated[str | None, _new("robot", ROBOT)] = None
+    seed: Annotated[int | None, _new("seed", "INTEGER")] = None
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="New run: one setting, such as bullet.latency=0.05.")
+        list[str] | None, Option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
     ] = None
-    config: Annotated[Path | None, typer.Option(help="New run: TOML file with settings.")] = None
+    config: Annotated[Path | None, Option("--config", "FILE", "New run: TOML file with settings.")] = None
 
     def given(self) -> list[str]:
         """Return the options of it that were given."""
         return [f"--{name.rstrip('_')}" for name, value in vars(self).items() if value not in (None, [])]
 
-    def asked(self) -> dict[str, Any]:
-        """Return what the run is of, with defaults for what was not given."""
+    def names(self) -> dict[str, Any]:
+        """Return the names and the seed of the run, with defaults for those that were not given."""
         from servobench.harness.config.registry import rendered_plant
 
-        named = {name: getattr(self, name) for name in ("plant", *RECORDED)}
-        chosen = {name: value for name, value in named.items() if value is not None}
-        return {"plant": rendered_plant(self.plant), **RECORDED, **chosen}
+        given = {name: value for name in ("plant", *RECORDED) if (value := getattr(self, name)) is not None}
+        return {"plant": rendered_plant(self.plant), **RECORDED, **given}
 
 
 def record(
     folder: Annotated[
         Path | None, typer.Argument(help="Results folder whose run to show; without one a run is carried out.")
     ] = None,
-    run: Annotated[str | None, typer.Option(help="The run_id, where the folder has more than one run.")] = None,
-    new: NewRun = NewRun(),
-    kinds: Annotated[str, typer.Option(help="Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
-    begin: Annotated[float, typer.Option(min=0.0, help="Time in the run at which the film begins [s].")] = 0.0,
+    *,
+    run: RunIdOption = None,
+    new: NewRun,
+    kinds: Annotated[str, Option("--kinds", "NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    begin: Annotated[
+        float, Option("--begin", "SECONDS", "Time in the run at which the film begins [s].", least=0.0)
+    ] = 0.0,
     length: Annotated[
-        float | None, typer.Option(min=0.001, help="Length of the film [s]; default: to the end of the run.")
+        float | None,
+        Option("--length", "SECONDS", "Length of the film [s]; default: to the end of the run.", least=0.001),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the films; default: recordings in the results folder.")
+        Path | None, Option("--out", "FOLDER", "Folder for the films; default: recordings in the results folder.")
     ] = None,
 ) -> None:
     """Make a film (MP4, GIF) and snapshots of a run.
@@ -89,7 +89,7 @@ def record(
     from servobench.harness.pictures.film import KINDS, find_kind, write_recording
     from servobench.harness.pictures.replay import stretch
 
-    wanted = split_names("kinds", kinds, KINDS, find_kind)
+    wanted = selection.split_names("kinds", kinds, KINDS, find_kind)
     into = out or (folder or Path("results")) / RECORDINGS
     _check_writable(into)
     with cleaning_up_when_terminated(), telling(console, "reading" if folder else "running") as tell:
@@ -103,25 +103,21 @@ def record(
 
 def _check_writable(folder: Path) -> None:
     """Refuse a folder that takes no film before a run is carried out and drawn."""
-    from servobench.harness.config.settings import ConfigurationError
-
     standing = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     if not standing.is_dir():
-        raise ConfigurationError(f"{folder} cannot be written: {standing} is a file")
+        refuse(f"{folder} cannot be written: {standing} is a file")
     if not os.access(standing, os.W_OK | os.X_OK):
-        raise ConfigurationError(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
+        refuse(f"{folder} cannot be written: {os.strerror(errno.EACCES)}")
 
 
 def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
     """Return the run of a folder that is named, or carry out a new one."""
-    from servobench.harness.config.settings import ConfigurationError
-
     if folder is not None:
         if given := new.given():
-            raise ConfigurationError(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
+            refuse(f"{given[0]} belongs to a new run; a run of {folder} is named by --run")
         return _run_of(folder, run_id)
     if run_id is not None:
-        raise ConfigurationError("--run names a run of a results folder, and no folder is given")
+        refuse("--run names a run of a results folder, and no folder is given")
     return _carried_out(new)
 
 
@@ -148,10 +144,10 @@ def _carried_out(new: NewRun) -> LoggedRun:
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.rendered.settings import RenderedConfig
 
-    asked, settings = new.asked(), read_settings(new.config, new.set_ or [])
-    (plant,), (controller,) = choose_plants([asked["plant"]]), choose_controllers([asked["controller"]])
-    chosen = {"plant": plant, "mismatch": read_mismatch(asked["mismatch"]), "controller": controller}
-    request = RunRequest(**asked | chosen)
+    names, settings = new.names(), read_settings(new.config, new.set_ or [])
+    (plant,), (controller,) = choose_plants([names["plant"]]), choose_controllers([names["controller"]])
+    chosen = {"plant": plant, "mismatch": read_mismatch(names["mismatch"]), "controller": controller}
+    request = RunRequest(**names | chosen)
     check_settings(settings, [request.plant, request.controller, request.task])
     result = run_experiment(request, settings)
     shown_as = flatten(settings.resolve(rendered_plant(request.plant), RenderedConfig()))

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from servobench.harness.cli import completion, options, selection
-from servobench.harness.cli.options import RobotOption
-from servobench.harness.cli.terminal import console, print_json, say
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import JsonOption
+from servobench.harness.cli.terminal import console, print_json, refuse, say, writing
 
 if TYPE_CHECKING:
     from servobench.harness.batch.trial import Tried
@@ -20,11 +21,10 @@ if TYPE_CHECKING:
 DEFAULT_ROBOT = "ur5"
 STANDARD_OUTPUT = Path("-")
 HELP = "Name whose settings to show."
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 
 
 def plants(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.plants)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_plants)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
@@ -41,7 +41,7 @@ def plants(
 
 
 def controllers(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.controllers)] = None,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_controllers)] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the controllers, or show the settings of one."""
@@ -63,26 +63,24 @@ def controllers(
 
 
 def tasks(
-    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=completion.tasks)] = None,
-    robot: RobotOption = DEFAULT_ROBOT,
+    name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
+    robot: Annotated[str, replace(options.ROBOT_OPTION, value=replace(options.ROBOT, check=None))] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
     from servobench.harness.config.robots import find_robot
-    from servobench.harness.config.settings import ConfigurationError
-    from servobench.harness.run.tasks import TASKS, find_task
-    from servobench.harness.run.teaching import taught
+    from servobench.harness.run.tasks import TASKS, find_task, taught
 
     if name:
         _show_settings(name, taught(find_task(name), find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
-        raise ConfigurationError("--robot shows the settings of one task for that arm; name the task, such as exp1")
+        refuse("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
         _show_names([_described(name, entry.summary) for name, entry in TASKS.items()], as_json=as_json)
 
 
 def sensing(as_json: JsonOption = False) -> None:
-    """List the sensing set-ups: what cameras measure of the arm."""
+    """List the sensing set-ups: features that cameras measure."""
     from servobench.plant.cameras.registry import EYES
 
     _show_names([_described(name, entry.summary) for name, entry in EYES.items()], as_json=as_json)
@@ -92,11 +90,12 @@ def sensing(as_json: JsonOption = False) -> None:
 
 def init(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The new file; - prints it.")] = Path("bench.toml"),
+    *,
     plants: options.PlantsOption = "kinematic,bullet",
     controllers: options.ControllersOption = "ukf_mfac",
     tasks: options.TasksOption = "exp2",
     robot: options.RobotOption = "ur5",
-    overrides: options.Overrides = options.OVERRIDES,
+    overrides: options.Overrides,
 ) -> None:
     """Write a configuration file with all settings, explained.
 
@@ -104,14 +103,14 @@ def init(
     """
     from servobench.harness.config.description import configuration_file
     from servobench.harness.config.registry import find_controller, find_plant
-    from servobench.harness.config.settings import ConfigurationError, Settings
+    from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest, read_mismatch
     from servobench.harness.run.resolved import known_sections, resolve_sections
     from servobench.harness.run.tasks import find_task
 
     names = selection.split_plants(plants), selection.split_controllers(controllers), selection.split_tasks(tasks)
-    arm, nominal = selection.known_robot(robot), read_mismatch("none")
-    requests = [RunRequest(*each, nominal, 0, robot=arm) for each in product(*names)]
+    nominal = read_mismatch("none")
+    requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
     settings.check_sections([*known_sections(), *names[0], *names[1]])
     finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}
@@ -127,13 +126,10 @@ def init(
     if file == STANDARD_OUTPUT:
         sys.stdout.write(text)
         return
-    try:
-        with file.open("x", encoding="utf-8") as new:
-            new.write(text)
-    except FileExistsError:
-        raise ConfigurationError(f"{file} exists already and is left as it is; name another file") from None
-    except OSError as error:
-        raise ConfigurationError(f"{file} cannot be written: {error.strerror}") from error
+    if file.exists():
+        refuse(f"{file} exists already and is left as it is; name another file")
+    with writing(file), file.open("x", encoding="utf-8") as new:
+        new.write(text)
     say(f"{file}: {', '.join(sections)}")
 
 
@@ -142,7 +138,7 @@ def _described(name: str, summary: str) -> dict[str, str]:
 
 
 def _listed(all_of_them: Iterable[Tried], unused: Iterable[tuple[str, str]]) -> list[dict[str, str]]:
-    """Return names with their summaries, and what is wrong with those that cannot be used."""
+    """Return names with their summaries, or with the fault of those that cannot be used."""
     found = [
         {"name": each.name, "error": each.fault} if each.fault else _described(each.name, each.summary)
         for each in all_of_them
@@ -165,14 +161,14 @@ def _show_names(found: Sequence[dict[str, str]], *, as_json: bool) -> None:
     for each in found:
         base = summaries.get(each["name"].partition(":")[0], "")
         words = each.get("summary", "")
-        if base and words != base:  # a variant: only what is different
+        if base and words != base:  # a variant: only the difference
             words = words.removeprefix(base).lstrip("; ")
         table.add_row(Text(each["name"]), Text(words) if words else Text(each.get("error", ""), style="red"))
     console.print(table)
 
 
 def _show_settings(section: str, config: object, *, as_json: bool) -> None:
-    """Print each setting with its default, and what it means."""
+    """Print each setting with its default and its meaning."""
     from rich.padding import Padding
     from rich.text import Text
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.options import Option
+from servobench.harness.cli.terminal import console, print_tables, refuse, writing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,41 +24,34 @@ TABLE = "analyse.csv"
 
 def analyse(
     controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
-    mismatch: Annotated[
-        str,
-        typer.Option(
-            help="Difference of the true robot from the nominal one: none, factory, moderate, severe, or axes."
-        ),
-    ] = "none",
-    seed: Annotated[int, typer.Option(help="Seed of the warm-up move and of the robot.")] = 0,
+    *,
+    mismatch: options.MismatchOption = "none",
+    seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
-        str, typer.Option(help="Jacobian that estimators are fixed at: true, nominal or estimated.")
+        str, Option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated.")
     ] = "true",
     identify: Annotated[
         bool,
-        typer.Option(
-            "--identify", help="Identify all loops from logged small motions, while estimators go on learning."
-        ),
+        Option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning."),
     ] = False,
     simulate: Annotated[
-        bool, typer.Option("--simulate", help="Also find the limits of gain and latency by simulation.")
+        bool, Option("--simulate", "", "Also find the limits of gain and latency by simulation.")
     ] = False,
-    overrides: options.Overrides = options.OVERRIDES,
-    out: Annotated[Path, typer.Option(help="Folder for table, pictures and page.")] = Path("results") / "analyse",
+    overrides: options.Overrides,
+    out: Annotated[Path, Option("--out", "FOLDER", "Folder for table, pictures and page.")] = Path("results")
+    / "analyse",
 ) -> None:
     """Analyse the loop at rest: margins, Bode, Nyquist, step.
 
     Also sensitivity, and stability over gain and latency.
     """
-    from servobench.harness.analysis.loops.loop_analysis import analyse_loop
-    from servobench.harness.analysis.loops.table import LEGEND, loop_table, printed
-    from servobench.harness.config.settings import ConfigurationError
+    from servobench.harness.analysis.loops.loop_analysis import LEGEND, analyse_loop, loop_table, printed
     from servobench.harness.pictures.loops import write_pictures
     from servobench.plant.contract.faults import RunFault
 
-    source, arm = _source(jacobian), selection.known_robot(robot)
-    runs = _resolved(controllers, mismatch, seed, arm, overrides.settings())
+    source = _source(jacobian)
+    runs = _resolved(controllers, mismatch, seed, robot, overrides.settings())
     loops: list[LoopAnalysis] = []
     for run in runs:
         with console.status(f"analysing {run.request.controller}"):
@@ -66,17 +60,15 @@ def analyse(
             except RunFault as fault:
                 console.print(f"{run.request.controller}: {fault}", soft_wrap=True, markup=False)
     if not loops:
-        raise ConfigurationError("no loop is left to analyse")
+        refuse("no loop is left to analyse")
     table = loop_table(loops)
     if simulate:
         chosen = {run.request.controller: run for run in runs}
         with console.status("simulating"):
             table = table.join(_simulated([chosen[loop.name] for loop in loops]))
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"{out} cannot be written: {error.strerror}") from error
-    table.to_csv(out / TABLE, index=False)
+        table.to_csv(out / TABLE, index=False)
     text = printed(table)
     page = write_pictures(out, loops, text, LEGEND)[0]
     title = f"Loops at rest, estimators frozen at the {source} Jacobian"
@@ -86,14 +78,13 @@ def analyse(
 
 def _source(jacobian: str) -> Source:
     from servobench.harness.analysis.loops.equilibrium import SOURCES
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.plant.contract.settings import did_you_mean
 
-    for source in SOURCES:
-        if source == jacobian:
-            return source
-    hint = did_you_mean(jacobian, SOURCES)
-    raise ConfigurationError(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
+    known = [source for source in SOURCES if source == jacobian]
+    if not known:
+        hint = did_you_mean(jacobian, SOURCES)
+        refuse(f"--jacobian must be one of {', '.join(SOURCES)}, got {jacobian!r}{hint}")
+    return known[0]
 
 
 def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, settings: Settings) -> list[ResolvedRun]:
@@ -113,8 +104,7 @@ def _simulated(runs: list[ResolvedRun]) -> pd.DataFrame:
     import pandas as pd
 
     from servobench.controllers.servo import ServoController
-    from servobench.harness.analysis.loops.equilibrium import warm_up
-    from servobench.harness.analysis.loops.simulation import SmallLoop
+    from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
 
     rows: list[tuple[float, float]] = []
     for run in runs:

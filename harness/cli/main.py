@@ -5,48 +5,40 @@ from __future__ import annotations
 import contextlib
 import errno
 import faulthandler
+import io
 import os
 import sys
-from collections.abc import Callable
-from typing import Annotated, Any, NoReturn
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 import typer.main
+from rich.markup import escape
 
-from servobench.harness.cli import authoring, completion, lists, results, runs, studies
+from servobench.harness.cli import authoring, lists, results, runs, studies
 from servobench.harness.cli.films import record
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.loops import analyse
-from servobench.harness.cli.options import FAILED, HELP_NAMES, INTERRUPTED, grouped, word
+from servobench.harness.cli.options import command, reason_without
+from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 
-INPUT_ERROR = 2  # exit code
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
-WITHOUT: dict[tuple[object, object], str] = {  # why a command does not have an option that others have
-    ("claims", "--robot"): "the claims are those of the paper, which are about a UR5",
-    ("tune", "--robot"): "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how "
-    "they do",
-    ("claims", "--sensing"): "the claims are those of the paper, which are about the ball in 3-D",
-    ("tune", "--sensing"): "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural "
-    "units; compare shows how they do",
-    (
-        "analyse",
-        "--sensing",
-    ): "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
-    ("record", "--sensing"): "films show the ball's way through space; figures of run --sensing show pixels",
-    ("controllers", "--sensing"): "settings of a controller are the same under all sensing",
-}
+HELP_NAMES: Final = ["-h", "--help"]
+COMPLETION_REQUEST: Final = "_SERVOBENCH_COMPLETE"  # environment variable of a shell that wants completions
+BASH: Final = "complete_bash"
+WORD_BREAKS: Final = frozenset(":=")  # at which bash splits a word, though names of methods and settings have them
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {  # title -> commands, in the order of first use
     "First steps": (runs.run, runs.compare, results.statistics, results.report, record),
     "Your own controller": (authoring.new, authoring.check, authoring.shadow),
     "What there is": (lists.plants, lists.controllers, lists.tasks, lists.sensing, lists.init),
     "Studies": (studies.sweep, analyse, studies.robustness, studies.claims, studies.tune),
-    "Tools": (runs.train, runs.collect, results.export, results.verify),
+    "Tools": (runs.train, results.collect, results.export, results.verify),
 }
 
 app = typer.Typer(context_settings={"help_option_names": HELP_NAMES}, pretty_exceptions_enable=False)
-for panel, commands in PANELS.items():
-    for command in commands:
-        app.command(rich_help_panel=panel)(grouped(command))
+for title, functions in PANELS.items():
+    for function in functions:
+        app.command(rich_help_panel=title)(command(function))
 app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
 
 
@@ -70,25 +62,43 @@ def servobench(
 def command_line() -> Any:  # noqa: ANN401 - typer's own classes have no public name
     """Return the command with all subcommands."""
     root = typer.main.get_command(app)
-    word(root)
+    _hide_types(root)
     return root
+
+
+def _hide_types(root: Any) -> None:  # noqa: ANN401 - typer's own classes have no public name
+    """Let help pages name values by words such as FOLDER instead of types in Python, and print brackets of units."""
+    help_option = root.get_help_option(typer.Context(root, help_option_names=HELP_NAMES))
+    for each in (*root.params, help_option):
+        each.help = escape(each.help or "")
+        if each.param_type_name == "argument":
+            each.metavar = each.metavar or each.name.upper()
+            each.display_type_rich = _no_type
+        elif each.is_flag:
+            each.metavar = ""
+    for subcommand in getattr(root, "commands", {}).values():
+        _hide_types(subcommand)
+
+
+def _no_type(ctx: object) -> None:
+    """Return no type: the help of an argument says enough."""
 
 
 def main() -> None:
     """Run the command line; a bad input is one line on standard error and exit code 2."""
     _say_where_a_signal_strikes()
     try:
-        with completion.rejoining_words():
+        with rejoining_words():
             code = command_line()(sys.argv[1:] or ["--help"], prog_name="servobench", standalone_mode=False)
     except KeyboardInterrupt:  # before the command began
         code = INTERRUPTED
     except typer.TyperException as error:
-        _refuse(_usage_line(error))
+        _end(_usage_line(error))
     except (ValueError, ImportError) as error:
         line = _line_for_user(error)
         if line is None:
             raise
-        _refuse(line)
+        _end(line)
     except OSError as error:
         line = _line_of_system(error)
         if line is None or "--debug" in sys.argv:
@@ -102,8 +112,8 @@ def main() -> None:
 
 def _resuming() -> str:
     """Return how the command goes on after an error of the system, if it has finished runs to keep."""
-    command = command_line().commands.get("".join(sys.argv[1:2]))
-    kept = command is not None and any(option.name == "resume" for option in command.params)
+    called = command_line().commands.get("".join(sys.argv[1:2]))
+    kept = called is not None and any(option.name == "resume" for option in called.params)
     return "; finished runs are kept, --resume continues" if kept else ""
 
 
@@ -114,25 +124,25 @@ def _say_where_a_signal_strikes() -> None:
             faulthandler.enable(sys.__stderr__)
 
 
-def _refuse(line: str) -> NoReturn:
+def _end(line: str) -> NoReturn:
     if line:
         sys.stderr.write(f"servobench: {line}\n")
     sys.exit(INPUT_ERROR)
 
 
 def _usage_line(error: typer.TyperException) -> str:
-    """Return what a command that cannot be understood is told with; nothing where its help was printed."""
+    """Return the one-line usage error; empty if the help page was printed."""
     context = getattr(error, "ctx", None)
     option = getattr(error, "option_name", None)
-    if context and (context.info_name, option) in WITHOUT:
-        return f"{context.info_name} has no {option}: {WITHOUT[context.info_name, option]}"
+    if context and (reason := reason_without(context.info_name, option)):
+        return f"{context.info_name} has no {option}: {reason}"
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())
     return f"{words[0].lower()}{words[1:].rstrip('.')}{help_}" if words else ""
 
 
 def _line_of_system(error: OSError) -> str | None:
-    """Return what a folder that takes no more files is told with; None for a defect."""
+    """Return the one-line error for a folder in which no file can be written; None for a defect."""
     from servobench.harness.batch.checksums import UnwritableFolder
 
     if isinstance(error, UnwritableFolder):
@@ -143,13 +153,46 @@ def _line_of_system(error: OSError) -> str | None:
 
 
 def _line_for_user(error: ValueError | ImportError) -> str | None:
-    """Return what a bad input or a missing extra is told with; None for a defect."""
+    """Return the one-line error for a bad input or a missing extra; None for a defect."""
     from servobench.harness.config.installation import missing_extra
     from servobench.harness.config.settings import ConfigurationError
 
     if isinstance(error, ImportError):
         return missing_extra(error, "this command")
     return str(error) if isinstance(error, ConfigurationError) else None
+
+
+@contextlib.contextmanager
+def rejoining_words() -> Iterator[None]:
+    """Let bash complete within a word that it splits at a colon or an equals sign; it wants the part behind it."""
+    if os.environ.get(COMPLETION_REQUEST) != BASH:
+        yield
+        return
+    words, index = os.environ["COMP_WORDS"].split("\n"), int(os.environ["COMP_CWORD"])
+    joined, before = join_words(words, index)
+    os.environ.update(COMP_WORDS="\n".join(joined), COMP_CWORD=str(len(joined) - 1))
+    answer = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(answer):
+            yield
+    finally:
+        for line in answer.getvalue().splitlines():
+            sys.stdout.write(line.removeprefix(before) + "\n")
+
+
+def join_words(words: list[str], index: int) -> tuple[list[str], str]:
+    """Return the words up to that of `index` as they were typed, and the part of the last one before its last break."""
+    joined, before, after_break = list[str](), "", False
+    for word in words[: index + 1]:
+        is_break = bool(word) and WORD_BREAKS.issuperset(word)
+        if len(joined) > 1 and (is_break or after_break):
+            before = joined[-1] + (word if is_break else "")
+            joined[-1] += word
+        else:
+            before = ""
+            joined.append(word)
+        after_break = is_break
+    return joined, before
 
 
 if __name__ == "__main__":

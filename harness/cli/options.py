@@ -1,175 +1,310 @@
-"""Options that several commands share."""
+"""Options of the command line, each declared once, and commands made of them.
+
+The type of a parameter declares its option: `seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the run.")]`.
+Help pages, completion by shells, checks and the table in docs/commands.md are made from this one row. A parameter whose
+type is a dataclass stands for its fields, each of which is an option.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
-from rich.markup import escape
 
-from servobench.harness.cli import completion
+from servobench.harness.cli import selection
+from servobench.harness.cli.terminal import refuse
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
+    from servobench.harness.batch.compare import Batch
     from servobench.harness.batch.workers import Bounds
     from servobench.harness.config.settings import Settings
 
-DEFAULT_PLANT = "the first of bullet, mujoco and kinematic that is installed"
-FAILED = 1  # exit code where a run failed, or a check was not passed
-INTERRUPTED = 130  # exit code after Ctrl-C
-EXECUTION = "Execution"  # title of the options that say how runs are carried out
-
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", help="TOML file with settings; a [section] for each plant, controller or task."),
-]
-SetOption = Annotated[
-    list[str] | None, typer.Option("--set", help="One setting, such as kinematic.lag=0.1; may be repeated.")
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="Worker processes; default: one for each processor.", rich_help_panel=EXECUTION),
-]
-SchedulerOption = Annotated[
-    str | None, typer.Option(help="Address of a Dask scheduler to which runs are sent.", rich_help_panel=EXECUTION)
-]
-TimeoutOption = Annotated[
-    float | None,
-    typer.Option(
-        min=0.001,
-        help="Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
-        rich_help_panel=EXECUTION,
-    ),
-]
-MemoryOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
-        "servobench's.",
-        rich_help_panel=EXECUTION,
-    ),
-]
-IsolateOption = Annotated[
-    bool,
-    typer.Option(
-        "--isolate/--no-isolate",
-        help="Keep plug-ins and foreign FMUs in processes of their own, with limits.",
-        rich_help_panel=EXECUTION,
-    ),
-]
+EXECUTION = "Execution"  # panel of the options for workers, limits and resuming
 
 
-def _listed(what: str, complete: Callable[[str], list[str]], kinds: str = "names or files") -> Any:  # noqa: ANN401
-    """Return the option for several of what a command lists."""
-    return typer.Option(
-        help=f"Comma-separated {kinds}, or 'all'; servobench {what} lists them.",
-        autocompletion=completion.listed(complete),
+@dataclass(frozen=True)
+class Value:
+    """A kind of value that options take.
+
+    Attributes:
+        word: its name in help pages.
+        complete: values that a shell offers for an incomplete one.
+        check: returns the value of a text that was given or is the default, or refuses it.
+    """
+
+    word: str
+    complete: Callable[[str], list[str]] | None = None
+    check: Callable[[str], str] | None = None
+
+    def several(self) -> Value:
+        """Return the value of an option that takes a comma-separated list of these."""
+        return Value(f"{self.word}S", selection.completing_lists(self.complete) if self.complete else None)
+
+
+PLANT = Value("NAME", selection.complete_plants)
+CONTROLLER = Value("NAME", selection.complete_controllers)
+ESTIMATOR = Value("NAME", selection.complete_estimators)
+TASK = Value("NAME", selection.complete_tasks)
+MISMATCH = Value("NAME", selection.complete_mismatches)
+ROBOT = Value("NAME", selection.complete_robots, selection.known_robot)
+SENSING = Value("NAME", selection.complete_sensings, selection.known_sensing)
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of the command line.
+
+    Attributes:
+        name: with its dashes; `--on/--off` for a switch with two names, `--output -o` for a short one.
+        value: kind of its value, or only the word for it; empty for a switch.
+        help: meaning, unit in brackets.
+        least: smallest number that is allowed.
+        panel: title under which help pages show it.
+        absent: command without this option -> the reason.
+        folder_okay: whether a path may be that of a folder.
+    """
+
+    name: str
+    value: Value | str
+    help: str
+    least: float | None = None
+    panel: str | None = None
+    absent: Mapping[str, str] = field(default_factory=dict)
+    folder_okay: bool = True
+
+    @property
+    def kind(self) -> Value:
+        """The kind of its value."""
+        return self.value if isinstance(self.value, Value) else Value(self.value)
+
+    def typed(self) -> Any:  # noqa: ANN401 - typer's own word for it
+        """Return the option as typer declares it."""
+        return typer.Option(
+            *self.name.split(),
+            metavar=self.kind.word,
+            help=self.help,
+            autocompletion=self.kind.complete,
+            min=self.least,
+            rich_help_panel=self.panel,
+            dir_okay=self.folder_okay,
+        )
+
+
+def option_of(hint: Any) -> Option | None:  # noqa: ANN401 - any type
+    """Return the option that the type of a parameter declares; None for an argument."""
+    return next((each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Option)), None)
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Return a function as a command that typer can read, with its dataclasses taken apart into options."""
+    hints = get_type_hints(function, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    rows = list(_rows(function, hints, groups))
+    declared = {name: option for name, _, hint in rows if (option := option_of(hint)) is not None}
+
+    @wraps(function)
+    def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
+        from servobench.harness.config.registry import offering
+
+        for name, option in declared.items():
+            if option.kind.check is not None and values[name] is not None:
+                values[name] = option.kind.check(values[name])
+        for name, group in groups.items():
+            values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
+        with offering():  # a user's own controllers have their names for as long as the command takes
+            function(**values)
+
+    parameters = []
+    for name, default, hint in rows:
+        shown = Annotated[hint.__origin__, declared[name].typed()] if name in declared else hint
+        parameters.append(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=shown))
+    vars(call).update(
+        __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
     )
+    return call
 
 
-PlantsOption = Annotated[str, _listed("plants", completion.plants)]
-ControllersOption = Annotated[str, _listed("controllers", completion.controllers)]
-TasksOption = Annotated[str, _listed("tasks", completion.tasks, "names")]
-TaskOption = Annotated[
-    str, typer.Option(help="Name of the task; servobench tasks lists them.", autocompletion=completion.tasks)
+def _rows(
+    function: Callable[..., None], hints: Mapping[str, Any], groups: Mapping[str, Any]
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, default and type of each option and argument of a command."""
+    for name, parameter in signature(function).parameters.items():
+        if name not in groups:
+            yield name, parameter.default, hints[name]
+            continue
+        types = get_type_hints(groups[name], include_extras=True)
+        for each in fields(groups[name]):
+            default = each.default if parameter.default is Parameter.empty else getattr(parameter.default, each.name)
+            yield each.name, default, types[each.name]
+
+
+def reason_without(command_name: object, option_name: object) -> str:
+    """Return why a command does not have an option that others have; empty if no reason is declared."""
+    declared = (option_of(each) for each in globals().values())
+    reasons = (each.absent.get(str(command_name), "") for each in declared if each and each.name == option_name)
+    return next(reasons, "")
+
+
+AXES = "none, factory, moderate, severe, or axes, such as links=10%+tool=20mm"
+LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
+ROBOT_OPTION = Option(
+    "--robot",
+    ROBOT,
+    "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf.",
+    absent={
+        "claims": "the claims are those of the paper, which are about a UR5",
+        "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+    },
+)
+SENSING_OPTION = Option(
+    "--sensing",
+    SENSING,
+    "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
+    absent={
+        "claims": "the claims are those of the paper, which are about the ball in 3-D",
+        "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
+        "compare shows how they do",
+        "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
+        "record": "films show the ball's way through space; figures of run --sensing show pixels",
+        "controllers": "settings of a controller are the same under all sensing",
+    },
+)
+RobotOption = Annotated[str, ROBOT_OPTION]
+SensingOption = Annotated[str, SENSING_OPTION]
+PlantsOption = Annotated[str, Option("--plants", PLANT.several(), LISTED.format("plants"))]
+ControllersOption = Annotated[str, Option("--controllers", CONTROLLER.several(), LISTED.format("controllers"))]
+TasksOption = Annotated[
+    str, Option("--tasks", TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")
 ]
+TaskOption = Annotated[str, Option("--task", TASK, "Name of the task; servobench tasks lists them.")]
 MismatchOption = Annotated[
-    str,
-    typer.Option(
-        help="How far the true robot is from the nominal one: none, factory, moderate, severe, or axes, such as "
-        "links=10%+tool=20mm.",
-        autocompletion=completion.mismatches,
-    ),
+    str, Option("--mismatch", MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")
 ]
-MismatchesOption = Annotated[
-    str,
-    typer.Option(
-        metavar="NAMES",
-        help="Comma-separated: none, factory, moderate, severe, or axes, such as links=10%+tool=20mm.",
-        autocompletion=completion.listed(completion.mismatches),
-    ),
-]
-RobotOption = Annotated[
-    str,
-    typer.Option(
-        help="ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf.",
-        autocompletion=completion.robots,
-    ),
-]
-SensingOption = Annotated[
-    str,
-    typer.Option(
-        help="position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
-        autocompletion=completion.sensings,
-    ),
-]
-SensingsOption = Annotated[
-    str,
-    typer.Option(
-        metavar="NAMES",
-        help="Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the hand.",
-        autocompletion=completion.listed(completion.sensings),
-    ),
-]
-SeedsOption = Annotated[str, typer.Option(help="A count (5), a list (3,1,4) or a range (100:120).")]
-FolderOption = Annotated[Path, typer.Option(help="Folder for the results; with --resume the one to continue.")]
+SeedsOption = Annotated[str, Option("--seeds", "SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
+FolderOption = Annotated[Path, Option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")]
+RunIdOption = Annotated[str | None, Option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")]
+JsonOption = Annotated[bool, Option("--json", "", "Print JSON, for other programs.")]
 DebugOption = Annotated[
-    bool,
-    typer.Option(
-        "--debug", help="Run in this process, and stop at the first crash with its trace.", rich_help_panel=EXECUTION
-    ),
-]
-StrictOption = Annotated[
-    bool, typer.Option("--strict", help="End with exit code 1 if a run failed.", rich_help_panel=EXECUTION)
-]
-ResumeOption = Annotated[
-    bool, typer.Option("--resume", help="Continue in a folder whose runs were interrupted.", rich_help_panel=EXECUTION)
+    bool, Option("--debug", "", "Run in this process, and stop at the first crash with its trace.", panel=EXECUTION)
 ]
 
 
 @dataclass(frozen=True)
-class Limited:
-    """What a command lets a run take."""
+class Combinations:
+    """The runs of a comparison or a sweep: all combinations of these names and seeds."""
 
-    run_timeout: TimeoutOption = None
-    run_memory: MemoryOption = None
-    isolate: IsolateOption = True
+    plants: PlantsOption = "kinematic"
+    controllers: ControllersOption = "all"
+    tasks: TasksOption = "exp1,exp2,exp3,exp4,circle"
+    mismatch: Annotated[str, Option("--mismatch", MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
+    robot: RobotOption = "ur5"
+    sensing: Annotated[
+        str,
+        replace(
+            SENSING_OPTION,
+            value=SENSING.several(),
+            help="Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the "
+            "hand.",
+        ),
+    ] = "position"
+    seeds: SeedsOption = "1"
+
+    def batch(self) -> Batch:
+        """Return them as the planner takes them, each name looked up.
+
+        Raises:
+            ConfigurationError: a name that is unknown or given twice, or seeds that cannot be read.
+        """
+        from servobench.harness.batch.compare import Batch, parse_seeds
+
+        return Batch(
+            selection.split_plants(self.plants, robot=self.robot),
+            selection.split_controllers(self.controllers, self.robot),
+            selection.split_tasks(self.tasks),
+            selection.split_mismatches(self.mismatch),
+            parse_seeds(self.seeds),
+            self.robot,
+            selection.split_sensings(self.sensing),
+        )
+
+
+@dataclass(frozen=True)
+class Limited:
+    """Limits of a single run."""
+
+    run_timeout: Annotated[
+        float | None,
+        Option(
+            "--run-timeout",
+            "SECONDS",
+            "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
+            least=0.001,
+            panel=EXECUTION,
+        ),
+    ] = None
+    run_memory: Annotated[
+        str | None,
+        Option(
+            "--run-memory",
+            "SIZE",
+            "Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
+            "servobench's.",
+            panel=EXECUTION,
+        ),
+    ] = None
+    isolate: Annotated[
+        bool,
+        Option(
+            "--isolate/--no-isolate",
+            "",
+            "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
+            panel=EXECUTION,
+        ),
+    ] = True
 
     def bounds(self) -> Bounds:
-        """Return it as the driver takes it.
+        """Return them as the driver takes them.
 
         Raises:
             ConfigurationError: a memory limit that is no size.
         """
         from servobench.harness.batch.guard import read_size
         from servobench.harness.batch.workers import Bounds
-        from servobench.harness.config.settings import ConfigurationError
 
         try:
             memory = None if self.run_memory is None else read_size(self.run_memory)
         except ValueError as error:
-            raise ConfigurationError(f"--run-memory: {error}") from error
+            refuse(f"--run-memory: {error}")
         return Bounds(self.run_timeout, memory, self.isolate)
 
 
 @dataclass(frozen=True)
 class Place(Limited):
-    """Where a command carries runs out."""
+    """Processors or cluster that carry runs out."""
 
-    workers: WorkersOption = None
-    scheduler: SchedulerOption = None
+    workers: Annotated[
+        int | None,
+        Option("--workers", "COUNT", "Worker processes; default: one for each processor.", least=1, panel=EXECUTION),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        Option("--scheduler", "ADDRESS", "Address of a Dask scheduler to which runs are sent.", panel=EXECUTION),
+    ] = None
 
 
 @dataclass(frozen=True)
 class Running(Place):
-    """How a command carries runs out that can be resumed."""
+    """Execution of runs that can be resumed."""
 
-    resume: ResumeOption = False
+    resume: Annotated[
+        bool, Option("--resume", "", "Continue in a folder whose runs were interrupted.", panel=EXECUTION)
+    ] = False
 
     def execution(self, observer: Observer | None = None) -> Execution:
         """Return it as the driver takes it."""
@@ -180,19 +315,17 @@ class Running(Place):
 
 @dataclass(frozen=True)
 class Judging:
-    """What a command does about runs that fail."""
+    """Treatment of runs that fail."""
 
     debug: DebugOption = False
-    strict: StrictOption = False
+    strict: Annotated[bool, Option("--strict", "", "End with exit code 1 if a run failed.", panel=EXECUTION)] = False
 
     def execution(self, running: Running) -> Execution:
-        """Return how runs are carried out: as asked for, but one by one in this process where they are debugged.
+        """Return the execution of runs; one by one in this process if they are debugged.
 
         Raises:
             ConfigurationError: processes or a time limit for runs that are debugged.
         """
-        from servobench.harness.config.settings import ConfigurationError
-
         how = running.execution()
         if not self.debug:
             return how
@@ -204,7 +337,7 @@ class Judging:
         }
         for option, value in given.items():
             if value:
-                raise ConfigurationError(f"--debug carries runs out one by one in this process; leave {option} away")
+                refuse(f"--debug carries runs out one by one in this process; leave {option} away")
         return replace(how, workers=1, debug=True)
 
 
@@ -212,95 +345,17 @@ class Judging:
 class Overrides:
     """Settings that a user gives."""
 
-    set_: SetOption = None
-    config: ConfigOption = None
+    set_: Annotated[
+        list[str] | None,
+        Option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated."),
+    ] = None
+    config: Annotated[
+        Path | None,
+        Option("--config", "FILE", "TOML file with settings; a [section] for each plant, controller or task."),
+    ] = None
 
     def settings(self, *further: str) -> Settings:
         """Return them, with `further` assignments on top."""
         from servobench.harness.config.settings import read_settings
 
         return read_settings(self.config, [*(self.set_ or []), *further])
-
-
-LIMITED, PLACE, RUNNING, JUDGING, OVERRIDES = Limited(), Place(), Running(), Judging(), Overrides()  # as defaults
-
-
-VALUES = {  # what a value is -> the long names of the options that take it
-    "NAME": "controller division estimator format jacobian mismatch plant robot sensing task",
-    "NAMES": "axes controllers kinds plants platforms tasks",
-    "SEEDS": "seeds",
-    "INTEGER": "fmi offset seed study-seed",
-    "COUNT": "robots search studies trials workers",
-    "NUMBER": "never",
-    "NUMBERS": "noise",
-    "SECONDS": "begin latency length limit period run-timeout",
-    "SIZE": "run-memory",
-    "KEY=VALUE": "set",
-    "AXIS=VALUES": "vary",
-    "FILE": "config output",
-    "FOLDER": "folder out",
-    "RUN_ID": "run",
-    "COLUMN": "metric",
-    "ADDRESS": "scheduler",
-}
-WORDS = {option: word for word, options in VALUES.items() for option in options.split()}
-HELP_NAMES = ["-h", "--help"]
-COMPLETION_HELP = {  # by the option that typer adds
-    "install_completion": "Let this shell complete names.",
-    "show_completion": "Print the completion script instead of installing it.",
-}
-
-
-def word(root: Any) -> None:  # noqa: ANN401 - typer's own classes have no public name
-    """Name the values in the help of a command and its subcommands, instead of their types in Python.
-
-    Help texts are taken as they stand: `[s]` is a unit and no markup.
-    """
-    waiting = [root]
-    while waiting:
-        each = waiting.pop()
-        waiting += getattr(each, "commands", {}).values()
-        for option in (*each.params, each.get_help_option(typer.Context(each, help_option_names=HELP_NAMES))):
-            option.help = COMPLETION_HELP.get(option.name) or escape(option.help or "")
-            if option.param_type_name == "argument":
-                option.metavar = option.metavar or option.name.upper()
-                option.display_type_rich = _untyped
-            elif option.is_flag:
-                option.metavar = ""
-            else:
-                option.metavar = option.metavar or WORDS[option.opts[0].removeprefix("--")]
-
-
-def _untyped(ctx: object) -> None:
-    """Return no type: the help of an argument says what it is."""
-
-
-def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that has, for each parameter that is a dataclass, the fields of this class as options."""
-    hints = get_type_hints(command, include_extras=True)
-    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
-    parameters = []
-    for name, parameter in signature(command).parameters.items():
-        if name in groups:
-            own = get_type_hints(groups[name], include_extras=True)
-            options: list[tuple[str, Any, Any]] = [
-                (each.name, each.default, own[each.name]) for each in fields(groups[name])
-            ]
-        else:
-            options = [(name, parameter.default, hints[name])]
-        parameters += [Parameter(key, Parameter.KEYWORD_ONLY, default=default, annotation=hint)
-                       for key, default, hint in options]  # fmt: skip
-
-    @wraps(command)
-    def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
-        from servobench.harness.config.registry import offering
-
-        for name, group in groups.items():
-            values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
-        with offering():  # a user's own controllers have their names for as long as the command takes
-            command(**values)
-
-    vars(call).update(
-        __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
-    )
-    return call

@@ -1,4 +1,4 @@
-"""What long commands show on their way: bars in a terminal, elsewhere a line now and then on standard error."""
+"""Progress of long commands: bars in a terminal, elsewhere a line now and then on standard error."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from rich.status import Status
 from rich.text import Text
 
 from servobench.harness.batch.campaign import Observer, Row
-from servobench.harness.cli.options import INTERRUPTED
+from servobench.harness.cli.terminal import INTERRUPTED
 
 FIRST_LINE, LINE_SHARE = 5.0, 0.1  # [s] to the first line, and from line to line at least; [1] of the time so far
 
 
 class Lines:
-    """Tells on standard error how far a command is, in few lines: for pipes and files, in which a bar is no use."""
+    """Progress as few lines on standard error, for pipes and files, in which a bar is no use."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._began = clock, clock()
@@ -40,7 +40,7 @@ class Lines:
 
         Args:
             share: how much is done, from 0 to 1.
-            text: what is told.
+            text: the line, without the time left.
         """
         now = self._clock()
         if now < self._due:
@@ -54,17 +54,17 @@ class Lines:
 
 @contextlib.contextmanager
 def telling(console: Console, begin: str) -> Iterator[Callable[[float, str], None]]:
-    """Yield what shows the share that is done of something, and its name.
+    """Yield a function that shows the finished share of a task, and its name.
 
     Args:
-        console: where it is shown, if that is a terminal.
-        begin: what is shown first.
+        console: place of the line, if that is a terminal.
+        begin: first line.
     """
     lines = Lines()
     with console.status(begin) as status:
 
-        def tell(share: float, what: str) -> None:
-            text = f"{what}: {100 * share:.0f} %"
+        def tell(share: float, task: str) -> None:
+            text = f"{task}: {100 * share:.0f} %"
             status.update(text)
             if not console.is_terminal:
                 lines.tell(share, text)
@@ -95,7 +95,7 @@ def run_progress(console: Console, *further: ProgressColumn) -> Progress:
 
 
 class ConsoleObserver(Observer):
-    """Shows what happens before the runs as a line, then a bar with throughput and time left.
+    """Shows the work before the runs as a line, then a bar with throughput and time left.
 
     Args:
         console: where.
@@ -154,7 +154,7 @@ def watching(console: Console, folder: Path, *, bar: bool = True) -> Iterator[Ob
 
     Args:
         console: where it shows the progress.
-        folder: what the user named with --out.
+        folder: the folder of --out.
         bar: see `ConsoleObserver`.
     """
     observer = ConsoleObserver(console, bar=bar)

@@ -1,4 +1,4 @@
-"""The commands on results folders, `statistics | report | export | verify`, and the verdict on failed runs."""
+"""The commands on results folders: `statistics | report | collect | export | verify`; the verdict on failed runs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from servobench.harness.cli.options import FAILED
-from servobench.harness.cli.terminal import console, print_json, print_markdown, print_tables, say
+from servobench.harness.cli.options import JsonOption, Option
+from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, refuse, say
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,28 +23,32 @@ def statistics(
     folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
     metric: Annotated[
         str | None,
-        typer.Option(
-            help="Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error."
+        Option(
+            "--metric",
+            "COLUMN",
+            "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
         ),
     ] = None,
     never: Annotated[
         float | None,
-        typer.Option(help="Value for a run that has none, such as one that never settled; default: twice the largest."),
+        Option(
+            "--never",
+            "NUMBER",
+            "Value for a run that has none, such as one that never settled; default: twice the largest.",
+        ),
     ] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as Markdown.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
+    markdown: Annotated[bool, Option("--markdown", "", "Print the tables as Markdown.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Judge the controllers of a folder, with 95 % intervals.
 
     Rates, medians, tails, failures and paired differences.
     """
-    from servobench.harness.analysis.cells import as_plain
-    from servobench.harness.analysis.tables import statistics_rows, statistics_tables
+    from servobench.harness.analysis.tables import as_plain, statistics_rows, statistics_tables
     from servobench.harness.batch import results
-    from servobench.harness.config.settings import ConfigurationError
 
     if markdown and as_json:
-        raise ConfigurationError("--markdown and --json are two ways to print the same; give one of them")
+        refuse("--markdown and --json are two ways to print the same; give one of them")
     runs = results.load_runs(folder)
     missing = results.describe_missing(folder)
     if as_json:
@@ -64,9 +68,7 @@ def statistics(
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The page; default: report.html in the folder.")
-    ] = None,
+    out: Annotated[Path | None, Option("--out", "FILE", "The page; default: report.html in the folder.")] = None,
 ) -> None:
     """Write one page about a results folder.
 
@@ -90,10 +92,21 @@ def make_report(folder: Path, out: Path | None = None) -> None:
     console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})", soft_wrap=True, markup=False)
 
 
-def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
-    """Check that a results folder holds what was written.
+def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
+    """Make the tables of a batch that was killed."""
+    from servobench.harness.batch import results
+    from servobench.harness.batch.lock import locked
 
-    Names each file that is damaged, and what to type. The exit code is 1 if there is one.
+    results.check_folder(folder)
+    with locked(folder):
+        count = results.collect(folder)
+    console.print(f"{count} runs in {folder / results.RUNS}")
+
+
+def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
+    """Check the files of a results folder by their checksums.
+
+    Names each damaged file and its remedy. The exit code is 1 if there is one.
     """
     from servobench.harness.batch.integrity import examine
     from servobench.harness.batch.lock import current_holder
@@ -110,14 +123,14 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
         say(line)
     if found.findings:
         sys.exit(FAILED)
-    console.print(f"{found.files} files are what was written, {found.runs} runs", markup=False, highlight=False)
+    console.print(f"{found.files} files are as they were written, {found.runs} runs", markup=False, highlight=False)
 
 
 def export(
     folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
-    out: Annotated[Path, typer.Option(help="New folder for the files.")],
+    out: Annotated[Path, Option("--out", "FOLDER", "New folder for the files.")],
     format_: Annotated[
-        str, typer.Option("--format", help="csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
+        str, Option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
     ] = "csv",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
@@ -132,7 +145,7 @@ def export(
 
 def print_faults(runs: pd.DataFrame) -> None:
     """Print why runs failed, a line each; of many the first ones."""
-    from servobench.harness.run.ending import COMPLETED
+    from servobench.harness.run.result import COMPLETED
 
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
         line = f"{row['run_id']}: {row['status']}: {row['reason']}"
@@ -147,7 +160,7 @@ def judge(folder: Path, *, strict: bool) -> None:
         strict: whether a run that failed makes the command fail.
     """
     from servobench.harness.batch import results
-    from servobench.harness.run.ending import COMPLETED
+    from servobench.harness.run.result import COMPLETED
 
     statuses = [table["status"] for table in results.iterate_runs(folder, ("status",))]
     count, failed = sum(map(len, statuses)), sum(int((status != COMPLETED).sum()) for status in statuses)

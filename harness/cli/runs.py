@@ -1,4 +1,4 @@
-"""The commands `servobench run | compare | train | collect`."""
+"""The commands that carry runs out, `servobench run | compare`, and `train`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from servobench.harness.cli import completion, options, selection
+from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, Option
 from servobench.harness.cli.results import judge, make_report, print_faults
-from servobench.harness.cli.terminal import console, print_tables, say
+from servobench.harness.cli.terminal import INTERRUPTED, console, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,8 +23,10 @@ if TYPE_CHECKING:
 
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 
-OutOption = Annotated[Path | None, typer.Option(help="New folder for the results; default: results/<date-time>.")]
-ReportOption = Annotated[bool, typer.Option("--report/--no-report", help="Also make the page report.html.")]
+OutOption = Annotated[
+    Path | None, Option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
+]
+ReportOption = Annotated[bool, Option("--report/--no-report", "", "Also make the page report.html.")]
 
 
 def run(
@@ -33,126 +36,92 @@ def run(
             metavar="CONTROLLER",
             help="Short for --controller.",
             show_default=False,
-            autocompletion=completion.controllers,
+            autocompletion=selection.complete_controllers,
         ),
     ] = None,
+    *,
     plant: Annotated[
         str | None,
-        typer.Option(
-            help=f"Name or file of the plant; default: {options.DEFAULT_PLANT}.", autocompletion=completion.plants
+        Option(
+            "--plant",
+            PLANT,
+            "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed.",
         ),
     ] = None,
     controller: Annotated[
         str | None,
-        typer.Option(
-            help=f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
-            autocompletion=completion.controllers,
+        Option(
+            "--controller",
+            CONTROLLER,
+            f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
         ),
     ] = None,
     estimator: Annotated[
         str | None,
-        typer.Option(help="Compose the law --controller with this estimator.", autocompletion=completion.estimators),
+        Option("--estimator", ESTIMATOR, "Compose the law --controller with this estimator."),
     ] = None,
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = "moderate",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    seed: Annotated[int, typer.Option(help="Seed of everything random in the run.")] = 0,
-    overrides: options.Overrides = options.OVERRIDES,
-    view: Annotated[bool, typer.Option("--view", help="Watch the bullet plant in a window.")] = False,
+    seed: Annotated[int, Option("--seed", "INTEGER", "Seed of everything random in the run.")] = 0,
+    overrides: options.Overrides,
+    view: Annotated[bool, Option("--view", "", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
-    limited: options.Limited = options.LIMITED,
+    limited: options.Limited,
     debug: options.DebugOption = False,
 ) -> None:
-    """Carry out one run and show what came of it.
+    """Carry out one run and show its results.
 
     The exit code is 1 if the run failed.
     """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.compare import Batch, parse_seeds
 
-    batch = Batch(
-        (_one_plant(plant, view=view),),
-        (_one_controller(method, controller, estimator),),
-        (task,),
-        (mismatch,),
-        parse_seeds(f"{seed},"),
-        selection.known_robot(robot),
-        (selection.one_sensing(sensing),),
-    )
+    if None not in (method, controller) and method != controller:
+        refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
+    plant = selection.known_plant(plant)
+    if view and plant != "bullet":
+        refuse(f"--view shows the plant bullet only, got --plant {plant}")
+    law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
+    name = selection.known_controller(law if estimator is None else f"{law}+{estimator}")
+    seeds = parse_seeds(f"{seed},")
+    batch = Batch((plant,), (name,), (task,), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
     judge(_carry_out(campaign, out, how, with_report=with_report), strict=True)
 
 
-def _one_plant(plant: str | None, *, view: bool) -> str:
-    """Return the name of the plant of a run."""
-    from servobench.harness.batch.apart import choose_plants
-    from servobench.harness.config.settings import ConfigurationError
-    from servobench.plant.bench.plant import PlantEntry
-
-    (name,) = [selection.default_plant()] if plant is None else choose_plants([plant])
-    if view and name != "bullet":
-        raise ConfigurationError(f"--view shows the plant bullet only, got --plant {name}")
-    selection.tell_unused(PlantEntry, [name])
-    return name
-
-
-def _one_controller(method: str | None, controller: str | None, estimator: str | None) -> str:
-    """Return the name of the controller of a run, which may be named as an argument or as an option."""
-    from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.apart import choose_controllers
-    from servobench.harness.config.settings import ConfigurationError
-
-    if None not in (method, controller) and method != controller:
-        raise ConfigurationError(f"two controllers are named, {method} and --controller {controller}; a run has one")
-    law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
-    (name,) = choose_controllers([law if estimator is None else f"{law}+{estimator}"])
-    selection.tell_unused(ControllerEntry, [name])
-    return name
-
-
 def compare(
-    plants: options.PlantsOption = "kinematic",
-    controllers: options.ControllersOption = "all",
-    tasks: options.TasksOption = "exp1,exp2,exp3,exp4,circle",
-    mismatch: options.MismatchesOption = "moderate",
-    robot: options.RobotOption = "ur5",
-    sensing: options.SensingsOption = "position",
-    seeds: options.SeedsOption = "1",
-    running: options.Running = options.RUNNING,
-    overrides: options.Overrides = options.OVERRIDES,
+    *,
+    combinations: options.Combinations,
+    running: options.Running,
+    overrides: options.Overrides,
     out: OutOption = None,
     with_report: ReportOption = True,
-    judging: options.Judging = options.JUDGING,
+    judging: options.Judging,
 ) -> None:
     """Compare controllers: run every combination."""
     from servobench.harness.batch.campaign import comparison
-    from servobench.harness.batch.compare import Batch, parse_seeds
-    from servobench.harness.config.settings import ConfigurationError
 
-    batch = Batch(
-        selection.split_plants(plants, robot=robot),
-        selection.split_controllers(controllers, robot),
-        selection.split_tasks(tasks),
-        selection.split_mismatches(mismatch),
-        parse_seeds(seeds),
-        selection.known_robot(robot),
-        selection.split_sensings(sensing),
-    )
+    batch = combinations.batch()
     if running.resume and out is None:
-        raise ConfigurationError("--resume needs --out, the folder to continue in")
+        refuse("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
     folder = _carry_out(campaign, out, judging.execution(running), with_report=with_report)
     judge(folder, strict=judging.strict)
 
 
 def train(
-    controller: Annotated[str, typer.Option(help="Name of the controller whose networks to train.")] = "rbfnn_mfac",
+    *,
+    controller: Annotated[
+        str,
+        Option("--controller", CONTROLLER, "Name of the controller whose networks to train."),
+    ] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    overrides: options.Overrides = options.OVERRIDES,
+    overrides: options.Overrides,
 ) -> None:
     """Train the networks of a controller.
 
@@ -163,7 +132,7 @@ def train(
     from servobench.harness.batch.apart import choose_controllers
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
-    from servobench.harness.run.network_cache import NETWORKS
+    from servobench.harness.run.knowledge import NETWORKS
     from servobench.harness.run.resolved import check_settings
     from servobench.plant.contract.cache import cache_folder
 
@@ -176,17 +145,6 @@ def train(
     table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
     console.print(table)
     console.print(f"kept in {cache_folder(NETWORKS)}", soft_wrap=True)
-
-
-def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
-    """Make the tables of a batch that was killed."""
-    from servobench.harness.batch import results
-    from servobench.harness.batch.lock import locked
-
-    results.check_folder(folder)
-    with locked(folder):
-        count = results.collect(folder)
-    console.print(f"{count} runs in {folder / results.RUNS}")
 
 
 @contextlib.contextmanager
@@ -204,7 +162,7 @@ def _ending_at_once(folder: Path, wanted: int) -> Iterator[None]:
         line = f"interrupted: {count} of {wanted} runs were finished and kept in {folder}; "
         line += "the same call with --resume and this --out continues"
         say(line)
-        sys.exit(options.INTERRUPTED)
+        sys.exit(INTERRUPTED)
 
 
 def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> Path:
@@ -222,11 +180,11 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
 
 def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
     """Print the tables of a folder whose runs are finished, and draw its figures and its report."""
-    from servobench.harness.analysis.summary import summary_legend, summary_tables
+    from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.config.installation import missing_extra
     from servobench.harness.config.settings import ConfigurationError
-    from servobench.harness.pictures.draw import draw_figures
+    from servobench.harness.pictures.figures import draw_figures
     from servobench.plant.contract.files import point_latest
 
     runs = results.load_runs(folder)

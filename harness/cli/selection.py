@@ -1,10 +1,12 @@
-"""Names that a user gives, alone or as a list: split, looked up, and refused at once where they are mistyped."""
+"""Names of plants, controllers, tasks, robots, sensing and mismatches: completed by shells, split and looked up."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
+
+from servobench.harness.cli.terminal import refuse, say
 
 if TYPE_CHECKING:
     from servobench.controllers.controller import ControllerEntry
@@ -12,9 +14,76 @@ if TYPE_CHECKING:
     from servobench.plant.bench.plant import PlantEntry
 
 
+def complete_plants(incomplete: str) -> list[str]:
+    """Return the plants whose names begin so."""
+    from servobench.harness.config.registry import plant_names
+
+    return _matching(incomplete, plant_names())
+
+
+def complete_controllers(incomplete: str) -> list[str]:
+    """Return the controllers whose names begin so; after `law+` the pairs with this law."""
+    from servobench.controllers.parts import ESTIMATORS
+    from servobench.harness.config.registry import controller_names
+
+    law, plus, _ = incomplete.partition("+")
+    return _matching(incomplete, [f"{law}+{name}" for name in ESTIMATORS] if plus else controller_names())
+
+
+def complete_tasks(incomplete: str) -> list[str]:
+    """Return the tasks whose names begin so."""
+    from servobench.harness.run.tasks import TASKS
+
+    return _matching(incomplete, TASKS)
+
+
+def complete_sensings(incomplete: str) -> list[str]:
+    """Return the sensing set-ups whose names begin so."""
+    from servobench.harness.config.robots import sensing_names
+
+    return _matching(incomplete, sensing_names())
+
+
+def complete_estimators(incomplete: str) -> list[str]:
+    """Return the estimators whose names begin so."""
+    from servobench.controllers.parts import ESTIMATORS
+
+    return _matching(incomplete, ESTIMATORS)
+
+
+def complete_mismatches(incomplete: str) -> list[str]:
+    """Return the profiles and axes of mismatch whose names begin so; after a `+` the axes."""
+    from servobench.plant.robot.mismatch import AXES, PROFILES
+
+    before, plus, last = incomplete.rpartition("+")
+    axes = [f"{axis}=" for axis in AXES]
+    return [before + plus + name for name in _matching(last, axes if plus else [*PROFILES, *axes])]
+
+
+def complete_robots(incomplete: str) -> list[str]:
+    """Return the robots whose names begin so."""
+    from servobench.harness.config.robots import robot_names
+
+    return _matching(incomplete, robot_names())
+
+
+def completing_lists(complete: Callable[[str], list[str]]) -> Callable[[str], list[str]]:
+    """Return a function that completes the last name of a comma-separated list."""
+
+    def complete_last(incomplete: str) -> list[str]:
+        before, comma, last = incomplete.rpartition(",")
+        words = complete(last) + _matching(last, ["all"] * (not comma))
+        return [before + comma + word for word in words]
+
+    return complete_last
+
+
+def _matching(incomplete: str, names: Iterable[str]) -> list[str]:
+    return [name for name in names if name.startswith(incomplete)]
+
+
 def known_robot(name: str) -> str:
-    """Return the name of a robot that can be found, and print what was assumed about it."""
-    from servobench.harness.cli.terminal import say
+    """Return the name of a robot that can be found, and print the assumptions made about it."""
     from servobench.harness.config.robots import find_robot
 
     note = find_robot(name).note
@@ -23,66 +92,40 @@ def known_robot(name: str) -> str:
     return name
 
 
-def split_words(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())
-
-
-def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
-    """Split a comma-separated list of names, each of which `find` accepts; `all` stands for those in `known`."""
-    from servobench.harness.config.settings import ConfigurationError
-
-    if text.strip() == "all":
-        return tuple(known)
-    names = split_words(text)
-    if not names:
-        raise ConfigurationError(f"--{kind} is empty; valid: {', '.join(known)}")
-    for name in names:
-        find(name)
-    refuse_repetition(kind, names)
-    return names
-
-
-def refuse_repetition(option: str, values: Sequence[object]) -> None:
-    """Refuse a list that names something twice."""
-    from servobench.harness.config.settings import ConfigurationError
-
-    for value in values:
-        if values.count(value) > 1:
-            raise ConfigurationError(f"--{option} names {value} twice")
-
-
-def split_mismatches(text: str) -> tuple[str, ...]:
-    """Return the mismatches that a user named; each is read, so that a mistyped one is refused at once."""
-    from servobench.harness.run.request import read_mismatch
-    from servobench.plant.robot.mismatch_axes import PROFILES
-
-    return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
-
-
-def one_sensing(word: str) -> str:
-    """Return the sensing set-up that a user named; it is looked up, so that a mistyped one is refused at once."""
+def known_sensing(name: str) -> str:
+    """Return the name of a sensing set-up that can be found; a mistyped one is refused."""
     from servobench.harness.config.robots import find_sensing
 
-    find_sensing(word)
-    return word
+    find_sensing(name)
+    return name
 
 
-def split_sensings(text: str) -> tuple[str, ...]:
-    """Return the sensing set-ups that a user named; each is looked up, so that a mistyped one is refused at once."""
-    from servobench.harness.config.robots import find_sensing, sensing_names
+def known_plant(text: str | None) -> str:
+    """Return the name of the plant of a run, given by name or file; for None the default, with a line if second choice.
 
-    return split_names("sensing", text, sensing_names(), find_sensing)
-
-
-def default_plant() -> str:
-    """Return the plant of a run for which none is named; a line says if it is not the first choice, and why."""
-    from servobench.harness.cli.terminal import say
+    The default is the first of bullet, mujoco and kinematic that is installed.
+    """
+    from servobench.harness.batch.apart import choose_plants
     from servobench.harness.config.registry import default_plant
+    from servobench.plant.bench.plant import PlantEntry
 
-    name, why = default_plant()
-    if why:
-        say(f"no plant is named, so this run is on {name}: {why}")
+    if text is None:
+        name, why = default_plant()
+        if why:
+            say(f"no plant is named, so this run is on {name}: {why}")
+    else:
+        (name,) = choose_plants([text])
+    tell_unused(PlantEntry, [name])
+    return name
+
+
+def known_controller(text: str) -> str:
+    """Return the name of the controller of a run, given by name or file."""
+    from servobench.controllers.controller import ControllerEntry
+    from servobench.harness.batch.apart import choose_controllers
+
+    (name,) = choose_controllers([text])
+    tell_unused(ControllerEntry, [name])
     return name
 
 
@@ -95,16 +138,33 @@ def tell_unused(entry: type[ControllerEntry | PlantEntry], named: Sequence[str])
             sys.stderr.write(f"servobench: note: {line}\n")
 
 
-def _usable(all_of_them: Sequence[Tried]) -> list[str]:
-    """Return the names of those that can be used, with a line for each other."""
-    for each in all_of_them:
-        if each.fault:
-            sys.stderr.write(f"servobench: left out: {each.fault}\n")
-    return [each.name for each in all_of_them if not each.fault]
+def split_words(text: str) -> tuple[str, ...]:
+    """Split a comma-separated list."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def split_names(kind: str, text: str, known: Sequence[str], find: Callable[[str], Any]) -> tuple[str, ...]:
+    """Split a comma-separated list of names, each of which `find` accepts; `all` stands for those in `known`."""
+    if text.strip() == "all":
+        return tuple(known)
+    names = split_words(text)
+    if not names:
+        refuse(f"--{kind} is empty; valid: {', '.join(known)}")
+    for name in names:
+        find(name)
+    refuse_repetition(kind, names)
+    return names
+
+
+def refuse_repetition(option: str, values: Sequence[object]) -> None:
+    """Refuse a list that names something twice."""
+    for value in values:
+        if values.count(value) > 1:
+            refuse(f"--{option} names {value} twice")
 
 
 def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
-    """Return the names of the plants that a user named, or whose place was given, such as ./cell.py:Cell."""
+    """Return the names of plants given by name or by file, such as ./cell.py:Cell."""
     from servobench.harness.batch.apart import choose_plants
     from servobench.harness.batch.trial import try_plants
     from servobench.harness.config.registry import ALL, find_plant, plant_names
@@ -118,7 +178,7 @@ def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple
 
 
 def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
-    """Return the names of the controllers that a user named, or whose place was given, such as ./mine.py:Mine."""
+    """Return the names of controllers given by name or by file, such as ./mine.py:Mine."""
     from servobench.controllers.controller import ControllerEntry
     from servobench.harness.batch.apart import choose_controllers
     from servobench.harness.batch.trial import try_controllers
@@ -131,8 +191,31 @@ def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
     return split_names("controllers", ",".join(names), known, find_controller)
 
 
+def _usable(all_of_them: Sequence[Tried]) -> list[str]:
+    """Return the names of those that can be used; print a line for each other."""
+    for each in all_of_them:
+        if each.fault:
+            sys.stderr.write(f"servobench: left out: {each.fault}\n")
+    return [each.name for each in all_of_them if not each.fault]
+
+
 def split_tasks(text: str) -> tuple[str, ...]:
-    """Return the tasks that a user named."""
+    """Return the names of tasks, each looked up."""
     from servobench.harness.run.tasks import TASKS, find_task
 
     return split_names("tasks", text, list(TASKS), find_task)
+
+
+def split_mismatches(text: str) -> tuple[str, ...]:
+    """Return mismatches, each read, so that a mistyped one is refused at once."""
+    from servobench.harness.run.request import read_mismatch
+    from servobench.plant.robot.mismatch import PROFILES
+
+    return split_names("mismatch", text, tuple(PROFILES), read_mismatch) if text.strip() != "all" else (text,)
+
+
+def split_sensings(text: str) -> tuple[str, ...]:
+    """Return the names of sensing set-ups, each looked up."""
+    from servobench.harness.config.robots import find_sensing, sensing_names
+
+    return split_names("sensing", text, sensing_names(), find_sensing)

@@ -7,11 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from servobench.harness.cli import options, selection
+from servobench.harness.cli.options import CONTROLLER, PLANT, Option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import console, print_tables
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,56 +18,48 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from servobench.harness.batch.workers import Workers
-    from servobench.harness.studies.tuning.campaign import Method, TuningPlan
-    from servobench.harness.studies.tuning.check import Change
-    from servobench.harness.studies.tuning.files import TunedValues
+    from servobench.harness.studies.tuning.campaign import Change, Method, TunedValues, TuningPlan
     from servobench.harness.studies.tuning.objective import TuningSet
 
 DEFAULT_CONTROLLERS = "arm_mfac, map_mfac, rbfnn_mfac, ukf_mfac, ukf_mpc, rbf_pid"  # spaces let the help break lines
-EXIT_DIFFERENT = 1
+SWEPT = options.Combinations(controllers="rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid", tasks="random", seeds="10")
 
 
 def sweep(
+    *,
     out: options.FolderOption,
-    plants: options.PlantsOption = "kinematic",
-    controllers: options.ControllersOption = "rbfnn_mfac,ukf_mfac,ukf_mpc,rbf_pid",
-    tasks: options.TasksOption = "random",
-    mismatch: options.MismatchesOption = "moderate",
-    robot: options.RobotOption = "ur5",
-    sensing: options.SensingsOption = "position",
+    combinations: options.Combinations = SWEPT,
     vary: Annotated[
         list[str] | None,
-        typer.Option(help="Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg."),
+        Option(
+            "--vary",
+            "AXIS=VALUES",
+            "Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg.",
+        ),
     ] = None,
-    noise: Annotated[str, typer.Option(help="Comma-separated factors on the plants' sensor noise.")] = "1",
-    latency: Annotated[str, typer.Option(help="Comma-separated camera latencies [s]; default: the plant's.")] = "",
-    period: Annotated[str, typer.Option(help="Comma-separated control periods [s]; default: run.period.")] = "",
-    seeds: options.SeedsOption = "10",
-    running: options.Running = options.RUNNING,
-    overrides: options.Overrides = options.OVERRIDES,
-    judging: options.Judging = options.JUDGING,
+    noise: Annotated[str, Option("--noise", "NUMBERS", "Comma-separated factors on the plants' sensor noise.")] = "1",
+    latency: Annotated[
+        str, Option("--latency", "SECONDS", "Comma-separated camera latencies [s]; default: the plant's.")
+    ] = "",
+    period: Annotated[
+        str, Option("--period", "SECONDS", "Comma-separated control periods [s]; default: run.period.")
+    ] = "",
+    running: options.Running,
+    overrides: options.Overrides,
+    judging: options.Judging,
 ) -> None:
     """Run a Monte Carlo sweep: many runs, a row each.
 
     No steps are kept. A sweep that was interrupted is continued with --resume.
     """
-    from servobench.harness.analysis.summary import SWEEP_COLUMNS, sweep_legend, sweep_tables
+    from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
-    from servobench.harness.batch.compare import Batch, parse_seeds
     from servobench.harness.batch.sweep import SweepPlan, parse_variation
     from servobench.harness.cli.progress import watching
 
     plan = SweepPlan(
-        Batch(
-            selection.split_plants(plants, robot=robot),
-            selection.split_controllers(controllers, robot),
-            selection.split_tasks(tasks),
-            selection.split_mismatches(mismatch),
-            parse_seeds(seeds),
-            selection.known_robot(robot),
-            selection.split_sensings(sensing),
-        ),
+        combinations.batch(),
         tuple(parse_variation(text) for text in vary or []),
         tuple(_numbers("noise", noise)),
         _times("latency", latency),
@@ -86,39 +77,38 @@ def sweep(
 
 def _times(option: str, text: str) -> tuple[float | None, ...]:
     """Return times, s; numbers from 1 on are refused because they were control periods in version 0.1."""
-    from servobench.harness.config.settings import ConfigurationError
-
     times = _numbers(option, text) if text.strip() else [None]
     if max(time or 0.0 for time in times) >= 1.0:
-        raise ConfigurationError(f"--{option} is in seconds, below 1, such as 0.05 for a period of 20 Hz; got {text!r}")
+        refuse(f"--{option} is in seconds, below 1, such as 0.05 for a period of 20 Hz; got {text!r}")
     return tuple(times)
 
 
 def _numbers(option: str, text: str) -> list[float]:
-    from servobench.harness.config.settings import ConfigurationError
 
     try:
         numbers = [float(part) for part in text.split(",") if part.strip()]
-    except ValueError as error:
-        raise ConfigurationError(f"--{option} must be comma-separated numbers, got {text!r}") from error
+    except ValueError:
+        refuse(f"--{option} must be comma-separated numbers, got {text!r}")
     if not numbers or min(numbers) < 0:
-        raise ConfigurationError(f"--{option} must be numbers from 0 on, got {text!r}")
+        refuse(f"--{option} must be numbers from 0 on, got {text!r}")
     selection.refuse_repetition(option, [f"{number:g}" for number in numbers])
     return numbers
 
 
 def robustness(
+    *,
     out: options.FolderOption,
-    plant: Annotated[str, typer.Option(help="Name or file of the plant.")] = "fmu",
+    plant: Annotated[str, Option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
-        str, typer.Option(help="Comma-separated axes, such as outliers,jitter; default: the seven of the map.")
+        str,
+        Option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
     ] = "",
-    running: options.Running = options.RUNNING,
-    overrides: options.Overrides = options.OVERRIDES,
+    running: options.Running,
+    overrides: options.Overrides,
 ) -> None:
     """Draw success and settling time along seven axes.
 
@@ -126,36 +116,33 @@ def robustness(
     """
     from servobench.harness.batch.compare import parse_seeds
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.map_lines import find_lines
-    from servobench.harness.studies.robustness import make_map
+    from servobench.harness.studies.robustness import find_lines, make_map
 
     settings = overrides.settings()
     lines = find_lines([axis.strip() for axis in axes.split(",") if axis.strip()])
-    arm = selection.known_robot(robot)
-    names = selection.split_controllers(controllers, arm)
-    where = selection.split_plants(plant, "plant", arm)[0]
-    seen = selection.one_sensing(sensing)
+    names = selection.split_controllers(controllers, robot)
+    where = selection.split_plants(plant, "plant", robot)[0]
     with watching(console, out) as observer:
         how = running.execution(observer)
-        files = make_map(out, where, names, parse_seeds(seeds), settings, how, arm, lines, seen)
+        files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
     console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
 
 
 def claims(
+    *,
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[
-        int, typer.Option(metavar="COUNT", help="Robots for each move; two fifths of them for the circle.")
-    ] = 500,
+    seeds: Annotated[int, Option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
-        str, typer.Option(help="Form of the methods: equipped (all aids), published (the law as printed) or both.")
+        str,
+        Option(
+            "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
+        ),
     ] = "both",
-    running: options.Running = options.RUNNING,
+    running: options.Running,
     check: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Table of answers that must come out the same; the exit code is 1 if they differ."
-        ),
+        Option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
     ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
@@ -163,9 +150,15 @@ def claims(
     The figure behind each answer is drawn as well.
     """
     from servobench.harness.cli.progress import watching
-    from servobench.harness.studies.claims.reproduction import FIGURES, reproduce
-    from servobench.harness.studies.claims.studies import find_divisions
-    from servobench.harness.studies.claims.table import ANSWERS, differences, elsewhere, read_answers
+    from servobench.harness.studies.claims import find_divisions
+    from servobench.harness.studies.reproduction import (
+        ANSWERS,
+        FIGURES,
+        differences,
+        elsewhere,
+        read_answers,
+        reproduce,
+    )
 
     names = selection.split_plants(plants)
     divisions = find_divisions(division)
@@ -182,32 +175,37 @@ def claims(
         lines = differences(answers, wanted)
         console.print("\n".join(lines) or f"the same answers as in {check}", soft_wrap=True, markup=False)
         if lines:
-            sys.exit(EXIT_DIFFERENT)
+            sys.exit(FAILED)
 
 
 def tune(
-    controllers: Annotated[str, typer.Option(help="Comma-separated names, or all that have a search space.")] = "all",
+    *,
+    controllers: Annotated[
+        str,
+        Option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
+    ] = "all",
     studies: Annotated[
-        int, typer.Option(help="Studies of each method; the one that is best on a second set of robots is taken.")
+        int,
+        Option(
+            "--studies", "COUNT", "Studies of each method; the one that is best on a second set of robots is taken."
+        ),
     ] = 3,
-    trials: Annotated[int, typer.Option(help="Trials of each study, known settings included.")] = 100,
+    trials: Annotated[int, Option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
-        int, typer.Option(help="Upper limit on the points of the coordinate search that ends a study.")
+        int, Option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, typer.Option(help="Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, Option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
     plants: options.PlantsOption = "kinematic",
-    place: options.Place = options.PLACE,
+    place: options.Place,
     offset: Annotated[
-        int, typer.Option(help="First seed, counted from the beginning of the range kept for tuning.")
+        int, Option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
     ] = 0,
-    study_seed: Annotated[int, typer.Option(help="Seed of the first study's sampler.")] = 0,
+    study_seed: Annotated[int, Option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
         bool,
-        typer.Option(
-            "--check", help="Change each tuned value in use one by one instead, and name changes that are better."
-        ),
+        Option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
     ] = False,
-    out: Annotated[Path, typer.Option(help="Folder of the studies; interrupted ones are continued.")] = (
+    out: Annotated[Path, Option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
 ) -> None:
@@ -217,7 +215,6 @@ def tune(
     """
     from servobench.harness.batch.lock import locked
     from servobench.harness.batch.workers import open_workers
-    from servobench.harness.config.settings import ConfigurationError
     from servobench.harness.studies.tuning.campaign import TuningPlan, check_study_folder, open_methods, write_results
     from servobench.harness.studies.tuning.objective import TuningSet
     from servobench.harness.studies.tuning.spaces import SPACES, find_tunable
@@ -227,7 +224,7 @@ def tune(
         runs = TuningSet(selection.split_plants(plants), robots, offset)
         plan = TuningPlan(names, trials, runs, studies, search, study_seed)
     except ValueError as error:
-        raise ConfigurationError(str(error)) from error
+        refuse(str(error))
     check_study_folder(out)
     opening = open_workers(place.workers, place.scheduler, place.bounds(), plants=plan.runs.plants, controllers=names)
     with opening as opened, locked(out):
@@ -246,23 +243,21 @@ def tune(
 
 def _say_interrupted() -> None:
     console.print("interrupted; the same call continues where it stopped")
-    sys.exit(options.INTERRUPTED)
+    sys.exit(INTERRUPTED)
 
 
 def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers) -> None:
     """Score every change of one value of the settings in use and say which of them improve a score by too much."""
     from servobench.harness.cli.progress import Lines, run_progress
-    from servobench.harness.studies.tuning.check import TOLERANCE, Check, improvements
+    from servobench.harness.studies.tuning.campaign import TOLERANCE, Check, improvements
 
     checked, lines = Check(folder, names, runs), Lines()
-    total, done = len(checked), checked.known()
-    begun = done
+    total, begun = len(checked), checked.known()
     with run_progress(console) as progress:
-        bar = progress.add_task("points", total=total, completed=done)
+        bar = progress.add_task("points", total=total, completed=begun)
         try:
-            for _ in checked.carry_out(workers):
-                progress.update(bar, advance=1)
-                done += 1
+            for done, _ in enumerate(checked.carry_out(workers), begun + 1):
+                progress.update(bar, completed=done)
                 if not console.is_terminal:
                     lines.tell((done - begun) / (total - begun), f"{done} of {total} points")
         except KeyboardInterrupt:
@@ -271,7 +266,7 @@ def _check(folder: Path, names: Sequence[str], runs: TuningSet, workers: Workers
     found = improvements(checked.changes())
     console.print(_change_table(found) if found else f"no change improves a score by more than {TOLERANCE:.0%}")
     if found:
-        sys.exit(EXIT_DIFFERENT)
+        sys.exit(FAILED)
 
 
 def _advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> bool:

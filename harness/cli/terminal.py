@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Iterable, Iterator
 from itertools import takewhile
+from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
@@ -15,15 +16,40 @@ from rich.console import Console
 if TYPE_CHECKING:
     import pandas as pd
 
+FAILED = 1  # exit code where a run failed, a check was not passed or answers are different
+INPUT_ERROR = 2  # exit code
+INTERRUPTED = 130  # exit code after Ctrl-C
 TERMINATED = 128 + signal.SIGTERM  # exit code
 
-KEYS = ("controller", "mismatch", "noise", "latency", "period", "pair")  # first columns that say what a row is about
+KEYS = ("controller", "mismatch", "noise", "latency", "period", "pair")  # first columns, by which a row is known
 LEFT = (*KEYS, "failures", "outcome")  # columns of words
 WHOLE = ("controller", "pair")  # columns whose cells are not broken over lines
 CONTROLLER_WIDTH = 15  # [characters] at least, so that tables below each other begin alike
 GAP = 2  # [characters] that a table needs for each column beside its cells
 
 console = Console()
+
+
+def refuse(line: str) -> NoReturn:
+    """End the command because of a bad input: one line on standard error and exit code 2.
+
+    Raises:
+        ConfigurationError: always; `main` prints its line.
+    """
+    from servobench.harness.config.settings import ConfigurationError
+
+    raise ConfigurationError(line)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Refuse a file or a folder that cannot be written within the context."""
+    from servobench.plant.contract.files import reason
+
+    try:
+        yield
+    except OSError as error:
+        refuse(f"{error.filename or path} cannot be written: {reason(error)}")
 
 
 @contextlib.contextmanager
@@ -45,7 +71,7 @@ def print_tables(tables: Iterable[tuple[str, pd.DataFrame]], legend: str = "") -
     """Print tables of text with their titles, and a legend below all of them.
 
     Cells are broken between words where a table is wider than the terminal. Columns for which there is no room even so
-    follow in a table of their own below, after the columns again that say what a row is about.
+    follow in a table of their own below, after the columns by which a row is known.
     """
     from rich.box import SIMPLE_HEAD
     from rich.table import Table

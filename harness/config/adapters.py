@@ -16,8 +16,7 @@ from servobench.controllers.controller import Controller, RobotKnowledge
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import describe_at
 from servobench.plant.bench.bench import Bench, build_bench
-from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel, World
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import PlantDiverged, RunFault
 from servobench.plant.contract.sensing import SensingConfig

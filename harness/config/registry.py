@@ -276,13 +276,6 @@ def _points(group: str) -> dict[str, EntryPoint]:
 
 
 @cache
-def plugin_packages() -> frozenset[str]:
-    """Return the names of the top-level packages that publish plants or controllers, this one left out."""
-    values = (point.value for group in (PLANT_GROUP, CONTROLLER_GROUP) for point in entry_points(group=group))
-    return frozenset(value.partition(":")[0].partition(".")[0] for value in values) - {"servobench"}
-
-
-@cache
 def _load(group: str, kind: str, name: str) -> object:
     points = _points(group)
     if name not in points:

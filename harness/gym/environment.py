@@ -6,25 +6,31 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final, final
 
+import cv2
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.config.registry import rendered_plant, scene_of
+from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.gym.outside import OutsideView
-from servobench.harness.gym.view import Floats32, View
-from servobench.harness.run.experiment import Experiment, build, check_possible
+from servobench.harness.gym.spaces import Floats32, View
+from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.rendered.detection import ByteArray
+from servobench.plant.rendered.overview import Overview
+from servobench.plant.rendered.room import Room
+from servobench.plant.robot.hand_eye import HandEyeModel
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none
 PLACEHOLDER: Final = "constant"  # the harness builds every run with a controller; this one costs least
+MARK: Final = (40, 40, 40)  # red, green, blue
 
 
 def resolve_environment(
@@ -221,3 +227,42 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         if self._experiment is not None:
             self._experiment.plant.close()
             self._experiment = None
+
+
+class OutsideView:
+    """A scene with the true arm of a run."""
+
+    def __init__(self, drawn: Drawn, request: RunRequest) -> None:
+        """Open the scene.
+
+        Raises:
+            ConfigurationError: the plant brings a robot of its own, or no engine that renders is installed.
+        """
+        if drawn.true is None:
+            raise ConfigurationError(f"plant {request.plant} brings a robot of its own, which cannot be rendered")
+        robot = find_robot(request.robot)
+        self._arm, self._drawn, self._overview = drawn.true.arm, drawn, Overview.of(robot.workspace.scale)
+        self._scene = scene_of(rendered_plant())(Room(self._arm, scenery=True, robot=robot))
+
+    def picture(self, joint_position: FloatArray, target: FloatArray, *, moved: bool) -> ByteArray:
+        """Return the arm, (480, 640, 3), with a cross where features are places and the ball is to be.
+
+        Args:
+            joint_position: (n,) [rad].
+            target: (m,), the reference.
+            moved: whether the camera was moved before, in whose frame the target is given.
+        """
+        self._scene.place(self._arm.joint_angle(joint_position))
+        colours, _ = self._scene.render(self._overview.camera, self._overview.X_BC)
+        picture = np.ascontiguousarray(colours[..., :3])
+        model = self._drawn.final if moved else self._drawn.true
+        if isinstance(model, HandEyeModel):
+            (pixel,), (far,) = self._overview.pixels(model.to_base(target)[None])
+            if far > self._overview.camera.near:
+                x, y = np.round(pixel).astype(int).tolist()
+                cv2.drawMarker(picture, (x, y), MARK, cv2.MARKER_TILTED_CROSS, 14, 2, cv2.LINE_AA)
+        return picture
+
+    def close(self) -> None:
+        """Leave the scene."""
+        self._scene.close()

@@ -12,8 +12,8 @@ from gymnasium.vector.utils import batch_space
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym.environment import SEEDS, ServoEnv, check_options, with_seed
-from servobench.harness.gym.view import Floats32, View
-from servobench.harness.run.together import Together, build_together, side_by_side_key
+from servobench.harness.gym.spaces import Floats32, View
+from servobench.harness.run.lanes import Together, build_together, side_by_side_key
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import BoolArray, Command, Observation

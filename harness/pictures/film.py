@@ -1,14 +1,20 @@
-"""A moving picture of a run: the arm with the trails of ball and reference, the camera's view, the error below.
+"""A film of a logged run: the arm with the trails of ball and reference, the camera's image, the error over time.
 
-Everything comes from the log through `harness.pictures.replay`. Frames are composed once and go to MP4 and GIF side by
-side (`harness.pictures.encoder`).
+Everything comes from the log through `servobench.harness.pictures.replay`. Each frame is composed once and sent to the
+ffmpeg of every requested film, which the optional extra `animation` installs. A film gets its name once it is complete;
+until then it has a hidden name, and an interruption removes it and ends ffmpeg.
 """
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import contextlib
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, cast
 
 import cv2
 import matplotlib as mpl
@@ -17,20 +23,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from servobench.controllers.networks.fit import Progress
+from servobench.harness.config.installation import missing_extra
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.pictures.draw import save_figure
-from servobench.harness.pictures.encoder import GIF, MP4, encoding, find_ffmpeg
-from servobench.harness.pictures.panels import mark_settling_band, plain_logarithms
 from servobench.harness.pictures.replay import LoggedRun, Replay, Trail
-from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles
+from servobench.harness.pictures.responses import mark_settling_band
+from servobench.harness.pictures.style import MethodStyle, figure_style, method_styles, plain_logarithms, save_figure
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import suggest
 from servobench.plant.rendered.detection import ByteArray
 from servobench.plant.robot.ur5 import BALL_RADIUS
 
-SNAPSHOTS = "snapshots"
-KINDS = (MP4, GIF, SNAPSHOTS)
+MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
 WIDTH, HEIGHT = 960, 816  # px of a frame; ffmpeg wants multiples of 16
 HEAD, VIEW_WIDTH, VIEW_HEIGHT = 48, 640, 480  # px: line of text on top, overview below it at the left
 TYPE = 19.0  # [pt] of all words: 9 px high where a page on a telephone shows the frame 330 px wide
@@ -43,6 +47,10 @@ SNAPSHOT_COUNT = 8
 MIN_ADVANCE = 0.01  # of the extent of the ball's path: shorter ways are the jitter of an arm at rest
 CROSS = 2.5 * BALL_RADIUS  # [m] half of its size at a fixed target: it is seen around the ball
 CLOSED = 0.05  # share of a curve's size, within which its reference counts as back at its start
+GIF_WIDTH, GIF_RATE = 640, 10  # px, frames a second
+QUALITY = "22"  # of H.264: smaller is better and larger
+Write = Callable[[ByteArray], None]
+"""Appends a frame (height, width, 3) to a film."""
 
 
 def find_kind(name: str) -> str:
@@ -91,6 +99,99 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
                 write(frame)
         progress(1.0, "encoding")
     return paths + films
+
+
+def find_ffmpeg(alternative: str) -> str:
+    """Return the path of ffmpeg.
+
+    Args:
+        alternative: what the user can do without it, the end of the message.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    try:
+        package: Any = import_module("imageio_ffmpeg")
+        return str(package.get_ffmpeg_exe())
+    except ImportError as error:
+        raise ConfigurationError(f"{missing_extra(error, 'a film')}; {alternative}") from error
+    except RuntimeError as error:
+        raise ConfigurationError(f"no ffmpeg for mp4 and gif, {alternative}: {error}") from error
+
+
+@contextmanager
+def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
+    """Yield what appends a frame to the film `path`, which is there when the context ends without an exception.
+
+    Args:
+        ffmpeg: the program.
+        path: of the film, ending with .mp4 or .gif.
+        size: width and height of the frames [px]; even numbers for MP4.
+        rate: frames a second.
+
+    Raises:
+        ConfigurationError: ffmpeg cannot write the film; with its last line.
+    """
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{rate:g}", "-i", "-"]
+    call = [ffmpeg, "-y", "-v", "error", *raw, *_options(path.suffix.removeprefix("."), rate), str(partial)]
+    with tempfile.TemporaryFile() as complaints:
+        process = subprocess.Popen(
+            call, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=complaints, start_new_session=True
+        )
+
+        pipe = cast("IO[bytes]", process.stdin)
+
+        def write(frame: ByteArray) -> None:
+            try:
+                pipe.write(frame.tobytes())
+            except OSError as error:
+                raise _failure(path, process, complaints) from error
+
+        try:
+            yield write
+            with contextlib.suppress(BrokenPipeError):
+                pipe.close()
+            if process.wait() != 0:
+                raise _failure(path, process, complaints)
+            partial.replace(path)
+        finally:
+            process.kill()  # nothing happens if it has ended
+            process.wait()
+            with contextlib.suppress(OSError):
+                pipe.close()
+            partial.unlink(missing_ok=True)
+
+
+def _options(kind: str, rate: float) -> list[str]:
+    if kind == MP4:
+        return [
+            "-c:v",
+            "libx264",
+            "-pix_fmt",
+            "yuv420p",
+            "-crf",
+            QUALITY,
+            "-preset",
+            "medium",
+            "-movflags",
+            "+faststart",
+        ]
+    # One palette for the whole film, no dithering, and only the rectangle that changed: a still background is free.
+    chain = (
+        f"fps={min(float(GIF_RATE), rate):g},scale={GIF_WIDTH}:-1:flags=area,split[a][b];"
+        "[a]palettegen=max_colors=128:stats_mode=full[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+    )
+    return ["-filter_complex", chain, "-c:v", "gif"]
+
+
+def _failure(path: Path, process: subprocess.Popen[bytes], complaints: IO[bytes]) -> ConfigurationError:
+    """Return what the user is told when ffmpeg has ended with a complaint."""
+    code = process.wait()
+    complaints.seek(0)
+    lines = complaints.read().decode(errors="replace").split("\n")
+    said = next((line.strip() for line in reversed(lines) if line.strip()), f"it ended with exit code {code}")
+    return ConfigurationError(f"ffmpeg cannot write {path}: {said}")
 
 
 def draw_snapshots(run: LoggedRun) -> Figure:

@@ -14,10 +14,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
-from servobench.harness.analysis.loops.margins import loci
-from servobench.harness.pictures.draw import picture_of, save_figure
-from servobench.harness.pictures.panels import Styles, add_legend, plain_logarithms
-from servobench.harness.pictures.style import figure_style, method_styles
+from servobench.harness.analysis.loops.response import loci
+from servobench.harness.pictures.style import (
+    Styles,
+    add_legend,
+    figure_style,
+    method_styles,
+    picture_of,
+    plain_logarithms,
+    save_figure,
+)
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.files import write_atomically
 

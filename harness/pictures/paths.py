@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.pictures.panels import DESIRED, END_MARK, LETTER, Styles, add_legend
-from servobench.harness.pictures.style import WIDE, Layout, divisions
+from servobench.harness.pictures.style import DESIRED, END_MARK, LETTER, WIDE, Layout, Styles, add_legend, divisions
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, longest
 from servobench.plant.contract.checks import FloatArray
 

@@ -1,15 +1,23 @@
-"""One colour, line and marker a method, the same in every picture, and readable without colour."""
+"""The appearance of every figure: colour, line and marker of each method, legend, axes and files; readable in grey."""
 
 from __future__ import annotations
 
+import io
+import math
 import re
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+from PIL import Image
 
 from servobench.controllers.methods import METHODS, PUBLISHED
 from servobench.plant.contract.checks import FloatArray
@@ -23,6 +31,24 @@ WIDTH = 7.2  # [in] of a figure: both columns of a paper
 MOST_LINES = 7  # of methods in a panel, besides those that know the true robot
 TEXT = 8.0  # [pt] of a figure of that width
 FILM_TEXT = 9.0  # [pt]
+FORMATS = ("png", "pdf")
+RESOLUTION = 150  # dpi of PNG
+PALETTE = 64  # colours
+STRIP = 0.04  # [in] above and below what is drawn
+ENDED, END = "run ended early", "|"  # and its marker, which no method has
+SETTLED, CAMERA_MOVES = "settled from here on", "camera moves"
+NOT_METHODS: Final = ("desired", "settling band", "start", "target", SETTLED, CAMERA_MOVES, ENDED)  # in a legend
+FEW_DECADES: Final = 50.0  # upper over lower end of a logarithmic axis
+LETTER, SAMPLE = 0.066, 0.55  # [in] width of a letter of the legend and of the line beside it
+MARGIN: Final = 0.2  # [in] beside the legend
+DESIRED: dict[str, Any] = {"color": "black", "linewidth": 3.0, "alpha": 0.3, "label": "desired"}
+END_MARK: dict[str, Any] = {"marker": END, "markersize": 12, "markeredgewidth": 2.0, "linestyle": "", "zorder": 12,
+                            "gid": ENDED}  # fmt: skip
+DASHED = (0, (3.5, 1.5))  # of every method as published
+UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
+_OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
+_OTHER_LINES = ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-.")
+_OTHER_MARKERS = ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
 
 
 @dataclass(frozen=True)
@@ -48,6 +74,8 @@ class Layout:
 
 
 WIDE = Layout(WIDTH, 3, 1000, 1.5)
+
+
 NARROW = Layout(2.75, 1, 335, 2.0)  # of a phone of 390 px, with a bar to scroll
 
 
@@ -90,7 +118,9 @@ class MethodStyle:
         return look | {"markersize": 4.0, "linewidth": 1.2, "markerfacecolor": self.face}
 
 
-DASHED = (0, (3.5, 1.5))  # of every method as published
+Styles = dict[str, MethodStyle]
+
+
 _STYLES = {
     "rbfnn_mfac": MethodStyle(VERMILION, "-", "o"),
     "map_mfac": MethodStyle(WINE, "-", "*"),
@@ -105,15 +135,13 @@ _STYLES = {
     "rls": MethodStyle(SKY, "-", "X"),
     "cfdl_mfac": MethodStyle(YELLOW, "-", "p"),
 }
+
+
 _STYLES |= {
     name + PUBLISHED: replace(_STYLES[name], line=DASHED, hollow=True)
     for name in _STYLES
     if name + PUBLISHED in METHODS
 }
-UPPER_BOUNDS = ("calibrated", "nmpc_calibrated")  # which know the true robot
-_OTHER_COLOURS = (PURPLE, SKY, YELLOW, VERMILION, BLUE, GREEN)
-_OTHER_LINES = ((0, (6, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (5, 1, 1, 1, 1, 1)), "-.")
-_OTHER_MARKERS = ("<", ">", "h", "d", "8", *(f"${letter}$" for letter in "abcdefghijklmnopqrstuvwxyz"))
 
 
 def method_styles(names: Iterable[str]) -> dict[str, MethodStyle]:
@@ -167,6 +195,98 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
             "pdf.fonttype": 42,
         }
     )
+
+
+def panel_grid(count: int, height: float, layout: Layout = WIDE) -> tuple[Figure, list[Axes]]:
+    """Return a figure of panels with a common ordinate, and its `count` panels.
+
+    Args:
+        count: how many panels, at least one.
+        height: of a row, inches.
+        layout: of the figure.
+    """
+    columns = min(layout.columns, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(layout.width, 1.0 + height * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure, panels[:count]
+
+
+def label_rows(panels: list[Axes], text: str) -> None:
+    """Label the ordinate of the first panel of each row."""
+    for axes in panels:
+        place = axes.get_subplotspec()
+        axes.set_ylabel(text if place is None or place.is_first_col() else "")
+
+
+def add_legend(figure: Figure, panels: Iterable[Axes]) -> None:
+    """Put one legend for all panels below them, methods first; marks of settling and of an early end get a line."""
+    panels = list(panels)
+    entries: dict[str, Artist] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    for gid, marker in ((SETTLED, "v"), (ENDED, END)):
+        if any(line.get_gid() == gid for axes in panels for line in axes.get_lines()):
+            entries[gid] = mpl.lines.Line2D([], [], color="0.3", marker=marker, markersize=7, linestyle="")
+    entries = dict(sorted(entries.items(), key=lambda entry: entry[0].startswith(NOT_METHODS)))
+    if entries:
+        letters = math.floor((figure.get_figwidth() - SAMPLE - MARGIN) / LETTER)
+        labels = [fitted(label, letters) for label in entries]
+        longest_line = max(len(line) for label in labels for line in label.splitlines())
+        fitting = math.floor(figure.get_figwidth() / (SAMPLE + LETTER * longest_line))
+        figure.legend(
+            list(entries.values()), labels, loc="outside lower center", frameon=False, fontsize=TEXT - 0.5,
+            ncols=max(1, min(fitting, len(entries))), handlelength=2.6, columnspacing=1.2,
+        )  # fmt: skip
+
+
+def plain_logarithms(axes: Axes) -> None:
+    """Make the value axis logarithmic with plain numbers; where it spans few decades, 2 and 5 have numbers as well."""
+
+    def between(value: float, _position: int | None) -> str:
+        low, high = axes.get_ylim()
+        return f"{value:g}" if high < FEW_DECADES * low and f"{value:e}"[0] in "25" else ""
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(mpl.ticker.FuncFormatter(between))
+
+
+def save_figure(figure: Figure, stem: Path) -> list[Path]:
+    """Write a figure as PNG and as PDF beside each other; the same figure gives the same bytes."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for ending in FORMATS:
+        paths.append(stem.with_name(f"{stem.name}.{ending}"))
+        with figure_style(TEXT):
+            metadata = {"CreationDate": None} if ending == "pdf" else {"Software": None}
+            figure.savefig(paths[-1], dpi=RESOLUTION, metadata=metadata)
+        figure.set_layout_engine("none")  # freeze the layout: computing it dominates the save
+    return paths
+
+
+def picture_of(figure: Figure, layout: Layout = WIDE) -> tuple[bytes, int, int]:
+    """Return a figure as a small, sharp PNG, and width and height with which it is to be shown, px.
+
+    The picture is as high as what is drawn: nothing is cut, and there is no empty strip.
+    """
+    large, small = io.BytesIO(), io.BytesIO()
+    with figure_style(TEXT):
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)  # once, also for the edges of what is drawn
+            figure.set_layout_engine("none")
+        drawn = figure.get_tightbbox()
+        low, high = drawn.y0 - STRIP, drawn.y1 + STRIP
+        box = Bbox.from_extents(min(0.0, drawn.x0), low, max(figure.get_figwidth(), drawn.x1), high)
+        figure.savefig(large, dpi=layout.density * layout.scale, bbox_inches=box)
+    # A line drawing has few colours; a palette makes half the size of it, and an octree keeps those of a few pixels.
+    with Image.open(large) as picture:
+        indexed = picture.convert("RGB").quantize(PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        indexed.save(small, "PNG", optimize=True)
+    return small.getvalue(), round(layout.scale * box.width), round(layout.scale * box.height)
 
 
 def _parts(heading: str, names: list[str], bounds: list[str]) -> dict[str, list[str]]:

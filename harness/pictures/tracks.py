@@ -1,8 +1,14 @@
-"""The logged steps of a results folder, arranged as figures want them: by plant and mismatch, task and controller."""
+"""The logged steps of a results folder, arranged for figures: by plant and mismatch, task and controller.
+
+A `Track` has the steps of one run, an `Ensemble` the runs of one controller over all seeds at common instants, for
+medians and bands.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +16,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import with_places
+from servobench.harness.analysis.comparison import POINT_TO_POINT, settling_times, with_places
 from servobench.harness.analysis.measures import handy_unit
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
 FEATURE = "feature_"
@@ -25,6 +31,12 @@ ROOT_MEAN_SQUARES = (
     "error_norm",
     "jacobian_error",
 )  # of which a row of an overview has that of all rows for which it stands
+ERROR, JACOBIAN, STEP_TIME = "error_norm", "jacobian_error", "controller_time_us"
+COLUMNS = ("run_id", "time_s", ERROR, JACOBIAN, STEP_TIME)
+BAND = (0.1, 0.5, 0.9)  # quantiles over seeds: the band's edges and its middle
+WINDOW = 0.5  # [s] over which the error along a curve is averaged
+MARGIN = 1.5  # on the time until which a figure shows moves that have settled
+MIN_SHARE = 0.2  # of a run that a figure shows at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,3 +184,151 @@ def label_of(feature: str) -> str:
     """Return `x [m]` for `x_m`."""
     name, _, unit = feature.rpartition("_")
     return f"{name} [{unit}]"
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """The runs of one controller on one task, a row a seed.
+
+    Attributes:
+        runs: their rows in the table of runs.
+        time: instants, (k,) [s].
+        error: norm of the true error, (r, k) [`error_unit`]; infinite from an early end on.
+        jacobian_error: relative, (r, k) [%]; NaN where it is not known.
+        step_time: of all steps of the controller, (s,) [µs].
+        camera_moved_at: when the camera was moved [s]; NaN where it was not.
+    """
+
+    runs: pd.DataFrame
+    time: FloatArray
+    error: FloatArray
+    jacobian_error: FloatArray
+    step_time: FloatArray
+    camera_moved_at: float
+
+    @property
+    def period(self) -> float:
+        """Control period [s]; NaN of a run of one period."""
+        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else math.nan
+
+    @property
+    def point_to_point(self) -> bool:
+        """Whether the task has a fixed target."""
+        return bool((self.runs.reindex(columns=["task_kind"])["task_kind"] == POINT_TO_POINT).any())
+
+    @property
+    def error_unit(self) -> tuple[str, float]:
+        """The unit in which errors are shown, and the factor to it from that of the feature."""
+        units = self.runs.reindex(columns=["feature_unit"])["feature_unit"].dropna()
+        return handy_unit(units.iloc[0] if len(units) else None)
+
+    @property
+    def settling_band(self) -> float:
+        """The error within which a run counts as settled [`error_unit`]; NaN if the table does not tell it."""
+        return self.error_unit[1] * float(self.runs.reindex(columns=["settling_band"])["settling_band"].iloc[0])
+
+    @property
+    def settling_time(self) -> float:
+        """Median settling time [s]; infinite if half of the runs never settled."""
+        return float(settling_times(self.runs).fillna(math.inf).median())
+
+    @property
+    def mostly_ended(self) -> bool:
+        """Whether half of the runs ended early, so that no median goes on to the end."""
+        return bool((self.runs["status"] != COMPLETED).mean() >= BAND[1])
+
+    @property
+    def shown_error(self) -> FloatArray:
+        """The error, (r, k) [`error_unit`]; along a curve its root mean square over `WINDOW`."""
+        if self.point_to_point or not self.period < WINDOW:
+            return self.error
+        rows = round(WINDOW / self.period)
+        with np.errstate(invalid="ignore"):
+            squares = pd.DataFrame(self.error.T**2).replace(math.inf, np.nan)
+            means = squares.rolling(rows, min_periods=1).mean().to_numpy().T
+        return np.where(np.isfinite(self.error), np.sqrt(means), self.error)
+
+
+Ensembles = dict[str, Ensemble]
+
+
+def quantile(values: FloatArray, share: float) -> FloatArray:
+    """Return a quantile over runs, (k,), of values (r, k) of which some may be infinite; NaN counts as the largest."""
+    ordered, place = np.sort(values, axis=0), share * (len(values) - 1)
+    below, part = math.floor(place), place - math.floor(place)
+    return np.asarray((1.0 - part) * ordered[below] + part * ordered[below + 1] if part else ordered[below])
+
+
+def load_ensembles(folder: Path, runs: pd.DataFrame) -> dict[str, Ensembles]:
+    """Return the ensembles of `runs`, task -> controller -> ensemble; those without any step are left out.
+
+    Args:
+        folder: the results folder.
+        runs: rows of its table, of one plant and mismatch.
+    """
+    try:
+        steps = results.load_steps(folder, runs["run_id"].tolist(), COLUMNS)
+    except ConfigurationError:  # a sweep keeps no steps
+        return {}
+    run = results.read_manifest(folder).get("configuration", {}).get("run", {})
+    share = float(run.get("camera_moves_at", math.nan))
+    tables = dict(iter(steps.groupby("run_id", sort=False)))
+    found: dict[str, Ensembles] = {}
+    for (task, controller), group in runs.groupby(["task", "controller"], sort=False):
+        known = group[group["run_id"].isin(list(tables))].drop_duplicates("run_id")
+        if len(known):
+            own = [tables[name] for name in known["run_id"]]
+            found.setdefault(str(task), {})[str(controller)] = _ensemble(known, own, share)
+    return found
+
+
+def shown_until(ensembles: Mapping[str, Ensemble]) -> float:
+    """Return until when a figure shows these runs [s]: a move until well after the slowest method has settled."""
+    end = max(float(ensemble.time[-1]) for ensemble in ensembles.values())
+    times = [ensemble.settling_time for ensemble in ensembles.values() if math.isfinite(ensemble.settling_time)]
+    moved = [ensemble.camera_moved_at for ensemble in ensembles.values()]
+    if not times or not next(iter(ensembles.values())).point_to_point or np.isfinite(moved).any():
+        return end
+    return min(end, max(MARGIN * max(times), MIN_SHARE * end))
+
+
+def _ensemble(runs: pd.DataFrame, tables: Sequence[pd.DataFrame], camera_moves_at: float) -> Ensemble:
+    """Return the ensemble of runs and their steps; a camera moves after that share of a run."""
+    longest = max(tables, key=len)
+    known = _camera_moved(runs) and not math.isnan(camera_moves_at)
+    moved_at = float(longest["time_s"].iloc[int(camera_moves_at * len(longest))]) if known else math.nan
+    block = len(longest) // OVERVIEW if len(longest) > LONG else 1
+    count = -(-len(longest) // block)
+    statuses = (runs["status"] == COMPLETED).tolist()
+    unit = handy_unit(runs.reindex(columns=["feature_unit"])["feature_unit"].iloc[0])[1]
+    ends = [0.0 if completed else math.inf for completed in statuses]
+    error = [_padded(table, ERROR, block, count, end or math.nan) for table, end in zip(tables, ends, strict=True)]
+    jacobian = [_padded(table, JACOBIAN, block, count, math.nan) for table in tables]
+    times = np.concatenate([_column(table, STEP_TIME) for table in tables])
+    return Ensemble(
+        runs,
+        longest["time_s"].to_numpy(dtype=np.float64)[::block],
+        unit * np.stack(error),
+        100.0 * np.stack(jacobian),
+        times[times > 0.0],
+        moved_at,
+    )
+
+
+def _camera_moved(runs: pd.DataFrame) -> bool:
+    """Return whether a camera was moved in the middle of these runs, by the values that were drawn for them."""
+    drawn = runs.reindex(columns=["mismatch_values"])["mismatch_values"].dropna()
+    return any(json.loads(text).get("move_angle", 0.0) != 0.0 for text in drawn)
+
+
+def _padded(table: pd.DataFrame, name: str, block: int, count: int, filling: float) -> FloatArray:
+    """Return a column as root mean squares over blocks of rows, (count,), filled up at its end."""
+    values = _column(table, name)
+    if block > 1:
+        means = pd.Series(values**2).groupby(np.arange(len(values)) // block).mean()
+        values = np.sqrt(means.to_numpy())
+    return np.concatenate([values, np.full(count - len(values), filling)])
+
+
+def _column(table: pd.DataFrame, name: str) -> FloatArray:
+    return np.asarray(table.get(name, pd.Series(np.nan, table.index)), dtype=np.float64)

@@ -14,7 +14,7 @@ import numpy as np
 
 from servobench.controllers.controller import Controller, Diagnostics
 from servobench.controllers.servo import ServoController
-from servobench.harness.run.ending import WrongAnswer
+from servobench.harness.run.result import WrongAnswer
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray

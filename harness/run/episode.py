@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,41 +14,20 @@ from servobench.harness.config.registry import engine_of
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.contract import held_to_contract
-from servobench.harness.run.drawn import Drawn, draw
-from servobench.harness.run.ending import COMPLETED, Ending, ends_batch, is_defect
-from servobench.harness.run.experiment import Experiment, build
+from servobench.harness.run.experiment import Drawn, Experiment, build, draw
+from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos, Together, build_together
 from servobench.harness.run.log import StepLog, Steps
-from servobench.harness.run.loop import run_loop
+from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.outcome import find_outcome
 from servobench.harness.run.pose_error import final_pose_error, pose_errors
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun, resolve
-from servobench.harness.run.side_by_side import AllEnded, Ends, ManyBenches, ManyLogs, ManyServos
+from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
 from servobench.harness.run.tasks import Scenario
-from servobench.harness.run.threads import careful
-from servobench.harness.run.together import Together, build_together
-from servobench.plant.bench.plant import ImageArray
 from servobench.plant.contract.checks import FloatArray
 
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """What a run gives back.
-
-    Attributes:
-        row: the run's row in the table of runs.
-        steps: one row a period; None where it was not asked for.
-        picture: what the camera saw last; None without a camera or where it was not asked for.
-        trace: of the error that ended the run, for the log of failures; empty without one.
-    """
-
-    row: dict[str, Any]
-    steps: pd.DataFrame | None
-    picture: ImageArray | None = field(default=None, repr=False)
-    trace: str = ""
 
 
 def run_experiment(
@@ -172,8 +150,7 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
     spec, status = logged.spec, ending.status
     outcome = _outcome(drawn, metrics, logged) if status == COMPLETED else status
     return {
-        **request.as_row(),
-        "engine": engine_of(request.plant),
+        **identity(request),
         "robot": OWN_ROBOT if drawn.true is None else request.robot,
         "task_kind": drawn.scenario.kind,
         "feature_unit": spec.feature_unit,
@@ -188,6 +165,11 @@ def _row(drawn: Drawn, request: RunRequest, ending: Ending, metrics: dict[str, f
     }
 
 
+def identity(request: RunRequest) -> dict[str, Any]:
+    """Return the columns that are known of a run before it is carried out."""
+    return {**request.as_row(), "engine": engine_of(request.plant)}
+
+
 def _pose_metrics(drawn: Drawn, logged: Steps) -> dict[str, float]:
     """Return the true pose error at the end of a run, where the sensing set-up is judged by it."""
     errors = pose_errors(drawn.true, drawn.scenario.reference, logged) if len(logged) else None
@@ -197,17 +179,3 @@ def _pose_metrics(drawn: Drawn, logged: Steps) -> dict[str, float]:
 def _outcome(drawn: Drawn, metrics: dict[str, float], logged: Steps) -> str:
     times = metrics["settling_time_s"], metrics["rms_error_evaluated"]
     return find_outcome(logged, drawn.scenario, *times, drawn.final)
-
-
-def failed(request: RunRequest, ending: Ending) -> RunResult:
-    """Return what is left of a run of which nothing is known but why it failed."""
-    row = {
-        **request.as_row(),
-        "engine": engine_of(request.plant),
-        "status": ending.status,
-        "outcome": ending.status,
-        "periods": 0,
-        "reason": ending.reason,
-        "mismatch_values": "{}",
-    }
-    return RunResult(row, None, trace=ending.trace)

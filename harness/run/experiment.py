@@ -1,4 +1,4 @@
-"""A run made ready: from names, a mismatch and a seed to plant, controller and scenario."""
+"""A run made ready: from names, a mismatch and a seed to the true robot, the task on it, plant and controller."""
 
 from __future__ import annotations
 
@@ -15,23 +15,77 @@ from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot, find_sensing
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.drawn import Drawn, build_scenario, draw
-from servobench.harness.run.ending import ends_batch
 from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained_on
 from servobench.harness.run.loop import CameraMove, LoopSettings
-from servobench.harness.run.plausible import check_joints, check_reach
+from servobench.harness.run.plausibility import check_joints, check_reach, check_times
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun, resolve
-from servobench.harness.run.tasks import Scenario, TaskSetting
+from servobench.harness.run.result import ends_batch
+from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
+from servobench.plant.cameras.draws import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.hand_eye import TrueJacobian, hand_eye_spec
-from servobench.plant.robot.mismatch import Mismatch
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm, TrueJacobian, hand_eye_spec
+from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is drawn for one run."""
+
+    scenario: Scenario
+    true: SensedArm | None = None  # the true robot and its cameras; None for a plant that brings its own
+    sample: MismatchSample | None = None  # how it differs from the nominal one
+    moved: SensedArm | None = None  # the true robot after its camera was moved; None if it is not
+    cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
+
+    @property
+    def final(self) -> SensedArm | None:
+        """The true robot with the camera as it is at the end of the run."""
+        return self.moved or self.true
+
+    def as_record(self) -> dict[str, object]:
+        """Return all values drawn for robot and cameras, for JSON."""
+        parts = (self.sample, self.cameras)
+        return {name: value for part in parts if part is not None for name, value in part.as_record().items()}
+
+
+def draw(resolved: ResolvedRun) -> Drawn:
+    """Draw the true robot and the task of a run.
+
+    Raises:
+        ConfigurationError: a mismatch or a task that cannot be used.
+    """
+    request, robot = resolved.request, find_robot(resolved.request.robot)
+    sensing, seed = find_sensing(request.sensing), named_seed(request.seed, "mismatch")
+    try:
+        arm, sample = sample_mismatch(request.mismatch, robot, seed)
+        true, cameras = sensing.true(robot, arm, sample, request.mismatch, seed)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+    moved = sample.moved(true, robot)
+    task_seed = named_seed(request.seed, "task")
+    setting = TaskSetting(true, true.arm.n, true.channel, task_seed, moved, robot, sensing.nominal(robot))
+    return Drawn(build_scenario(resolved, setting), true, sample, moved, cameras)
+
+
+def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
+    """Return the task of a run as it is in a setting.
+
+    Raises:
+        ConfigurationError: a task that cannot be used there, or times that do not fit.
+    """
+    name = resolved.request.task
+    try:
+        scenario = find_task(name).build(resolved.task, setting)
+    except ValueError as error:
+        raise ConfigurationError(f"task {name}: {error}") from error
+    check_times(resolved, scenario.duration)
+    return scenario
 
 
 @dataclass(frozen=True, eq=False)

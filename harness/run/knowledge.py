@@ -1,23 +1,30 @@
-"""What a controller knows of its arm before a run: the nominal one, and networks that are trained on it."""
+"""The knowledge of a controller before a run: the nominal arm, and networks trained on it and kept in a cache."""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from servobench.controllers.controller import RobotKnowledge
+from servobench.controllers.camera_model import CameraModel
+from servobench.controllers.controller import JacobianFunction, RobotKnowledge
 from servobench.controllers.networks.config import TrainingConfig
-from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.fit import Progress
-from servobench.controllers.sight import Sight
+from servobench.controllers.networks.file import TrainedNetworks, load_networks, save_networks
+from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.controllers.units import in_natural_units
-from servobench.harness.run.network_cache import network_source
+from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunSettings
 from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.signals import PlantSpec
+from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
+
+NETWORKS = "networks"
+FILE = "networks.npz"
+NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes ten times longer to read
+_KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
 
 
 def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
@@ -28,16 +35,16 @@ def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: Ru
         spec=spec,
         preview=run.preview_rows,
         nominal_jacobian=nominal.jacobian,
-        nominal_sight=_sight(nominal),
+        nominal_cameras=_cameras(nominal),
         region=(robot.workspace.lower, robot.workspace.upper),
     )
 
 
-def _sight(nominal: SensedArm) -> Sight | None:
+def _cameras(nominal: SensedArm) -> CameraModel | None:
     """Return how the cameras of a nominal model see points, where its features are those of single points."""
     if not (isinstance(nominal, EyeModel) and nominal.eye.single and nominal.eye.locate):
         return None
-    return Sight(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
+    return CameraModel(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
 
 
 def in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:
@@ -55,3 +62,41 @@ def trained_on(
     if natural.nominal_jacobian is None:
         raise ValueError("nominal_jacobian must be known for networks that are trained on it, got None")
     return network_source(natural.nominal_jacobian, natural.spec, keep, progress)
+
+
+def network_source(
+    nominal_jacobian: JacobianFunction, spec: PlantSpec, keep: Path | None = None, progress: Progress | None = None
+) -> Callable[[TrainingConfig], TrainedNetworks]:
+    """Return a function from a training configuration to its networks: kept, read from the cache, or trained.
+
+    Args:
+        nominal_jacobian: the model to train on.
+        spec: of the plant.
+        keep: results folder in which a copy is kept beside the runs, where that is possible.
+        progress: called with the share that is done while training.
+    """
+
+    def train_cached(config: TrainingConfig, digest: str) -> TrainedNetworks:
+        def make(folder: Path) -> None:
+            save_networks(train(config, nominal_jacobian, spec, progress), folder / FILE)
+
+        return load_networks(cached(NETWORKS, digest[:16], make) / FILE, digest)
+
+    def obtain(config: TrainingConfig) -> TrainedNetworks:
+        with one_thread():
+            key = (cache_folder(NETWORKS), training_digest(config, nominal_jacobian, spec))
+            if key not in _KEPT:
+                while len(_KEPT) >= NETWORKS_KEPT:
+                    _KEPT.pop(next(iter(_KEPT)))
+                _KEPT[key] = train_cached(config, key[1])
+        networks = _KEPT[key]
+        if keep is not None:
+            path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"
+            if not path.exists():
+                with contextlib.suppress(
+                    OSError
+                ):  # a folder that takes no more files is told of where rows are written
+                    save_networks(networks, path)
+        return networks
+
+    return obtain

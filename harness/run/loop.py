@@ -6,15 +6,22 @@ reference(t) ------------.
   |         |                                |                      |
   |         '------------> log row k <-------'                      |
   '-----------------------------------------------------------------'
+
+Linear algebra runs on one thread, for the same bits on any number of processors, and a number that leaves its range is
+an error (`careful`).
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from servobench.controllers.controller import Controller
 from servobench.harness.run.log import StepLog
@@ -22,6 +29,8 @@ from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.seeds import Seeds, named_seed
+
+_found: list[tuple[int, ThreadpoolController]] = []
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,3 +92,22 @@ def run_loop(
 
 def _named(seed: Seeds, name: str) -> Any:  # noqa: ANN401 - as `seed`
     return named_seed(seed, name) if isinstance(seed, int) else [named_seed(each, name) for each in seed]
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Return a context in which linear algebra runs on one thread.
+
+    The search for libraries takes milliseconds, so it is repeated only if a module was imported since the last one.
+    """
+    modules = len(sys.modules)
+    if not _found or _found[0][0] != modules:
+        _found[:] = [(modules, ThreadpoolController())]
+    context: AbstractContextManager[object] = _found[0][1].limit(limits=1)
+    return context
+
+
+@contextmanager
+def careful() -> Iterator[None]:
+    """One thread, and an error where a number leaves its range."""
+    with one_thread(), np.errstate(divide="raise", over="raise", invalid="raise"):
+        yield

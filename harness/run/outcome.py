@@ -24,9 +24,8 @@ import numpy as np
 from servobench.harness.run.log import Steps
 from servobench.harness.run.tasks import Scenario
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.inverse import closest_distance
-from servobench.plant.robot.sensed import SensedArm
 
 SETTLED, NOT_SETTLED = "settled", "not_settled"
 FOLLOWED, NOT_FOLLOWED = "followed", "not_followed"

@@ -7,12 +7,11 @@ from scipy.spatial.transform import Rotation
 
 from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
-from servobench.harness.run.references import Reference
-from servobench.harness.run.views import View
+from servobench.harness.run.references import Reference, View
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm
 
 
 def pose_errors(robot: SensedArm | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:

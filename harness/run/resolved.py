@@ -19,8 +19,7 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.tasks import TASKS, find_task
-from servobench.harness.run.teaching import taught
+from servobench.harness.run.tasks import TASKS, find_task, taught
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.sensing import change_sensing, vary_sensing
 from servobench.plant.robot.robot import Robot

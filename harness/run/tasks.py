@@ -1,50 +1,160 @@
-"""The tasks: where a run starts, what the feature should do, and for how long.
+"""The tasks: the start of a run, the desired feature over time, and the duration.
 
 Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
-feature. A target given as joint positions is therefore seen through the true robot, and is always in reach. Curves are
+feature. A target given as joint positions is therefore observed on the true robot, and is always in reach. Curves are
 given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch; where cameras
-see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.views`). The numbers
-here are those of the UR5's bench; `servobench.harness.run.teaching` moves them to that of another arm.
+see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.references`). The
+defaults are those of the UR5's bench; `taught` moves them to the same places in another arm's workspace.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.pose_tasks import PoseTask, pose_start
-from servobench.harness.run.references import FixedPoint, Laps, Reference, TaskKind, line, read_waypoints
-from servobench.harness.run.sampling import Box, draw_in_view, drawn_together
-from servobench.harness.run.task_settings import (
-    CircleTask,
-    EnduranceTask,
-    LemniscateTask,
-    LineTask,
-    PointTask,
-    RandomTask,
-    TargetTask,
-    Vector,
-    WaypointTask,
+from servobench.harness.run.references import (
+    FixedPoint,
+    Laps,
+    Reference,
+    TaskKind,
+    TaughtView,
+    in_space,
+    line,
+    read_waypoints,
 )
-from servobench.harness.run.views import TaughtView, in_space
+from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together, pose_start
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
-from servobench.plant.contract.settings import suggest
+from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings, suggest
 from servobench.plant.contract.signals import Channel
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
-from servobench.plant.robot.ur5 import MOVES, STRETCHED
+from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
+from servobench.plant.robot.workspace import Workspace
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
+
+Vector: TypeAlias = tuple[float, ...]
+
+
+@settings
+class PointTask:
+    """A move from rest to a fixed target that was taught at given joint positions."""
+
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    target: Vector = HOME
+    """[rad] joint positions at which the target was taught"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
+    into_view: bool = True
+    """where cameras see pixels, draw start and target together towards the arm's home until both are in view"""
+
+
+@settings
+class RandomTask:
+    """A move whose start and target are drawn by the run's seed from a box of joint positions.
+
+    Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
+    """
+
+    lower: Vector = TRAINING_LOWER
+    """[rad] lower corner of the box"""
+    upper: Vector = TRAINING_UPPER
+    """[rad] upper corner of the box"""
+    shortest: Number = 0.1
+    """[m] least distance between start and target on the nominal model"""
+    lowest: Number = 0.08
+    """[m] least height of the ball above the table on the nominal model"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
+
+
+@settings
+class CircleTask:
+    """A horizontal circle in the camera frame, entered from its centre: a large initial error."""
+
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    centre: Vector = (0.0, 0.0, 1.25)
+    """[m] camera frame; (0.5, 0, 0.3) m in the base frame of the nominal robot"""
+    radius: Positive = 0.3
+    """[m] of the circle"""
+    lap_time: Positive = 10.0
+    """[s] 200 points a lap at the default period"""
+    laps: Count = 2
+    """laps in the run; the last one is judged"""
+
+
+@settings
+class LemniscateTask(CircleTask):
+    """A figure of eight in the plane of the camera's image."""
+
+    radius: Positive = 0.25
+    """[m] half of its length"""
+
+
+@settings
+class EnduranceTask:
+    """Many laps on the curve of the task `circle` or `lemniscate`: whether a method stays as good as it was."""
+
+    curve: Literal["circle", "lemniscate"] = "circle"
+    """the task whose centre and radius the curve has"""
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    lap_time: Positive = 10.0
+    """[s] 200 points a lap at the default period"""
+    laps: Count = 180
+    """laps in the run, half an hour; the first one is the entry, the last one is judged"""
+
+
+@settings
+class LineTask:
+    """A straight line at constant speed, then rest at its end."""
+
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    begin: Vector = (-0.2, 0.0, 1.25)
+    """[m] camera frame"""
+    end: Vector = (0.2, 0.1, 1.2)
+    """[m] camera frame"""
+    moving: Positive = 8.0
+    """[s] from the beginning to the end of the line"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
+
+
+@settings
+class WaypointTask:
+    """Waypoints from a CSV file, in the camera frame; its columns are time_s, x_m, y_m, z_m on a UR5."""
+
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    file: str = ""
+    """path of the CSV file"""
+    settle: NonNegative = 2.0
+    """[s] rest after the last waypoint"""
+
+
+@settings
+class TargetTask:
+    """A move from rest to a fixed target that is given as a feature."""
+
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    target: Vector = (0.1, -0.1, 1.2)
+    """[m] camera frame"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
 
 
 @dataclass(frozen=True)
@@ -260,3 +370,46 @@ def find_task(name: str) -> TaskEntry:
     if name not in TASKS:
         raise ConfigurationError(f"unknown task {name!r}: {suggest(name, TASKS)}")
     return TASKS[name]
+
+
+def taught(entry: TaskEntry, robot: Robot) -> Any:  # noqa: ANN401 - the settings of any task
+    """Return the settings of a task for a robot: on a UR5 those of the entry itself.
+
+    Joint positions are those that were found for the robot, lengths grow with its workspace, times stay.
+    """
+    if robot.name == DEFAULT_ROBOT:
+        return entry.default
+    work, default = robot.workspace, entry.default
+    home = _numbers(work.home)
+    match default:
+        case PoseTask():  # its start and its goal are the arm's own
+            return default
+        case PointTask():
+            start, target = work.moves.get(entry.name, (work.stretched, work.home))
+            return replace(default, start=_numbers(start), target=_numbers(target))
+        case RandomTask():
+            return RandomTask(
+                _numbers(work.lower),
+                _numbers(work.upper),
+                work.scale * default.shortest,
+                work.scale * default.lowest,
+                default.duration,
+            )
+        case CircleTask():
+            return replace(
+                default, start=home, centre=_scaled(work, default.centre), radius=work.scale * default.radius
+            )
+        case LineTask():
+            return replace(default, start=home, begin=_scaled(work, default.begin), end=_scaled(work, default.end))
+        case TargetTask():
+            return replace(default, start=home, target=_scaled(work, default.target))
+        case _:
+            return replace(default, start=home)
+
+
+def _scaled(work: Workspace, point: Vector) -> Vector:
+    return tuple(work.scale * value for value in point)
+
+
+def _numbers(values: FloatArray | Iterable[float]) -> Vector:
+    return tuple(np.asarray(values, dtype=np.float64).tolist())

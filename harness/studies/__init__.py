@@ -1,1 +1,1 @@
-"""Studies: the paper's claims, tuning, the robustness map, the README's pictures."""
+"""Studies: the paper's claims and their reproduction, tuning, the robustness map."""

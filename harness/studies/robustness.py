@@ -1,7 +1,7 @@
 """The robustness map: success and settling time along axes, each varied by itself from a `moderate` mismatch.
 
 Every method gets the same robots, starts and targets at every place of the map. Runs whose camera is moved half-way
-take longer, so that there is time to recover. The axes are those of `servobench.harness.studies.map_lines`.
+take longer, so that there is time to recover. The usual map has the axes `LINES`; a user names others.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -32,26 +32,76 @@ from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.pictures.draw import save_figure
-from servobench.harness.pictures.panels import Styles, add_legend
-from servobench.harness.pictures.places import Curves, draw_curves, same_curves
-from servobench.harness.pictures.style import TEXT, WIDTH, figure_style, method_styles
+from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
+from servobench.harness.pictures.style import TEXT, WIDTH, Styles, add_legend, figure_style, method_styles, save_figure
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import check_settings
-from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, NOISE, Line
 from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.contract.settings import suggest
 from servobench.plant.kinematic import KinematicConfig
+from servobench.plant.robot.mismatch import Magnitude, parse_magnitudes
 
 BASE: Final = "moderate"
 TASK: Final = "random"
 MOVE_DURATION: Final = 20.0  # [s], of a run whose camera is moved half-way
-
 STATIC_CAMERA: Final = "usual"  # folder of the runs whose camera stays where it is
 MOVED_CAMERA: Final = "moved"  # folder of the runs whose camera is moved
 FIGURES: Final = "figures"
 LIMITS: Final = "predicted_limits.csv"
 COLUMNS: Final = 3  # panels of a picture
 NOTE: Final = 115  # letters of a line below it
+MOVE: Final = "camera_move"
+LATENCY: Final = "latency"
+NOISE: Final = "noise"
+
+
+@dataclass(frozen=True)
+class Line:
+    """An axis of the map."""
+
+    axis: str  # of the mismatch, the sensor's among them, or "latency" or "noise"
+    title: str  # label of the axis
+    places: tuple[Magnitude, ...]  # its magnitudes
+
+
+LINES: Final = (
+    Line("camera_rotation", "camera turned [°]", parse_magnitudes("camera_rotation", "0:180:30deg")),
+    Line("links", "link lengths wrong by up to [%]", parse_magnitudes("links", "0:30:10%")),
+    Line("joint_offsets", "joint zeros wrong by up to [°]", parse_magnitudes("joint_offsets", "0:20:5deg")),
+    Line("tool", "tool wrong by up to [mm]", parse_magnitudes("tool", "0:100:25mm")),
+    Line(LATENCY, "camera latency [ms]", tuple(Magnitude(50.0 * n, "ms") for n in range(6))),
+    Line(NOISE, "sensor noise [times the usual]", tuple(Magnitude(float(n), "") for n in (0, 1, 2, 4, 8))),
+    Line(MOVE, "camera moved half-way [°]", parse_magnitudes(MOVE, "0:180:45deg")),
+)
+
+
+SENSOR_LINES: Final = (
+    Line("mixture", "noise displaced to one side [%]", parse_magnitudes("mixture", "0:20:5%")),
+    Line("bimodal", "noise displaced to either side [%]", parse_magnitudes("bimodal", "0:20:5%")),
+    Line("stable", "exponent of stable noise", parse_magnitudes("stable", "1:2:0.25")),
+    Line("uniform", "uniform noise, deviation [mm]", parse_magnitudes("uniform", "0/1/2/4/8mm")),
+    Line("quantised", "feature rounded to [mm]", parse_magnitudes("quantised", "0/1/2/5/10mm")),
+    Line("outliers", "frames that are outliers [%]", parse_magnitudes("outliers", "0:40:10%")),
+    Line("occlusions", "frames with the feature hidden [%]", parse_magnitudes("occlusions", "0:40:10%")),
+    Line("lost_frames", "frames lost [%]", parse_magnitudes("lost_frames", "0:80:20%")),
+    Line("frame_period", "time between frames [ms]", parse_magnitudes("frame_period", "50:200:50ms")),
+    Line("jitter", "frames late by up to [ms]", parse_magnitudes("jitter", "0:200:50ms")),
+)
+
+
+KNOWN_LINES: Final = {line.axis: line for line in (*LINES, *SENSOR_LINES)}
+
+
+def find_lines(axes: Sequence[str]) -> tuple[Line, ...]:
+    """Return the axes of those names, in the order of the map; all of the usual map for none.
+
+    Raises:
+        ConfigurationError: an unknown name.
+    """
+    for axis in axes:
+        if axis not in KNOWN_LINES:
+            raise ConfigurationError(f"the map has no axis {axis!r}: {suggest(axis, KNOWN_LINES)}")
+    return tuple(line for line in KNOWN_LINES.values() if line.axis in axes) or LINES
 
 
 class Scale(NamedTuple):

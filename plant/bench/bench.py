@@ -19,9 +19,8 @@ from typing import Any, NamedTuple, final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel
+from servobench.plant.bench.plant import ImageArray, Plant, PlantSetup, TrueModel, World
 from servobench.plant.bench.sensor import Sensor
-from servobench.plant.bench.world import World
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.lanes import take

@@ -25,7 +25,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray, Channel
 from servobench.plant.robot.arm import YZX, ZXY, SerialArm
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm
 
 Mount: TypeAlias = Literal["fixed", "hand"]
 """Whether the cameras are beside the arm and the target on it, or the reverse."""

@@ -24,8 +24,8 @@ from servobench.plant.cameras.optics import Optics, ideal_optics
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.hand_eye import turn_about
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import turn_about
 from servobench.plant.robot.workspace import camera_pose
 
 CAMERA: Final = PinholeCamera()  # as planned

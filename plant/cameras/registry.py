@@ -15,10 +15,9 @@ from servobench.plant.cameras.plate import PLATE
 from servobench.plant.cameras.position import POSITION
 from servobench.plant.cameras.stereo import STEREO
 from servobench.plant.contract.settings import suggest
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 
 EYES: Final[Mapping[str, Eye]] = {eye.name: eye for eye in (POSITION, PIXEL, STEREO, PLATE)}
 FIXED: Final = "fixed"

@@ -12,7 +12,7 @@ from servobench.plant.contract.settings import NonNegative, Number, Positive, Sh
 
 Config = TypeVar("Config")
 Family: TypeAlias = Literal["white", "mixture", "bimodal", "stable", "uniform"]
-"""A family of noise, as `servobench.plant.bench.noise_families` defines them."""
+"""A family of noise, as `servobench.plant.bench.noise` defines them."""
 Stability: TypeAlias = Annotated[float, Ge(0.5), Le(2.0)]
 """Exponent α of a stable distribution; below 0.5 its numbers tell nothing."""
 Skewness: TypeAlias = Annotated[float, Ge(-1.0), Le(1.0)]

@@ -11,7 +11,7 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, nested, settings
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm
 
 
 @settings

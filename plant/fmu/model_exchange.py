@@ -2,7 +2,7 @@
 
     q -> (y, ∂y/∂q)
 
-The result answers like `plant.robot.symbolic.feature_and_jacobian`, so that whatever is built on the project's own
+The result answers like `plant.cameras.symbolic.feature_and_jacobian`, so that whatever is built on the project's own
 equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU whose equations nobody has.
 """
 

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench.plant import TrueModel
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import TrueModel, World
 from servobench.plant.contract.checks import FloatArray, as_array, is_finite, whole_steps
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.seeds import Seeds
@@ -34,7 +33,7 @@ from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
 from servobench.plant.fmu.port import Port
 from servobench.plant.fmu.states import FmuState
 from servobench.plant.robot.arm import rpy_from_rotation
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm
 
 SEEN_ABOVE = 0.5  # a number that says whether a feature is seen
 

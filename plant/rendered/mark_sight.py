@@ -26,9 +26,8 @@ from servobench.plant.rendered.lens import Lens
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.sight import Sight
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.robot import Robot
-from servobench.plant.robot.sensed import SensedArm
 
 NOWHERE: Final = (0.0, 0.0, 1.0)  # stands for a point that is not found, whose features are not valid
 CROSS: Final = 5  # [px] half size of what marks a point that is found

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.robot.sensed import SensedArm
+from servobench.plant.robot.hand_eye import SensedArm
 
 Model = TypeVar("Model", bound=SensedArm)
 

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from servobench.plant.bench.bench import Bench, build_bench
-from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import PlantSetup, World
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.contract.faults import Collision, PlantDiverged

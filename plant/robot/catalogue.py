@@ -1,16 +1,27 @@
-"""Robots by name or by file: `--robot ur10e`, `panda`, `random_arm:7`, `my_ur10e.yaml`, `arm.toml`, `arm.urdf`."""
+"""Robots by name or by file: `--robot ur10e`, `panda`, `random_arm:7`, `my_ur10e.yaml`, `arm.toml`, `arm.urdf`.
+
+A random arm is drawn from its number: the number of joints, lengths and offsets of the links, twists and the signs of
+the gears. It is as long as a UR5, and drawn again until it can work at the bench. The tool on its flange and the turn
+of the camera are those of the run's mismatch. Controllers know the joint limits and the number of features, no model.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache, partial
 from typing import Final
 
+import numpy as np
+
 from servobench.plant.contract.files import user_path
+from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import suggest
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
-from servobench.plant.robot.random_arm import MAX_NUMBER, RANDOM_ARM, random_robot
-from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.robot import Robot, estimate_links
+from servobench.plant.robot.workspace import find_workspace, with_ball
 
 UR5: Final = "ur5"
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
@@ -68,3 +79,48 @@ def _read(text: str, changed: int) -> Robot:
     from servobench.plant.robot.files import read_robot  # noqa: PLC0415 - only files need their readers
 
     return read_robot(text)
+
+
+RANDOM_ARM: Final = "random_arm"  # before a colon and the number
+MAX_NUMBER: Final = 1_000_000
+JOINTS: Final = (3, 7)  # fewest and most
+LENGTH: Final = 1.2  # [m] of all links, about that of a UR5
+SKEW: Final = math.radians(10.0)  # of a twist from the nearest quarter of a turn
+SHARE: Final = 0.6  # of the lengths and offsets that are not zero
+LIMIT: Final = 0.9 * math.pi  # [rad] of a joint to either side
+SPEED: Final = math.pi  # [rad/s] of a joint
+MAX_DRAWS: Final = 200
+
+
+def random_robot(number: int) -> Robot:
+    """Return the arm of a number, the same for ever.
+
+    Raises:
+        ValueError: a number out of its bounds.
+    """
+    if not 0 <= number <= MAX_NUMBER:
+        raise ValueError(f"the number of a {RANDOM_ARM} must be from 0 to {MAX_NUMBER:,}, got {number}")
+    generator = named_generator(number, RANDOM_ARM)
+    n, name = int(generator.integers(JOINTS[0], JOINTS[1] + 1)), f"{RANDOM_ARM}_{number}"
+    limits = JointLimits(np.full(n, -LIMIT), np.full(n, LIMIT), np.full(n, SPEED))
+    for _ in range(MAX_DRAWS):
+        arm = _draw_arm(n, generator)
+        links = estimate_links(arm, None, None)
+        try:
+            workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+        except ValueError:
+            continue
+        source = f"drawn from the number {number}"
+        return Robot(name, name, source, arm, limits, links, workspace, note=f"{name} has {n} joints", known=False)
+    raise ValueError(f"none of {MAX_DRAWS} arms drawn for {name} can work at the bench; take another number")
+
+
+def _draw_arm(n: int, generator: np.random.Generator) -> SerialArm:
+    lengths = generator.uniform(0.2, 1.0, (2, n)) * (generator.random((2, n)) < SHARE)
+    lengths[0, 0] = max(lengths[0, 0], 0.2)  # one link at least
+    a, d = LENGTH / lengths.sum() * lengths
+    quarters = generator.choice([-1.0, 0.0, 1.0], n)
+    twists = 0.5 * math.pi * quarters + generator.uniform(-SKEW, SKEW, n)
+    names = tuple(f"joint_{i}" for i in range(1, n + 1))
+    arm = arm_from_dh(a, d, twists, (0.0, 0.0, 0.0), names)
+    return replace(with_ball(arm), gear_ratio=generator.choice([-1.0, 1.0], n))

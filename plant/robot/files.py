@@ -1,16 +1,40 @@
-"""Robots from files: a factory calibration of Universal Robots, a DH table in TOML, a URDF."""
+"""Robots from files: a factory calibration of Universal Robots, a DH table in TOML, a URDF.
+
+A DH table:
+
+    name = "my_arm"                          # by default the file's name
+    convention = "standard"                  # or "modified"
+    a = [0.0, -0.425, -0.392, 0.0, 0.0, 0.0]           # [m]
+    d = [0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996]     # [m]
+    alpha = [1.5708, 0.0, 0.0, 1.5708, -1.5708, 0.0]   # [rad]
+    theta = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]   # [rad] joint offsets; by default 0
+    joint_lower = [-3.14, -3.14, -3.14, -3.14, -3.14, -3.14]     # [rad]
+    joint_upper = [3.14, 3.14, 3.14, 3.14, 3.14, 3.14]           # [rad]
+    joint_speed = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]                 # [rad/s]
+
+`joint_names`, `mass` [kg] and `torque` [Nm] may be given too. By the modified convention the lists of a, d and alpha
+may have one entry more, which leads to the flange.
+
+Of a URDF, read by yourdfpy, the chain with the most rotating joints is taken, with its limits, masses and torques.
+"""
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
+from math import isfinite, pi
 from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from servobench.plant.contract.files import user_path
-from servobench.plant.robot.dh_file import read_dh_robot
-from servobench.plant.robot.makers import universal_robot
-from servobench.plant.robot.measured import MAX_DEVIATION, nearest_title, read_calibration
-from servobench.plant.robot.robot import Robot
+from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.files import read_toml, user_path
+from servobench.plant.contract.settings import Number, Positive, override, settings
+from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh, arm_from_modified_dh, rpy_from_rotation
+from servobench.plant.robot.makers import MAX_DEVIATION, nearest_title, read_calibration, universal_robot
+from servobench.plant.robot.robot import Links, Robot, at_far_end, estimate_links
+from servobench.plant.robot.workspace import find_workspace, with_ball
 
 
 def read_robot(text: str) -> Robot:
@@ -26,8 +50,6 @@ def read_robot(text: str) -> Robot:
     path = user_path(name)
     kind = path.suffix.lower()
     if kind == ".urdf":
-        from servobench.plant.robot.urdf_file import read_urdf_robot  # noqa: PLC0415 - an extra brings its reader
-
         return read_urdf_robot(path, tip)
     if tip:
         raise ValueError(f"robot {text!r}: only a .urdf has links to be named after '#'")
@@ -61,3 +83,278 @@ def _read_calibrated(path: Path) -> Robot:
             f"data sheet's): the true robot is the calibrated arm, controllers know the data sheet's {title}"
         ),
     )
+
+
+Column = tuple[Number, ...]
+
+
+@settings
+class DhTable:
+    """The keys of a file."""
+
+    a: Column
+    """[m] link lengths."""
+    d: Column
+    """[m] link offsets."""
+    alpha: Column
+    """[rad] link twists."""
+    joint_lower: Column
+    """[rad]"""
+    joint_upper: Column
+    """[rad]"""
+    joint_speed: tuple[Positive, ...]
+    """[rad/s]"""
+    theta: Column = ()
+    """[rad] joint offsets; an empty list for none."""
+    convention: Literal["standard", "modified"] = "standard"
+    """Which of the two DH conventions."""
+    name: str = ""
+    """In tables; empty for the file's name."""
+    joint_names: tuple[str, ...] = ()
+    """An empty list for joint_1, joint_2, …"""
+    mass: tuple[Positive, ...] = ()
+    """[kg] of the links; an empty list for estimates."""
+    torque: tuple[Positive, ...] = ()
+    """[Nm] largest of the joints; an empty list for estimates."""
+
+
+REQUIRED = ("a", "d", "alpha", "joint_lower", "joint_upper", "joint_speed")
+
+
+def read_dh_robot(path: Path) -> Robot:
+    """Return the robot of a DH table.
+
+    Raises:
+        ValueError: the file is missing, malformed, or describes no arm that can work at a table.
+    """
+    values = read_toml("robot file", path)
+    for key in REQUIRED:
+        if key not in values:
+            raise ValueError(f"robot file {path}: the key {key!r} is missing; wanted {', '.join(REQUIRED)}")
+    blank = DhTable((), (), (), (), (), ())
+    table = override(f"robot file {path}", blank, values)
+    try:
+        return _robot_of(table, path)
+    except ValueError as error:
+        raise ValueError(f"robot file {path}: {error}") from error
+
+
+def _robot_of(table: DhTable, path: Path) -> Robot:
+    arm = with_ball(_arm_of(table))
+    n = arm.n
+    limits = JointLimits(
+        as_vector("joint_lower", table.joint_lower, n),
+        as_vector("joint_upper", table.joint_upper, n),
+        as_vector("joint_speed", table.joint_speed, n),
+    )
+    links = estimate_links(arm, _given("mass", table.mass, n), _given("torque", table.torque, n))
+    workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+    name = table.name or path.stem
+    return Robot(name, name, path.name, arm, limits, links, workspace, note=estimated(table.mass, name))
+
+
+def _arm_of(table: DhTable) -> SerialArm:
+    n = len(table.joint_lower)
+    names = table.joint_names or tuple(f"joint_{i}" for i in range(1, n + 1))
+    if len(names) != n:
+        raise ValueError(f"joint_names must hold {n} names, got {len(names)}")
+    if table.convention == "standard":
+        arm = arm_from_dh(table.a, table.d, table.alpha, (0.0, 0.0, 0.0), names)
+    else:
+        arm = arm_from_modified_dh(table.a, table.d, table.alpha, names)
+    return replace(arm, joint_offset=as_vector("theta", table.theta, n)) if table.theta else arm
+
+
+def _given(name: str, values: tuple[float, ...], n: int) -> FloatArray | None:
+    return as_vector(name, values, n) if values else None
+
+
+def estimated(mass: tuple[float, ...], name: str) -> str:
+    """Return the line that says what was estimated."""
+    return "" if mass else f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
+
+
+TURNING: Final = ("revolute", "continuous")
+DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
+
+
+class Joint(NamedTuple):
+    """A turning joint of the chain.
+
+    Attributes:
+        joint: as yourdfpy reads it.
+        origin: (4, 4), the joint in the frame of the turning joint before it, whose z axis is its own.
+        aligned: (4, 4), the frame whose z axis is the joint's axis, in the frame of the joint's child link.
+    """
+
+    joint: Any
+    origin: FloatArray
+    aligned: FloatArray
+
+
+def read_urdf_robot(path: Path, tip: str = "") -> Robot:
+    """Return the robot of a URDF.
+
+    Args:
+        path: the file; meshes are not read.
+        tip: the link that carries the ball; empty for the last link after the most turning joints.
+
+    Raises:
+        ValueError: the file is missing, malformed, or describes no serial arm with turning joints.
+    """
+    tree = _read(path)
+    try:
+        chain, flange, tip = _chain(tree, tip)
+        names = tuple(link.joint.name for link in chain)
+        origins = np.stack([*(link.origin for link in chain), flange])
+        n = len(chain)
+        bare = SerialArm(
+            names, origins[:, :3, 3], rpy_from_rotation(origins[:, :3, :3]), np.zeros(n), np.ones(n), np.zeros(3)
+        )
+        arm, limits = with_ball(bare), _limits(chain)
+        links, note = _links(tree, chain, arm)
+        workspace = find_workspace(arm, (limits.lower, limits.upper), (links.radius, links.aside))
+    except ValueError as error:
+        raise ValueError(f"robot file {path}: {error}") from error
+    lines = [f"{path.name}: {n} joints from {names[0]} to {names[-1]}, the ball on {tip}", *([note] if note else [])]
+    return Robot(path.stem, str(tree.name), path.name, arm, limits, links, workspace, note="; ".join(lines))
+
+
+def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
+    """Return the elements of a URDF."""
+    try:
+        import yourdfpy  # noqa: PLC0415 - only the extra urdf brings it
+    except ImportError as error:
+        raise ValueError(f"robot file {path}: a URDF needs yourdfpy: pip install 'servobench[urdf]'") from error
+    said: list[str] = []  # of a text that is no XML, of which yourdfpy goes on to read what it can
+
+    def collect(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            said.append(record.getMessage())
+        return record.levelno < logging.ERROR
+
+    log = logging.getLogger(yourdfpy.urdf.__name__)
+    log.addFilter(collect)
+    try:
+        read = yourdfpy.URDF.load(
+            str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
+        ).robot
+    except Exception as error:  # noqa: BLE001 - whatever it raises, the line says it
+        said.append(str(error) or type(error).__name__)
+    finally:
+        log.removeFilter(collect)
+    if said:
+        raise ValueError(f"robot file {path} is no URDF that can be read: {' '.join(said[0].split())}")
+    return read
+
+
+def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa: ANN401
+    """Return the turning joints from the base to a tip, the flange after the last one, and the name of the tip."""
+    above = {joint.child: joint for joint in tree.joints}
+    links = [link.name for link in tree.links]
+    for joint in tree.joints:
+        if lost := {joint.parent, joint.child} - set(links):
+            raise ValueError(f"joint {joint.name!r} is between links of which the file has no {min(map(str, lost))!r}")
+    if tip and tip not in links:
+        raise ValueError(f"it has no link {tip!r}; valid: {', '.join(links)}")
+    ways = {name: _way(name, above) for name in ([tip] if tip else links)}
+    # The nearest of the links behind the last turning joint is the flange, before fingers and cameras.
+    tip = max(ways, key=lambda name: (sum(map(_turns, ways[name])), -_after_last(ways[name])))
+    tip = tip if not _is_last_body(ways, tip) else _flange(ways, tip)
+    way = ways[tip]
+    if sum(map(_turns, way)) < 3:
+        raise ValueError("it has no chain of at least three turning joints")
+    chain, pose = [], np.eye(4)
+    for joint in way:
+        if joint.type not in (*TURNING, "fixed"):
+            raise ValueError(f"joint {joint.name!r} on the way to {tip!r} is of type {joint.type}; name another link")
+        pose = pose @ (np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=np.float64))
+        if _turns(joint):
+            aligned = _along(np.asarray(joint.axis, dtype=np.float64))
+            chain.append(Joint(joint, pose @ aligned, aligned))
+            pose = aligned.T
+    return chain, pose, tip
+
+
+def _turns(joint: Any) -> bool:  # noqa: ANN401
+    return joint.type in TURNING and joint.mimic is None
+
+
+def _way(link: str, above: dict[str, Any]) -> list[Any]:
+    """Return the joints from the root to a link."""
+    way: list[Any] = []
+    while link in above and len(way) <= len(above):
+        way.append(above[link])
+        link = above[link].parent
+    return way[::-1]
+
+
+def _after_last(way: list[Any]) -> int:
+    """Return how many joints follow the last one that turns."""
+    return next((i for i, joint in enumerate(reversed(way)) if _turns(joint)), len(way))
+
+
+def _is_last_body(ways: dict[str, list[Any]], tip: str) -> bool:
+    return len(ways) > 1 and _after_last(ways[tip]) == 0
+
+
+def _flange(ways: dict[str, list[Any]], last: str) -> str:
+    """Return the link that is fixed to the last turning one, if there is one, else that one itself."""
+    fixed = [
+        name for name, way in ways.items()
+        if len(way) == len(ways[last]) + 1 and way[:-1] == ways[last] and way[-1].type == "fixed"
+    ]  # fmt: skip
+    return fixed[0] if fixed else last
+
+
+def _along(axis: FloatArray) -> FloatArray:
+    """Return a frame (4, 4) whose z axis is `axis` (3,); no turn where that is z already."""
+    z = axis / np.linalg.norm(axis)
+    frame = np.eye(4)
+    if z[2] < 1.0 - 1e-12:
+        side = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+        x = side - (side @ z) * z
+        x /= np.linalg.norm(x)
+        frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    return frame
+
+
+def _limits(chain: list[Joint]) -> JointLimits:
+    """Return the limits; soft limits of a safety controller count where they are narrower."""
+    rows = []
+    for link in chain:
+        limit, safety = link.joint.limit, link.joint.safety_controller
+        lower, upper, speed = -2 * pi, 2 * pi, DEFAULT_SPEED
+        if limit is not None:
+            if link.joint.type != "continuous" and limit.lower is not None and limit.upper is not None:
+                lower, upper = limit.lower, limit.upper
+            speed = limit.velocity or speed
+        if safety is not None and link.joint.type != "continuous":
+            lower = max(lower, lower if safety.soft_lower_limit is None else safety.soft_lower_limit)
+            upper = min(upper, upper if safety.soft_upper_limit is None else safety.soft_upper_limit)
+        rows.append((lower, upper, speed))
+    lowers, uppers, speeds = np.array(rows, dtype=np.float64).T
+    return JointLimits(lowers, uppers, speeds)
+
+
+def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]:  # noqa: ANN401
+    """Return the links, estimated where the file says nothing, and a line about what was."""
+    inertials = {link.name: link.inertial for link in tree.links}
+    own = [inertials[link.joint.child] for link in chain]
+    efforts = [0.0 if link.joint.limit is None else link.joint.limit.effort or 0.0 for link in chain]
+    torque = np.array(efforts) if all(isfinite(effort) and effort > 0.0 for effort in efforts) else None
+    missing = [word for word, given in (("torque limits", torque is not None),) if not given]
+    if any(inertial is None or not inertial.mass for inertial in own):
+        return estimate_links(arm, torque=torque), f"estimated: masses, inertia{', torque limits' if missing else ''}"
+    mass = np.array([inertial.mass for inertial in own], dtype=np.float64)
+    poses = [link.aligned.T @ _pose(inertial.origin) for link, inertial in zip(chain, own, strict=True)]
+    centre = np.array([pose[:3, 3] for pose in poses])
+    inertia = np.array(
+        [pose[:3, :3] @ np.asarray(each.inertia) @ pose[:3, :3].T for pose, each in zip(poses, own, strict=True)]
+    )
+    links = estimate_links(arm, mass, torque, at_far_end(arm, centre, inertia))
+    return links, "estimated: torque limits" if missing else ""
+
+
+def _pose(origin: FloatArray | None) -> FloatArray:
+    return np.eye(4) if origin is None else np.asarray(origin, dtype=np.float64)

@@ -1,13 +1,16 @@
-"""How near an arm can bring its ball to a point: inverse kinematics of the position alone, within the joint limits.
+"""Inverse kinematics within the joint limits by damped least squares (Levenberg and Marquardt).
 
-Levenberg and Marquardt's damped least squares from many starts at once. With the error e = p* − p(q), of each start and
-point by itself,
+The position of the ball, from many starts at once. With the error e = p* − p(q), for each start and point by itself,
 
     Δq = Jᵀ (J Jᵀ + λ I)⁻¹ e,        q ← clip(q + Δq, lower, upper)   if that brings the ball nearer
 
-where J is the arm's own position Jacobian without the columns of those joints that are at a stop and would leave it.
-The damping λ shrinks after a step that is taken and grows after one that is not. A point that can be reached has
-many solutions, and most starts find one; of a point out of reach the nearest place that the ball can be at is found.
+where J is the arm's position Jacobian without the columns of joints that are at a stop and would leave their range.
+The damping λ shrinks after a step that is taken and grows after one that is not. A point within reach has many
+solutions, and most starts find one; for a point out of reach the nearest position of the ball is found.
+
+The pose of the flange, from one start, with the geometric Jacobian J (6×n) and lengths divided by that of the arm, ℓ:
+
+    Δq = Jᵀ (J Jᵀ + λ I)⁻¹ [ℓ⁻¹ (p* − p); log(R* Rᵀ)],        q ← clip(q + Δq, lower, upper)   if the error shrinks
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, plus_diagonal, transposed
@@ -114,3 +118,49 @@ def _step(
     J = J * free[..., None, :]
     weighted = np.linalg.solve(plus_diagonal(J @ transposed(J), damping[..., None]), error[..., None])[..., 0]
     return np.asarray(np.clip(q + np.vecmat(weighted, J), lower, upper))
+
+
+POSE_ITERATIONS: Final = 100
+POSE_TOLERANCE: Final = 1e-9  # norm of the error, of lengths over the arm's and angles [rad], at which the search ends
+FIRST_POSE_DAMPING: Final = 1e-3
+POSE_SHRINK, POSE_GROW = 0.2, 5.0  # of the damping after a step that is taken, and after one that is not
+
+
+def reach_pose(
+    arm: SerialArm, pose: FloatArray, start: FloatArray, lower: FloatArray, upper: FloatArray
+) -> tuple[FloatArray, float]:
+    """Return joint positions near a start at which the flange has a pose.
+
+    Args:
+        arm: one arm.
+        pose: X_BF, (4, 4), that is wanted.
+        start: (n,), where the search begins [rad].
+        lower: (n,), joint limits [rad].
+        upper: (n,) [rad].
+
+    Returns:
+        (n,) rad, and the norm of the error that is left: of the length over the arm's and the angle [rad].
+    """
+    length = float(np.linalg.norm(arm.translation, axis=-1).sum())
+    q, damping = np.clip(start, lower, upper), FIRST_POSE_DAMPING
+    error, J = _pose_error(arm, pose, q, length)
+    for _ in range(POSE_ITERATIONS):
+        if np.linalg.norm(error) <= POSE_TOLERANCE:
+            break
+        step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
+        tried = np.clip(q + step, lower, upper)
+        new_error, new_J = _pose_error(arm, pose, tried, length)
+        if np.linalg.norm(new_error) < np.linalg.norm(error):
+            q, error, J, damping = tried, new_error, new_J, damping * POSE_SHRINK
+        else:
+            damping *= POSE_GROW
+    return q, float(np.linalg.norm(error))
+
+
+def _pose_error(arm: SerialArm, pose: FloatArray, q: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
+    """Return the error, (6,), and the geometric Jacobian, (6, n), with lengths over that of the arm."""
+    frames = arm.frames(q)
+    flange, axes = frames[-1], frames[: arm.n, :3, 2] * arm.gear_ratio[:, None]
+    turn = Rotation.from_matrix(pose[:3, :3] @ flange[:3, :3].T).as_rotvec()
+    moves = np.cross(axes, flange[:3, 3] - frames[: arm.n, :3, 3]) / length
+    return np.concatenate([(pose[:3, 3] - flange[:3, 3]) / length, turn]), np.vstack([moves.T, axes.T])

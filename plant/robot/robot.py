@@ -1,20 +1,26 @@
-"""A robot as its maker describes it: the nominal arm, its joint limits, its links, and the room it works in.
+"""A robot as its maker describes it: the nominal arm, its joint limits, its links and its workspace.
 
 A controller may know all of this. The true robot of a run differs from it by a mismatch, and for a robot that is given
-by a factory calibration also by that.
+by a factory calibration also by that calibration.
+
+Masses, inertia and torque limits that nobody has published are estimated. An estimated link is a solid cylinder of its
+tube's radius, as long as the distance of its joints plus a joint housing of one diameter, with the mean density of the
+UR5's links. A joint's torque limit is 1.5 times the torque that holds the stretched arm with its rated load against
+gravity; a UR5 has 1.2 times this torque in its shoulder and more in its wrists.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray, as_array
-from servobench.plant.robot.arm import SerialArm
+from servobench.plant.contract.lanes import norm
+from servobench.plant.robot.arm import JointLimits, SerialArm, rotation_from_rpy
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.limits import JointLimits
 from servobench.plant.robot.workspace import Workspace
 
 
@@ -88,3 +94,69 @@ class Robot:
     def nominal(self) -> HandEyeModel:
         """The nominal arm under the camera as planned, which controllers may know."""
         return HandEyeModel(self.arm, self.workspace.camera_pose())
+
+
+DENSITY: Final = 1100.0  # [kg/m³] of the UR5's links as cylinders, in the mean
+TUBE_SHARE: Final = 0.055  # radius of the first tube over the arm's length from the shoulder on
+TAPER: Final = 0.65  # radius of the last tube over that of the first
+TORQUE_FACTOR: Final = 1.5  # torque limit over the torque that holds the stretched arm
+LEAST_TORQUE: Final = 5.0  # [Nm]
+GRAVITY: Final = 9.81  # [m/s²]
+PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
+
+
+def link_lengths(arm: SerialArm) -> FloatArray:
+    """Return how far each joint is from the next one, or the flange, (n,) m."""
+    return norm(arm.translation[1:])
+
+
+def cylinder_inertia(mass: FloatArray, radius: FloatArray, arm: SerialArm) -> FloatArray:
+    """Return the inertia of links as solid cylinders, across and along them, (n, 2) kg m²."""
+    length = link_lengths(arm) + 2.0 * radius
+    return np.stack([mass * (3.0 * radius**2 + length**2) / 12.0, mass * radius**2 / 2.0], axis=-1)
+
+
+def at_far_end(arm: SerialArm, centre: FloatArray, inertia: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return centres of mass (n, 3) m and inertia (n, 3, 3) kg m², given in joint frames, in the frames of `Links`."""
+    R = rotation_from_rpy(arm.rpy[1:])
+    turned = np.swapaxes(R, -1, -2)
+    return np.vecmat(centre - arm.translation[1:], R), turned @ inertia @ R
+
+
+def estimate_links(
+    arm: SerialArm,
+    mass: FloatArray | None = None,
+    torque: FloatArray | None = None,
+    bodies: tuple[FloatArray, FloatArray] | None = None,
+) -> Links:
+    """Return links with what is known of them, and estimates in place of the rest.
+
+    Args:
+        arm: the nominal arm.
+        mass: (n,) kg, if known.
+        torque: (n,) Nm, largest of each joint, if known.
+        bodies: centres of mass (n, 3) m and inertia (n, 3, 3) kg m², as `at_far_end` returns them, if known.
+    """
+    length, n = link_lengths(arm), arm.n
+    reach = float(length[1:].sum())
+    radius = TUBE_SHARE * reach * np.linspace(1.0, TAPER, n)
+    mass = DENSITY * np.pi * radius**2 * (length + 2.0 * radius) if mass is None else mass
+    if bodies is None:
+        R = rotation_from_rpy(arm.rpy[1:])
+        bodies = -0.5 * np.vecmat(arm.translation[1:], R), cylinder_inertia(mass, radius, arm)
+    payload = PAYLOAD_SHARE * float(mass.sum())
+    torque = _holding_torque(length, mass, payload) if torque is None else torque
+    return Links(mass, *bodies, torque, radius, np.zeros(n), payload)
+
+
+def _holding_torque(length: FloatArray, mass: FloatArray, payload: float) -> FloatArray:
+    """Return the torque limits, (n,) Nm, that follow from the weight of the level, stretched arm beyond each joint."""
+    n = len(length)
+    ends = np.cumsum(length)
+    middles = ends - length / 2.0
+    starts = ends - length
+    torque = [
+        GRAVITY * (float(mass[i:] @ (middles[i:] - starts[i])) + payload * float(ends[-1] - starts[i]))
+        for i in range(n)
+    ]
+    return np.maximum(TORQUE_FACTOR * np.array(torque), LEAST_TORQUE)

@@ -1,19 +1,29 @@
-"""Where a robot works: start, targets and training box, and the camera above them.
+"""The part of a robot's reach in which tasks are placed, with the camera above it, and the search that finds it.
 
-Lengths of the bench grow with the arm: `scale` is 1 for a UR5, so that the room around another arm looks like the room
+Lengths of the bench grow with the arm: `scale` is 1 for a UR5, so that the table around another arm looks like that
 around a UR5.
+
+The search needs joint positions: inverse kinematics from many starts gives candidates, `Clearance` says which postures
+are fit to work in, and the home is the posture that has the most fit postures around it. All random numbers come from
+fixed seeds, so an arm always has the same workspace. A posture is fit if the arm touches neither itself nor the table,
+its Jacobian is well conditioned and the camera sees its ball. Links are taken as tubes with round ends: from a joint
+along its axis to the tube's side, along the tube, and to the next joint, as the rendered arm is drawn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.camera import PinholeCamera
+from servobench.plant.robot.inverse import CLOSE_ENOUGH, reach_for
 
 CENTRE: Final = (0.5, 0.0, 0.25)  # [m] base frame of a UR5
 CAMERA_DISTANCE: Final = 1.3  # [m] from the camera to the workspace's centre, for a UR5
@@ -79,3 +89,312 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
     pose[:3, :3] = R_BC
     pose[:3, 3] = np.asarray(centre) - distance * pose[:3, 2]
     return pose
+
+
+BoolArray = npt.NDArray[np.bool_]
+
+HEIGHT: Final = 0.03  # [m] of a link above the table, beside its radius; of a UR5
+BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
+OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
+BUILT_IN: Final = 0.4  # share of random postures from which on two tubes are built into each other
+IMAGE_SHARE: Final = 0.8  # of the image's half sides in which the ball stays: a margin for a camera that is turned
+MIN_GAIN: Final = 0.18  # [m/rad] least singular value of the position Jacobian; of a UR5
+STOP_MARGIN: Final = 0.25  # [rad] from a joint's stop
+CAMERA: Final = PinholeCamera()
+
+
+@dataclass(frozen=True, eq=False)
+class Tubes:
+    """The tubes of an arm.
+
+    Attributes:
+        link: (s,), the index of each tube's link.
+        ends: (s, 2, 3) [m], in the frame of the link.
+        radius: (s,) [m].
+    """
+
+    link: npt.NDArray[np.intp]
+    ends: FloatArray
+    radius: FloatArray
+
+    def placed(self, frames: FloatArray) -> FloatArray:
+        """Return both ends of each tube in the base frame, (..., s, 2, 3) m, for frames (..., n+1, 4, 4)."""
+        own: FloatArray = frames[..., self.link, :, :]
+        turned = np.matvec(own[..., None, :3, :3], self.ends)
+        return np.asarray(turned + own[..., None, :3, 3])
+
+
+def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
+    """Return the tubes of links with a `radius`, (n,) m, that lie `aside`, (n,) m, of their joints."""
+    link, ends, radii = [], [], []
+    for i in range(arm.n):
+        step = arm.translation[i + 1]
+        top, corner = np.array([0.0, 0.0, aside[i]]), np.array([step[0], step[1], aside[i]])
+        for begin, end, share in ((top, corner, 0.8), (corner, step, 0.95)):
+            if np.linalg.norm(end - begin) > 1e-3 or begin is top:
+                link.append(i)
+                ends.append((begin, end))
+                radii.append(share * radius[i])
+    return Tubes(np.array(link), np.array(ends), np.array(radii))
+
+
+@dataclass(frozen=True, eq=False)
+class Clearance:
+    """The judge of postures; `scale` is that of the workspace.
+
+    Attributes:
+        arm: the nominal arm.
+        tubes: of its links.
+        lower: (n,) [rad], its stops.
+        upper: (n,) [rad].
+        X_BC: (4, 4), the camera.
+        scale: of all lengths over those of a UR5's bench.
+        ball_radius: [m].
+        pairs: (p, 2), tubes that must not meet.
+    """
+
+    arm: SerialArm
+    tubes: Tubes
+    lower: FloatArray
+    upper: FloatArray
+    X_BC: FloatArray
+    scale: float
+    ball_radius: float
+    pairs: npt.NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
+
+    def __call__(self, joint_position: FloatArray, *, singular: bool = False) -> BoolArray:
+        """Return whether joint positions (..., n) rad are fit to work in, (...).
+
+        Args:
+            joint_position: as reported.
+            singular: allow a Jacobian that is nearly singular.
+        """
+        q = np.asarray(joint_position, dtype=np.float64)
+        frames = self.arm.frames(q)
+        ball = np.matvec(frames[..., -1, :3, :3], self.arm.tool) + frames[..., -1, :3, 3]
+        placed = self.tubes.placed(frames)
+        fits = ((q >= self.lower + STOP_MARGIN) & (q <= self.upper - STOP_MARGIN)).all(axis=-1)
+        fits &= (ball[..., 2] >= BALL_HEIGHT * self.scale) & self._above_table(placed) & self._in_view(ball, placed)
+        fits &= self._apart(placed)
+        return np.asarray(fits if singular else fits & (self.gain(q) >= MIN_GAIN * self.scale))
+
+    def gain(self, joint_position: FloatArray) -> FloatArray:
+        """Return the least singular value of the position Jacobian, (...) m/rad."""
+        return np.asarray(np.linalg.svd(self.arm.ball_jacobian(joint_position), compute_uv=False)[..., -1])
+
+    def gaps(self, placed: FloatArray, pairs: npt.NDArray[np.intp]) -> FloatArray:
+        """Return the free distance of pairs of tubes, (..., p) m; negative where they overlap."""
+        first, second = placed[..., pairs[:, 0], :, :], placed[..., pairs[:, 1], :, :]
+        return np.asarray(segment_distance(first, second) - self.tubes.radius[pairs].sum(axis=-1))
+
+    def _above_table(self, placed: FloatArray) -> BoolArray:
+        """The first two links stand on the table."""
+        chosen = self.tubes.link >= 1
+        low = placed[..., 2][..., chosen, :].min(axis=-1) - self.tubes.radius[chosen]
+        return np.asarray((low >= HEIGHT * self.scale).all(axis=-1))
+
+    def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
+        """Return whether the ball is in the image and no link is between it and the camera."""
+        seen = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
+        half = IMAGE_SHARE * np.array([CAMERA.width, CAMERA.height]) / (2.0 * CAMERA.focal)
+        inside = (np.abs(seen[..., :2]) <= half * seen[..., 2:]).all(axis=-1) & (seen[..., 2] > 0.0)
+        sight = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
+        free = segment_distance(placed, sight[..., None, :, :]) - self.tubes.radius
+        return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
+
+    def _apart(self, placed: FloatArray) -> BoolArray:
+        return np.asarray((self.gaps(placed, self.pairs) >= -OVERLAP * self.scale).all(axis=-1))
+
+
+def watched_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
+    """Return the pairs of tubes, (p, 2), that can meet: not of neighbouring links, and apart in most of (k, n) rad."""
+    link = clearance.tubes.link
+    i, j = np.triu_indices(len(link), 1)
+    pairs = np.stack([i, j], axis=-1)[link[j] - link[i] > 1]
+    placed = clearance.tubes.placed(clearance.arm.frames(postures))
+    built_in = (clearance.gaps(placed, pairs) < 0.0).mean(axis=0) > BUILT_IN
+    return np.asarray(pairs[~built_in])
+
+
+def segment_distance(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the distance between segments with ends (..., 2, 3) m, (...) m; Ericson, Real-Time Collision Detection."""
+    p, d1 = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
+    r0, d2 = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
+    r = p - r0
+    a, e, b = (np.vecdot(x, y) for x, y in ((d1, d1), (d2, d2), (d1, d2)))
+    c, f = np.vecdot(d1, r), np.vecdot(d2, r)
+    tiny = 1e-12
+    denominator = a * e - b * b
+    s = np.where(denominator > tiny, np.clip((b * f - c * e) / np.maximum(denominator, tiny), 0.0, 1.0), 0.0)
+    t = np.where(e > tiny, (b * s + f) / np.maximum(e, tiny), 0.0)
+    clipped = np.clip(t, 0.0, 1.0)
+    again = np.where(a > tiny, np.clip((b * clipped - c) / np.maximum(a, tiny), 0.0, 1.0), 0.0)
+    s = np.where((clipped != t) | (e <= tiny), again, s)
+    return norm(p + s[..., None] * d1 - r0 - clipped[..., None] * d2)
+
+
+LENGTH_OF_UR5: Final = 1.10335  # [m] from its shoulder along the links to the flange
+TOOL: Final = 0.10  # [m] from the flange to the ball; of a UR5
+HOME_POINT: Final = (0.5, 0.0, 0.3)  # [m] the ball at home; of a UR5
+STRETCHED_POINT: Final = (3.0, 0.0, 0.1)  # [m] out of reach: the arm points there; of a UR5
+HEIGHTS: Final = (0.0, 0.1, 0.2)  # [m] by which the workspace is lifted until enough postures are fit; of a UR5
+# The ball in the base frame of a UR5 at start and target of each move [m].
+MOVES: Final = {
+    "exp1": ((0.50, -0.10, 0.35), (0.15, 0.58, 0.30)),
+    "exp2": ((0.40, -0.15, 0.45), (0.60, 0.10, 0.20)),
+    "exp3": ((0.62, 0.22, 0.20), (0.45, -0.25, 0.40)),
+    "exp4": ((0.12, -0.55, 0.50), (0.55, 0.05, 0.25)),
+}
+
+STARTS: Final = 512  # of the search for a home
+CANDIDATES: Final = 12  # homes whose surroundings are looked at
+WINDING: Final = 0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
+NEIGHBOURS: Final = 192  # postures that say how fit a box is
+NEAR_STARTS: Final = 96  # of the search for a posture near the home
+NEAR: Final = 0.4  # [rad] deviation of those starts from the home
+HALF_BOX: Final = 0.6  # [rad] half sides of the box
+LAST_HALF: Final = 0.3  # [rad] half side for the last joint, which moves the ball little
+SHRINK: Final = (1.0, 0.85, 0.7, 0.55, 0.4)  # of the box until enough postures in it are fit
+ENOUGH: Final = 0.7  # share of fit postures in a box
+WAYS: Final = 24  # starts of a move that are tried
+WAY_STEPS: Final = 40  # of the way of a move
+WITHDRAWALS: Final = 8  # steps of a tenth towards the home for a place that no fit posture reaches
+
+
+def length_scale(arm: SerialArm) -> float:
+    """Return how long an arm is from its shoulder to its flange, over a UR5."""
+    return float(norm(arm.translation[2:]).sum()) / LENGTH_OF_UR5
+
+
+def with_ball(arm: SerialArm) -> SerialArm:
+    """Return an arm with the ball on a stick on its flange."""
+    return replace(arm, tool=np.array([0.0, 0.0, TOOL * length_scale(arm)]))
+
+
+def find_workspace(
+    arm: SerialArm, limits: tuple[FloatArray, FloatArray], shapes: tuple[FloatArray, FloatArray]
+) -> Workspace:
+    """Return the workspace of an arm.
+
+    Args:
+        arm: the nominal arm with its ball.
+        limits: lower and upper joint positions, (n,) and (n,) rad.
+        shapes: radius of each link's tube and how far it lies aside, (n,) and (n,) m.
+
+    Raises:
+        ValueError: no posture is fit to work in: the arm cannot reach the middle of its bench.
+    """
+    found = [_at_height(arm, limits, shapes, height) for height in HEIGHTS[:1]]
+    for height in HEIGHTS[1:]:
+        if found[-1] is None or found[-1][0] < ENOUGH * 0.8:
+            found.append(_at_height(arm, limits, shapes, height))
+    fit = [each for each in found if each is not None]
+    if not fit:
+        raise ValueError(
+            "the arm has no posture in which its ball is over the table, in view of the camera and free of contact"
+        )
+    return max(fit, key=lambda each: each[0])[1]
+
+
+def _at_height(
+    arm: SerialArm, limits: tuple[FloatArray, FloatArray], shapes: tuple[FloatArray, FloatArray], height: float
+) -> tuple[float, Workspace] | None:
+    """Return the workspace at a height and the share of its box that is fit; None where no home is."""
+    scale = length_scale(arm)
+    centre = scale * (np.array(CENTRE) + np.array([0.0, 0.0, height]))
+    pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
+    lower, upper = limits
+    clear = Clearance(arm, link_tubes(arm, *shapes), lower, upper, pose, scale, BALL_RADIUS * scale)
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (STARTS, arm.n))
+    clear = replace(clear, pairs=watched_pairs(clear, postures))
+    lift = np.array([0.0, 0.0, height])
+    home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
+    if home is None:
+        return None
+    share, box = _find_box(clear, home)
+    moves = {
+        name: _move(clear, home, scale * (np.array(start) + lift), scale * (np.array(target) + lift))
+        for name, (start, target) in MOVES.items()
+    }
+    stretched = _stretch(clear, home, scale * np.array(STRETCHED_POINT), postures)
+    shoulder = arm.frames(np.zeros(arm.n))[1, :3, 3]
+    return share, Workspace(scale, centre, shoulder, home, *box, moves, stretched, clear)
+
+
+def _find_home(clear: Clearance, point: FloatArray, postures: FloatArray) -> FloatArray | None:
+    """Return the fit posture with the ball at `point` (3,) m that has the most fit postures around it."""
+    q, distance = reach_for(clear.arm, point, postures, clear.lower, clear.upper)
+    q = _within_a_turn(q, clear)
+    fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
+    if not len(fit):
+        return None
+    order = np.argsort(WINDING * norm(fit) - clear.gain(fit) / clear.scale, kind="stable")[:CANDIDATES]
+    shares = [_find_box(clear, home)[0] for home in fit[order]]
+    home: FloatArray = fit[order[int(np.argmax(shares))]]
+    return home
+
+
+def _within_a_turn(q: FloatArray, clear: Clearance) -> FloatArray:
+    """Return the same postures with joints within ±π where their stops allow it."""
+    turned = (q + np.pi) % (2 * np.pi) - np.pi
+    return np.where((turned >= clear.lower) & (turned <= clear.upper), turned, q)
+
+
+def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArray, FloatArray]]:
+    """Return the largest box around a home of which enough is fit, with the share of it that is."""
+    half = np.full(clear.arm.n, HALF_BOX)
+    half[-1] = LAST_HALF
+    unit = np.random.default_rng(1).uniform(-1.0, 1.0, (NEIGHBOURS, clear.arm.n))
+    best = 0.0, (home - SHRINK[-1] * half, home + SHRINK[-1] * half)
+    for shrink in SHRINK:
+        corners = np.maximum(home - shrink * half, clear.lower), np.minimum(home + shrink * half, clear.upper)
+        share = float(clear(np.clip(home + shrink * half * unit, *corners)).mean())
+        if share >= ENOUGH:
+            return shrink * share, corners
+        best = max(best, (shrink * share, corners), key=lambda each: each[0])
+    return best
+
+
+def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatArray) -> Move:
+    """Return a move of the ball from a `start` to a `target`, (3,) m, on which the arm stays fit all the way.
+
+    The way is that of a servo that knows the arm: the ball goes straight, the joints by the pseudo-inverse. A move
+    for which none of the postures at its start is fit is drawn together towards the home.
+    """
+    starts = home + NEAR * np.random.default_rng(2).standard_normal((NEAR_STARTS, clear.arm.n))
+    starts = np.clip(np.vstack([home, starts]), clear.lower, clear.upper)
+    middle = clear.arm.ball_position(home)
+    for step in range(WITHDRAWALS):
+        ends = [point + 0.1 * step * (middle - point) for point in (start, target)]
+        q, distance = reach_for(clear.arm, ends[0], starts, clear.lower, clear.upper)
+        fit = q[(distance <= CLOSE_ENOUGH) & clear(q)]
+        fit = fit[np.argsort(norm(fit - home), kind="stable")[:WAYS]]
+        ways = _straight_ways(clear, fit, ends[1])
+        good = clear(ways, singular=True).all(axis=0) & clear(ways[-1])
+        if good.any():
+            way = ways[:, int(np.argmax(good))]
+            return way[0], way[-1]
+    return home, home
+
+
+def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> FloatArray:
+    """Return the postures, (k+1, s, n) rad, on straight ways of the ball from (s, n) rad to a target (3,) m."""
+    q, ways = starts, [starts]
+    for left in range(WAY_STEPS, 0, -1):
+        ball, J = clear.arm.ball_and_jacobian(q)
+        q = q + np.matvec(np.linalg.pinv(J, rcond=0.02), (target - ball) / left)
+        ways.append(q)
+    return np.array(ways)
+
+
+def _stretch(clear: Clearance, home: FloatArray, point: FloatArray, postures: FloatArray) -> FloatArray:
+    """Return the posture with the least gain that is otherwise fit, of those that point at a place out of reach."""
+    near = home + NEAR * np.random.default_rng(3).standard_normal((NEAR_STARTS, clear.arm.n))
+    starts = np.clip(np.vstack([near, postures[: 2 * NEAR_STARTS]]), clear.lower, clear.upper)
+    q, _ = reach_for(clear.arm, point, starts, clear.lower + 0.1, clear.upper - 0.1)
+    fit = q[clear(q, singular=True)]
+    if not len(fit):
+        fit = np.vstack([home, postures[clear(postures, singular=True)]])
+    stretched: FloatArray = fit[np.argmin(clear.gain(fit))]
+    return stretched

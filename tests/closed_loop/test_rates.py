@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.laws.rbfnn import RbfnnConfig, RbfnnLaw
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig

@@ -2,9 +2,8 @@
 
 import pytest
 
-from servobench.harness.analysis.loops.equilibrium import warm_up
+from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
 from servobench.harness.analysis.loops.loop_analysis import analyse_loop
-from servobench.harness.analysis.loops.simulation import SmallLoop
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve

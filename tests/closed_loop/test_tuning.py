@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from kit.tuning import SMALL, cost_by_formula
+from kit.tuning import SMALL, cost_by_formula, read_tuned
 from servobench import controllers
 from servobench.controllers.aids import EQUIPPED
 from servobench.harness.batch.compare import TUNING
@@ -17,8 +17,7 @@ from servobench.harness.batch.workers import Workers
 from servobench.harness.config.defaults import apply_settings, default_config
 from servobench.harness.config.registry import controller_names, find_controller
 from servobench.harness.config.settings import flatten
-from servobench.harness.studies.tuning.check import TOLERANCE, Change, Check, improvements
-from servobench.harness.studies.tuning.files import read_tuned
+from servobench.harness.studies.tuning.campaign import TOLERANCE, Change, Check, improvements
 from servobench.harness.studies.tuning.objective import (
     CONDITIONS,
     MOVE,
@@ -29,6 +28,7 @@ from servobench.harness.studies.tuning.objective import (
     run_cost,
     score,
 )
+from servobench.harness.studies.tuning.search import first_points, inside
 from servobench.harness.studies.tuning.spaces import (
     SPACES,
     default_values,
@@ -38,7 +38,6 @@ from servobench.harness.studies.tuning.spaces import (
     nested_settings,
     values_of,
 )
-from servobench.harness.studies.tuning.study import first_points, inside
 
 CORNERS = 64
 AIDS = {f"aids.{word}" for word in EQUIPPED}

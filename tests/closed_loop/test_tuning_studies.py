@@ -9,27 +9,31 @@ import numpy as np
 import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of
+from kit.tuning import SMALL, carried_out, cost_by_formula, outcomes, plan_of, read_tuned
 from servobench import controllers
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning import objective
-from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods, write_results
-from servobench.harness.studies.tuning.files import StudyRecord, read_tuned, write_tuned
-from servobench.harness.studies.tuning.ledger import Ledger
+from servobench.harness.studies.tuning.campaign import (
+    StudyRecord,
+    TuningPlan,
+    advance,
+    open_methods,
+    write_results,
+    write_tuned,
+)
 from servobench.harness.studies.tuning.objective import (
     WORST,
     TuningSet,
     score,
 )
-from servobench.harness.studies.tuning.scoring import fill, open_ledger
-from servobench.harness.studies.tuning.search import ACCEPTED, changes, coordinate_search, neighbours
+from servobench.harness.studies.tuning.scoring import Ledger, fill, open_ledger
+from servobench.harness.studies.tuning.search import ACCEPTED, changes, coordinate_search, first_points, neighbours
 from servobench.harness.studies.tuning.spaces import (
     default_values,
     find_tunable,
     nested_settings,
 )
-from servobench.harness.studies.tuning.study import first_points
 
 TUNED = Path(controllers.__file__).parent / "tuned" / "constant.toml"
 

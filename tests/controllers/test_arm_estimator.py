@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from servobench.controllers.camera_model import CameraModel
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmState
 from servobench.controllers.estimators.estimator import Motion
-from servobench.controllers.sight import Sight
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import stack, take
@@ -69,27 +69,27 @@ def test_the_jacobian_elsewhere_is_that_of_the_bent_arm() -> None:
     assert error < 0.1 * nominal
 
 
-def sighted() -> ArmEstimator:
+def with_camera_model() -> ArmEstimator:
     """Return an estimator that also knows how the ball moves, as a point."""
 
-    def look(q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def kinematics(q: FloatArray) -> tuple[FloatArray, FloatArray]:
         y, J = nominal_ur5().feature_and_jacobian(q)
         return y[..., None, None, :], J[..., None, None, :, :]
 
     model = nominal_ur5()
-    sight = Sight(1, 1, look, lambda _, depth: np.eye(3) * depth[..., None, None])
+    cameras = CameraModel(1, 1, kinematics, lambda _, depth: np.eye(3) * depth[..., None, None])
     spec = hand_eye_spec(model, 0.05, 1.0, 6.0)
-    return ArmEstimator(ArmConfig(), RobotKnowledge(spec, 10, nominal_jacobian=model.jacobian, nominal_sight=sight))
+    return ArmEstimator(ArmConfig(), RobotKnowledge(spec, 10, nominal_jacobian=model.jacobian, nominal_cameras=cameras))
 
 
 def test_features_that_are_known_to_move_with_points_teach_what_the_points_teach() -> None:
     path, turn = walk(4, 40), np.eye(3)[[1, 2, 0]]
     expected = learned(estimator(), path)
-    arm = sighted()
+    arm = with_camera_model()
     plain = turned = arm.start(nominal_ur5().jacobian(path[0]))
     for motion in motions(path):
         plain = arm.update(plain, motion)
-        turned = arm.update(turned, replace(motion, feature_step=turn @ motion.feature_step, seen=turn))
+        turned = arm.update(turned, replace(motion, feature_step=turn @ motion.feature_step, interaction=turn))
     np.testing.assert_array_equal(plain.x, expected.x)
     np.testing.assert_allclose(turned.x, expected.x, atol=1e-9)
     np.testing.assert_allclose(turned.P, expected.P, atol=1e-9)
@@ -97,7 +97,7 @@ def test_features_that_are_known_to_move_with_points_teach_what_the_points_teach
 
 def test_points_move_as_the_bent_arm_moves_them() -> None:
     model, q = nominal_ur5(), walk(4, 20)[3]
-    arm = sighted()
+    arm = with_camera_model()
     state = arm.start(model.jacobian(q))._replace(x=np.concatenate([GEARS, OFFSETS]))
     np.testing.assert_allclose(arm.motions(state, q), bent_arm().jacobian(q), atol=1e-12)
     told = arm.diagnostics(state)

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, M, N, ToyArm
 from servobench.controllers.aids import EQUIPPED, AidsConfig
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.methods import METHODS
-from servobench.controllers.stages.inverses import damped_inverse
 
 TURN = Rotation.from_rotvec(np.radians(100.0) * np.array([0.0, 0.6, 0.8])).as_matrix()
 RESPONSE, GAIN, WEIGHT = (0.0, 0.6, 0.4), 14.0, 1e-9

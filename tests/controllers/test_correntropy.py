@@ -5,11 +5,18 @@ import pytest
 from scipy.linalg import block_diag
 
 from kit.toy import Learning, motion
-from servobench.controllers.estimators.gmckf import MIN_ERROR, GmckfConfig, gmckf_estimator
-from servobench.controllers.estimators.imcckf import ImcckfConfig, imcckf_estimator
-from servobench.controllers.estimators.kalman import KalmanConfig, KalmanEstimator
-from servobench.controllers.estimators.mckf import MckfConfig, mckf_estimator
-from servobench.controllers.estimators.rmckf import RmckfConfig, rmckf_estimator
+from servobench.controllers.estimators.correntropy import (
+    MIN_ERROR,
+    GmckfConfig,
+    ImcckfConfig,
+    MckfConfig,
+    RmckfConfig,
+    gmckf_estimator,
+    imcckf_estimator,
+    mckf_estimator,
+    rmckf_estimator,
+)
+from servobench.controllers.estimators.kalman import KalmanConfig, kalman_estimator
 from servobench.plant.contract.faults import FilterDiverged
 
 M, N, WALK, NOISE = 3, 4, 0.09, 0.001
@@ -115,7 +122,7 @@ def test_every_update_equals_the_published_formulas(name):
 def test_without_a_bound_of_the_bandwidth_they_are_the_kalman_filter(name):
     kind, make = FILTERS[name]
     J = np.zeros((M, N))
-    plain, filtered = Learning(KalmanEstimator(KalmanConfig()), J), Learning(make(kind(bandwidth=1e9)), J)
+    plain, filtered = Learning(kalman_estimator(KalmanConfig()), J), Learning(make(kind(bandwidth=1e9)), J)
     for dq, dy in motions(30):
         plain.update(motion(dq, dy))
         filtered.update(motion(dq, dy))
@@ -136,7 +143,7 @@ def test_the_generalised_kernel_of_exponent_2_is_the_gaussian_one():
 def test_an_outlier_changes_them_less_than_the_kalman_filter(name):
     kind, make = FILTERS[name]
     J = np.full((M, N), 0.3)
-    plain, filtered = Learning(KalmanEstimator(KalmanConfig()), J), Learning(make(kind()), J)
+    plain, filtered = Learning(kalman_estimator(KalmanConfig()), J), Learning(make(kind()), J)
     far = motion(np.full(N, 0.01), np.full(N, 0.01) @ J.T + 0.05)
     plain.update(far)
     filtered.update(far)

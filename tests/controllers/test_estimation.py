@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from kit.toy import KNOWLEDGE, PERIOD, M, N, Recorder, jacobian_network, only_jacobian, plant_spec
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays, RobotKnowledge
-from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator
+from servobench.controllers.estimators.projection import BroydenConfig, BroydenEstimator
 from servobench.controllers.estimators.rbf import RbfConfig, RbfEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.plant.contract.signals import Observation

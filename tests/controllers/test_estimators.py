@@ -8,15 +8,21 @@ from hypothesis import strategies as st
 from kit.toy import Learning, motion, plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator
-from servobench.controllers.estimators.broyden import BroydenConfig, BroydenEstimator, projection_update
-from servobench.controllers.estimators.cfdl import CfdlConfig, CfdlEstimator
-from servobench.controllers.estimators.fixed import ConstantEstimator, TrueConfig, TrueEstimator
+from servobench.controllers.estimators.constant import ConstantEstimator, TrueConfig, TrueEstimator
 from servobench.controllers.estimators.kalman import (
     KalmanConfig,
-    KalmanEstimator,
+    RandomWalkEstimator,
+    kalman_estimator,
     kalman_update,
     measurement_matrix,
     split_update,
+)
+from servobench.controllers.estimators.projection import (
+    BroydenConfig,
+    BroydenEstimator,
+    CfdlConfig,
+    CfdlEstimator,
+    projection_update,
 )
 from servobench.controllers.estimators.rls import RlsConfig, RlsEstimator, rls_update
 from servobench.controllers.estimators.ukf import UkfConfig, sigma_weights, ukf_estimator, unscented_update
@@ -26,7 +32,7 @@ LEARNING = [
     BroydenEstimator(BroydenConfig(step_factor=1.0)),
     RlsEstimator(RlsConfig()),
     CfdlEstimator(CfdlConfig(step_factor=1.0, regularisation=1e-6, reset=False)),
-    KalmanEstimator(KalmanConfig()),
+    kalman_estimator(KalmanConfig()),
     ukf_estimator(UkfConfig(form="sigma_points")),
 ]
 
@@ -54,7 +60,7 @@ def test_a_constant_jacobian_is_found_when_all_joints_move(estimator):
     for _ in range(400):
         dq = rng.normal(scale=0.05, size=6)
         run.update(motion(dq, J @ dq))
-    np.testing.assert_allclose(run.jacobian(), J, atol=0.01 if isinstance(estimator, KalmanEstimator) else 1e-3)
+    np.testing.assert_allclose(run.jacobian(), J, atol=0.01 if isinstance(estimator, RandomWalkEstimator) else 1e-3)
 
 
 @pytest.mark.parametrize("estimator", LEARNING)
@@ -74,8 +80,8 @@ def test_a_motion_too_small_to_tell_anything_is_left_out(estimator):
         (BroydenEstimator(BroydenConfig(step_factor=0.5)), [[0.1, 0.1]], [1.0, 1.0], [[0.15, 0.15]]),
         (CfdlEstimator(CfdlConfig(step_factor=0.5, regularisation=2.0)), [[0.1, 0.1]], [1.0, 1.0], [[0.125, 0.125]]),
         # P = 1/4, r = 2 · 1/8 = 1/4, Δq = (1, 0): S = 1/2, K = (1/2, 0), innovation 0.4 − 0.2 = 0.2
-        (KalmanEstimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
-        (KalmanEstimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
+        (kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="full")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
+        (kalman_estimator(KalmanConfig(0.5, 0.0, np.sqrt(0.125), form="split")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
         (ukf_estimator(UkfConfig(0.5, 0.0, np.sqrt(0.125), form="sigma_points")), [[0.2, 0.3]], [1, 0], [[0.3, 0.3]]),
     ],
 )
@@ -83,7 +89,7 @@ def test_the_first_step_equals_the_one_computed_by_hand(estimator, jacobian, dq,
     run = Learning(estimator, np.array(jacobian))
     run.update(motion(dq, [0.4]))
     np.testing.assert_allclose(run.jacobian(), expected, atol=1e-15)
-    if isinstance(estimator, KalmanEstimator):  # P → 1/8 and 1/4
+    if isinstance(estimator, RandomWalkEstimator):  # P → 1/8 and 1/4
         np.testing.assert_allclose(covariance_of(run.state), np.diag([0.125, 0.25]), atol=1e-15)
 
 
@@ -114,8 +120,8 @@ def test_the_unscented_filter_equals_the_kalman_filter_over_1000_random_steps(al
 @pytest.mark.parametrize(("n", "m"), [(2, 1), (6, 3), (8, 4)])
 def test_the_split_forms_equal_the_full_ones(n, m):
     estimators = [
-        KalmanEstimator(KalmanConfig(form="full")),
-        KalmanEstimator(KalmanConfig(form="split")),
+        kalman_estimator(KalmanConfig(form="full")),
+        kalman_estimator(KalmanConfig(form="split")),
         ukf_estimator(UkfConfig(form="sigma_points")),
         ukf_estimator(UkfConfig(form="split")),
     ]
@@ -238,7 +244,7 @@ def test_a_covariance_that_is_not_positive_definite_ends_least_squares_by_name()
 
 @pytest.mark.parametrize("form", ["full", "split"])
 def test_a_covariance_that_is_not_positive_definite_ends_the_kalman_filter_by_name(form):
-    estimator = KalmanEstimator(KalmanConfig(form=form))
+    estimator = kalman_estimator(KalmanConfig(form=form))
     state = estimator.start(np.zeros((2, 3)))
     with pytest.raises(FilterDiverged, match="covariance is not"):
         estimator.update(state._replace(P=-state.P), motion(np.full(3, 0.1), np.zeros(2)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kit.toy import KNOWLEDGE, PERIOD, PREVIEW, A, Commanding, M, N, networks
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.parts import LAWS
 from servobench.plant.contract.signals import trusted_observation
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from kit.toy import PERIOD, Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mfac import MfacConfig, MfacLaw, mfac_step
 
 HALF = math.log(2.0) / PERIOD  # [1/s] ρ = ½

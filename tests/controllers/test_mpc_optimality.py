@@ -8,7 +8,7 @@ from scipy.optimize import nnls
 
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.contract.signals import trusted_observation
 

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kit.toy import jacobian_network
-from servobench.controllers.networks.latest import LatestFeatures
 from servobench.controllers.networks.rbf import (
     ControllerNetwork,
     JacobianNetwork,
+    LatestFeatures,
     controller_output,
     hidden_features,
     information_vector,

@@ -6,15 +6,15 @@ import pytest
 
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.controllers.nmpc_calibrated import NmpcCalibrated, NmpcCalibratedConfig
 from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.signals import Observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import nominal_ur5
 
 MODEL = nominal_ur5()

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from kit.toy import KNOWLEDGE, PERIOD, SPEC, M, N, jacobian_network, seen
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
-from servobench.controllers.estimators.fixed import ConstantEstimator
+from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
 from servobench.controllers.stages.pairing import Pairing
 from servobench.plant.contract.signals import Observation

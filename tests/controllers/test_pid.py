@@ -5,7 +5,7 @@ import pytest
 
 from kit.toy import Commanding, plant_spec, seen
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.estimate import Estimate
+from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.pid import PidConfig, PidLaw
 
 J = np.array([[0.5, 0.1, 0.0], [0.0, 0.4, 0.2]])

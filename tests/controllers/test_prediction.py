@@ -9,12 +9,11 @@ from scipy.signal import StateSpace, cont2discrete, dlsim
 from kit.toy import KNOWLEDGE, PERIOD, A, M, N, ToyArm, seen
 from servobench.controllers.aids import AidsConfig
 from servobench.controllers.controller import Delays
-from servobench.controllers.estimators.fixed import ConstantEstimator
+from servobench.controllers.estimators.constant import ConstantEstimator
 from servobench.controllers.stages.estimation import Estimation
-from servobench.controllers.stages.feature_filter import FeatureFilter
 from servobench.controllers.stages.joint_response import JointResponse, with_response
 from servobench.controllers.stages.noise_level import NoiseLevel
-from servobench.controllers.stages.prediction import Past, Predictor, shifted
+from servobench.controllers.stages.prediction import FeatureFilter, Past, Predictor, shifted
 
 RESPONSE = np.array([0.0, 0.6, 0.3, 0.1])
 NO_DELAYS = Delays(0.0, 0.0, 0.0)

@@ -5,7 +5,7 @@ import pytest
 
 from kit.toy import KNOWLEDGE, Learning, motion, only_jacobian
 from kit.toy import jacobian_network as network
-from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig, RbfLyapunovEstimator
+from servobench.controllers.estimators.rbf import RbfLyapunovConfig, RbfLyapunovEstimator
 from servobench.controllers.networks.rbf import JacobianNetwork
 
 

@@ -5,17 +5,12 @@ import math
 import pytest
 
 from servobench.controllers.aids import AidsConfig
-from servobench.controllers.estimators.broyden import BroydenConfig
-from servobench.controllers.estimators.cfdl import CfdlConfig
-from servobench.controllers.estimators.gmckf import GmckfConfig
-from servobench.controllers.estimators.imcckf import ImcckfConfig
+from servobench.controllers.estimators.correntropy import GmckfConfig, ImcckfConfig, MckfConfig, RmckfConfig
 from servobench.controllers.estimators.kalman import KalmanConfig
-from servobench.controllers.estimators.mckf import MckfConfig
-from servobench.controllers.estimators.rbf import RbfConfig
-from servobench.controllers.estimators.rbf_lyapunov import RbfLyapunovConfig
+from servobench.controllers.estimators.projection import BroydenConfig, CfdlConfig
+from servobench.controllers.estimators.rbf import RbfConfig, RbfLyapunovConfig
 from servobench.controllers.estimators.rls import RlsConfig
-from servobench.controllers.estimators.rmckf import RmckfConfig
-from servobench.controllers.estimators.robust import RobustConfig
+from servobench.controllers.estimators.robust_filter import RobustConfig
 from servobench.controllers.estimators.ukf import UkfConfig
 from servobench.controllers.initial import InitialConfig
 from servobench.controllers.laws.mfac import MfacConfig

@@ -11,20 +11,18 @@ from servobench.controllers.methods import METHODS
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import FORMAT, TrainedNetworks, load_networks, save_networks
 from servobench.controllers.networks.fit import (
-    ideal_controller_matrix,
-    obtain_networks,
-    ridge_path,
-    train,
-    training_digest,
-)
-from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
-from servobench.controllers.networks.samples import (
     choose_centres,
     controller_dimension,
     controller_samples,
+    ideal_controller_matrix,
+    obtain_networks,
     pool_size,
+    ridge_path,
+    train,
+    training_digest,
     unit_points,
 )
+from servobench.controllers.networks.rbf import ControllerNetwork, JacobianNetwork
 
 TRAINED = [METHODS[name] for name in ("rbfnn_mfac", "rbfnn_mfac:published", "rbf_pid")]
 N, M = 3, 2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.networks.samples import WEAKEST
+from servobench.controllers.networks.fit import WEAKEST
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.signals import Channel, PlantSpec
 

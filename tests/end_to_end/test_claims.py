@@ -11,22 +11,31 @@ import pytest
 from kit.command import servobench
 from servobench.harness.batch.compare import TUNING
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.studies.claims.answers import answer_all
-from servobench.harness.studies.claims.figures import draw_answers
-from servobench.harness.studies.claims.measurements import DEPENDS, NOT_REPRODUCED, REPRODUCED, UNDECIDED
-from servobench.harness.studies.claims.studies import (
+from servobench.harness.studies.claims import (
     CIRCLE,
+    DEPENDS,
     ENTRIES,
     FIRST_SEED,
     FROZEN,
     MAIN,
     MOVES,
     NO_EPSILON,
+    NOT_REPRODUCED,
     PROPOSED,
+    REPRODUCED,
     TIMED,
+    UNDECIDED,
+    answer_all,
     studies,
 )
-from servobench.harness.studies.claims.table import differences, elsewhere, markdown_table, read_answers, write_tables
+from servobench.harness.studies.reproduction import (
+    differences,
+    draw_answers,
+    elsewhere,
+    markdown_table,
+    read_answers,
+    write_tables,
+)
 
 METHODS = (PROPOSED, "rbf_pid", "ukf_mfac", "ukf_mpc")
 SEEDS = range(20)

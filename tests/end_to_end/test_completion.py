@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from kit.command import PACKAGE
-from servobench.harness.cli.completion import join_words
+from servobench.harness.cli.main import join_words
 
 BASH = shutil.which("bash")
 

@@ -15,9 +15,9 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu as validate_by_fmpy
 
 from kit.controller_fmus import PERIODS, experiment, exported, inputs_of, periods, recorded
-from servobench.fmus.validate import validate_fmu
+from servobench.fmus.inspection import validate_fmu
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run import controller_fmu
+from servobench.harness.run import export as controller_fmu
 from servobench.harness.run.request import RunRequest
 
 PERIOD, N, M = 0.05, 6, 3

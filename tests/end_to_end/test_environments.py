@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from kit.plants import NEEDS, NEEDS_MUJOCO
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.gym.environment import ServoEnv
-from servobench.harness.run.pose_tasks import PoseTask
+from servobench.harness.run.starts import PoseTask
 from servobench.harness.run.tasks import TASKS
 
 WAYPOINTS = "time_s,x_m,y_m,z_m\n0,0,0,1.25\n1,0.05,0,1.25\n"

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 from typer.testing import CliRunner
 
-from servobench.fmus.information import read_information
+from servobench.fmus.inspection import read_information
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.config.settings import Settings

@@ -30,13 +30,13 @@ from servobench.fmus.compile import (
     this_platform,
 )
 from servobench.fmus.export import ExportOptions, arm_layout, default_actuation, export_fmu, fingerprint
-from servobench.fmus.information import read_information
+from servobench.fmus.inspection import read_information, validate_fmu
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table, reference_run
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
-from servobench.fmus.validate import validate_fmu
-from servobench.fmus.variables import model_of, parameters_of
+from servobench.fmus.variables import parameters_of
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.robot.arm import rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
+from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.ur5 import JOINT_NAMES, nominal_ur5
 
 VERSIONS = [2, 3]
@@ -66,6 +66,16 @@ def test_the_committed_reference_is_still_that_of_the_model(version):
 def test_camera_and_arm_survive_the_way_through_the_parameters(rpy, pitch):
     R = rotation_from_rpy((rpy[0], rpy[1] if pitch is None else pitch, rpy[2]))
     np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(R)), R, rtol=0, atol=1e-12)
+
+
+def model_of(p, joint_names):
+    """Return the arm and camera that the FMU's parameters describe."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_rpy(p["camera_rpy"]), p["camera_position"]
+    translation = np.vstack([p["base_position"], np.column_stack([p["a"], p["y"], p["d"]])])
+    rpy = np.vstack([p["base_rpy"], np.column_stack([p["alpha"], p["pitch"], p["yaw"]])])
+    arm = SerialArm(joint_names, translation, rpy, p["joint_offset"], p["gear_ratio"], p["tool"])
+    return HandEyeModel(arm, pose)
 
 
 @pytest.mark.parametrize("mismatch", ["none", "severe", "factory", "gear_ratio=5%"])

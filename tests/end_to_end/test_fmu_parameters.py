@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kit.foreign_fmu import build_crane, describe_with
-from servobench.fmus.information import read_information
+from servobench.fmus.inspection import read_information
 from servobench.plant.fmu.mapping import FmuMapping, read_mapping
 from servobench.plant.fmu.world import FmuWorld
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from kit.command import finish, start
+from kit.tuning import read_tuned
 from servobench.harness.batch import results
-from servobench.harness.studies.tuning.files import read_tuned
 
 HOSTILE = """
 import os

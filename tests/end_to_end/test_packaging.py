@@ -97,6 +97,30 @@ def test_another_version_in_the_citation_is_told(files, tmp_path):
     assert fault.startswith("CITATION.cff says version 9.")
 
 
+def test_only_the_tagged_commit_of_a_version_without_changes_is_a_release(tmp_path):
+    def git(*words):
+        subprocess.run(["git", "-c", "user.name=A", "-c", "user.email=a@b.c", *words], cwd=tmp_path, check=True)
+
+    git("init", "--quiet")
+    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## Unreleased\n")
+    git("add", ".")
+    git("commit", "--quiet", "-m", "one")
+    untagged, undated = release.faults_of_commit(tmp_path, "9.1.0")
+    assert untagged == "no commit has the tag v9.1.0; git tag -a v9.1.0, or --rehearse"
+    assert undated == "CHANGELOG.md has no section 9.1.0 with its date"
+    git("tag", "v9.1.0")
+    (tmp_path / "CHANGELOG.md").write_text("# Changelog\n\n## 9.1.0 (2026-01-01)\n")
+    assert release.faults_of_commit(tmp_path, "9.1.0") == [
+        "the checkout has changes; commit or remove them, or --rehearse"
+    ]
+    git("commit", "--quiet", "-am", "two")
+    (moved,) = release.faults_of_commit(tmp_path, "9.1.0")
+    assert moved.startswith("the checkout is at ")
+    assert moved.endswith("; git checkout v9.1.0, or --rehearse")
+    git("tag", "--force", "v9.1.0")
+    assert release.faults_of_commit(tmp_path, "9.1.0") == []
+
+
 def test_what_fails_on_the_way_ends_the_rehearsal(tmp_path):
     with pytest.raises(SystemExit, match="exit code 3"):
         release.quiet(Path(sys.executable), "-c", "raise SystemExit(3)", folder=tmp_path)

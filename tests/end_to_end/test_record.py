@@ -21,7 +21,8 @@ from kit.own import CELL, PLAIN_CELL, write
 from kit.plants import NEEDS_BULLET
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.pictures import encoder, film
+from servobench.harness.pictures import film
+from servobench.harness.pictures import film as encoder
 from servobench.harness.pictures.replay import Replay, Trail, logged_run, stretch
 from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment

@@ -24,7 +24,8 @@ from servobench.harness.batch.compare import TUNING, parse_seeds
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve_sections
-from servobench.harness.studies import map_lines, robustness
+from servobench.harness.studies import robustness
+from servobench.harness.studies import robustness as map_lines
 
 TRIED = ("--set", "random.duration=0.5")
 

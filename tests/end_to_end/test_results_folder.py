@@ -20,7 +20,7 @@ from servobench.harness.batch.campaign import Execution, carry_out
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.studies.tuning.ledger import Ledger
+from servobench.harness.studies.tuning.scoring import Ledger
 
 SWEEP = (
     "sweep", "--controllers", "constant,rls", "--seeds", "200", "--workers", "1", "--set", "random.duration=6",
@@ -139,7 +139,7 @@ def test_what_verify_says_can_be_done(tmp_path, monkeypatch, capsys):
     sweep = ("sweep", "--controllers", "constant", "--seeds", "3", "--workers", "1", "--set", "random.duration=1")
     assert servobench(monkeypatch, *sweep, "--out", str(out)) == 0
     assert servobench(monkeypatch, "verify", str(out)) == 0
-    assert "2 files are what was written, 3 runs" in capsys.readouterr().out
+    assert "2 files are as they were written, 3 runs" in capsys.readouterr().out
     (out / results.RUNS).write_bytes((out / results.RUNS).read_bytes()[:-100])
     assert servobench(monkeypatch, "verify", str(out)) == 1
     assert "runs.parquet is cut off: repeat the command that made the folder with --resume" in capsys.readouterr().out

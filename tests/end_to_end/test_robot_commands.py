@@ -8,7 +8,7 @@ import pytest
 from kit.command import servobench
 from kit.plants import NEEDS_BULLET
 from kit.robots import FOUR_JOINTS, calibration_text
-from servobench.fmus.validate import validate_fmu
+from servobench.fmus.inspection import validate_fmu
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest

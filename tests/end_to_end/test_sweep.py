@@ -15,7 +15,7 @@ from servobench.harness.batch.blocks import CHUNK
 from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.episode import RunResult
+from servobench.harness.run.result import RunResult
 
 SWEEP = (
     "sweep", "--controllers", "constant,broyden", "--vary", "camera_rotation=0:40:20deg", "--noise", "1,2",

@@ -8,8 +8,8 @@ import signal
 import pytest
 
 from kit.command import finish, servobench, start, wait_for
-from servobench.harness.studies.tuning import check as tuning_check
-from servobench.harness.studies.tuning.files import read_tuned
+from kit.tuning import read_tuned
+from servobench.harness.studies.tuning import campaign as tuning_check
 from servobench.harness.studies.tuning.spaces import default_values, find_tunable, nested_settings
 
 SHORT = ["--controllers", "rls", "--robots", "2", "--studies", "1", "--search", "0", "--workers", "1"]

@@ -19,12 +19,12 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
 from servobench.plant.bench.plant import PlantSetup
+from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.fmu.model_exchange import FmuModel
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.symbolic import symbolic_feature
 from servobench.plant.robot.ur5 import HOME
 
 TRUE_ARM, NOMINAL_ARM = (0.6, 0.3), (0.55, 0.4)

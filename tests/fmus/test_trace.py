@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from servobench.controllers import servo
+from servobench.controllers.algebra import damped_inverse, nearest_rotation
 from servobench.controllers.estimators.kalman import cholesky_of
-from servobench.controllers.rotation import nearest_rotation
-from servobench.controllers.stages.inverses import damped_inverse
 from servobench.controllers.stages.limit import redistribute
-from servobench.fmus.trace.array import NotTraceable, Traced
-from servobench.fmus.trace.faults import NOT_DEFINITE, NOT_FINITE, frame
-from servobench.fmus.trace.namespace import recording
-from servobench.fmus.trace.record import record
+from servobench.fmus.trace.arrays import NotTraceable, Traced
+from servobench.fmus.trace.branches import NOT_DEFINITE, NOT_FINITE, frame
+from servobench.fmus.trace.record import record, recording
 from servobench.plant.contract import lanes
 
 GENERATOR = np.random.default_rng(0)

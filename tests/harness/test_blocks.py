@@ -23,10 +23,9 @@ from servobench.harness.batch.survey import survey
 from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.ending import Ending
-from servobench.harness.run.episode import RunResult
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.result import Ending, RunResult
 
 PLAN = SweepPlan(
     Batch(("kinematic",), ("constant", "broyden"), ("random",), ("moderate",), range(6)),

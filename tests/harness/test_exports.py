@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 
-import control
 import numpy as np
 import pandas as pd
 import pytest
 from mcap.reader import make_reader
 
-from servobench.harness.analysis.exports import export_folder, time_response
+from servobench.harness.analysis.exports import export_folder
 from servobench.harness.batch.api import compare, load
 from servobench.harness.config.settings import ConfigurationError
 
@@ -47,19 +46,6 @@ def test_another_reader_opens_the_mcap_and_finds_the_run(folder, tmp_path):
         np.testing.assert_array_equal(features, steps[[f"feature_{axis}_m" for axis in "xyz"]].to_numpy())
         schema, channel, _ = messages[0]
         assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
-
-
-def test_python_control_takes_a_run(folder):
-    whole = load(folder).steps
-    with pytest.raises(ConfigurationError, match="steps must be those of one run, got 2"):
-        time_response(whole)
-    steps = whole[whole["run_id"] == whole["run_id"].iloc[0]]
-    response = time_response(steps)
-    assert isinstance(response, control.TimeResponseData)
-    assert (response.noutputs, response.nstates, response.ninputs) == (3, 6, 6)
-    np.testing.assert_array_equal(response.outputs[2], steps["feature_z_m"])
-    np.testing.assert_array_equal(response.inputs[0], steps["joint_velocity_command_shoulder_pan_rad_s"])
-    assert response.output_labels == ["feature_x_m", "feature_y_m", "feature_z_m"]
 
 
 def test_what_cannot_be_exported_is_one_line(folder, tmp_path):

@@ -13,15 +13,11 @@ from kit.folders import made_up_row, made_up_steps, write_folder
 from servobench.controllers.methods import METHODS
 from servobench.harness.analysis.statistics import Estimate
 from servobench.harness.batch import results
-from servobench.harness.pictures.batch import draw_measures, draw_step_times
-from servobench.harness.pictures.ensembles import load_ensembles, quantile, shown_until
-from servobench.harness.pictures.motion import draw_joint_motion
-from servobench.harness.pictures.panels import SETTLED
-from servobench.harness.pictures.paper import draw_moves, draw_tracking
+from servobench.harness.pictures.measures import draw_measures, draw_step_times, same_curves
 from servobench.harness.pictures.paths import draw_paths
-from servobench.harness.pictures.places import same_curves
-from servobench.harness.pictures.style import divisions, method_styles
-from servobench.harness.pictures.tracks import Track
+from servobench.harness.pictures.responses import draw_joint_motion, draw_moves, draw_tracking
+from servobench.harness.pictures.style import SETTLED, divisions, method_styles
+from servobench.harness.pictures.tracks import Track, load_ensembles, quantile, shown_until
 
 STYLES = method_styles(METHODS)
 

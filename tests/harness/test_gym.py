@@ -15,8 +15,7 @@ from servobench.harness.batch.api import run
 from servobench.harness.config.registry import RENDERED, default_plant
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym import ENVIRONMENT
-from servobench.harness.gym.environment import ServoEnv
-from servobench.harness.gym.outside import MARK
+from servobench.harness.gym.environment import MARK, ServoEnv
 from servobench.harness.gym.vector import ServoVectorEnv
 from servobench.plant.rendered.overview import Overview
 

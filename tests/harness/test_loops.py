@@ -7,15 +7,21 @@ import numpy as np
 import pytest
 
 from kit.plants import configure, setup
+from servobench.controllers.algebra import damped_inverse
 from servobench.controllers.laws.mfac import mfac_step
 from servobench.controllers.servo import ServoController
-from servobench.controllers.stages.inverses import damped_inverse
-from servobench.harness.analysis.loops.arm import ArmModel
 from servobench.harness.analysis.loops.equilibrium import arm_model, at_rest, linear_controller, warm_up
-from servobench.harness.analysis.loops.identification import SmallMotions, controller_response, excite
 from servobench.harness.analysis.loops.loop_analysis import analyse_loop, delay_margin, linear_response
-from servobench.harness.analysis.loops.margins import LoopResponse, frequencies, gain_crossings, phase_crossings
-from servobench.harness.analysis.loops.matrices import StateSpace, closed_loop, decay, is_stable
+from servobench.harness.analysis.loops.response import (
+    LoopResponse,
+    SmallMotions,
+    controller_response,
+    excite,
+    frequencies,
+    gain_crossings,
+    phase_crossings,
+)
+from servobench.harness.analysis.loops.systems import ArmModel, StateSpace, closed_loop, decay, is_stable
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve

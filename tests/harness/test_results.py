@@ -11,20 +11,18 @@ from kit.command import servobench
 from kit.folders import comparison, made_up_row, made_up_steps, write_folder
 from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
-from servobench.harness.analysis.summary import summary_legend, summary_tables
-from servobench.harness.analysis.tables import statistics_rows
+from servobench.harness.analysis.tables import statistics_rows, summary_legend, summary_tables
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import parquet, results
 from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.columns import NEEDED
 from servobench.harness.batch.integrity import examine
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.pictures.conditions import draw_conditions
-from servobench.harness.pictures.ensembles import load_ensembles
-from servobench.harness.pictures.interactive import error_curves, path_views
+from servobench.harness.pictures.measures import draw_conditions
+from servobench.harness.pictures.report import error_curves, path_views
 from servobench.harness.pictures.style import method_styles
-from servobench.harness.pictures.tracks import load_groups
-from servobench.harness.run.episode import RunResult
+from servobench.harness.pictures.tracks import load_ensembles, load_groups
+from servobench.harness.run.result import RunResult
 from servobench.plant.contract.files import point_latest, write_atomically
 
 STEPS = {"time_s": 0.05 * np.arange(3), "error_norm": 1.0}

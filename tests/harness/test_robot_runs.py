@@ -18,8 +18,7 @@ from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve, resolve_sections
-from servobench.harness.run.tasks import TASKS
-from servobench.harness.run.teaching import taught
+from servobench.harness.run.tasks import TASKS, taught
 from servobench.plant.robot.catalogue import find_robot
 
 PANDA = RunRequest("kinematic", "map_mfac", "exp2", "moderate", 3, robot="panda")
@@ -101,7 +100,7 @@ def test_of_an_arm_that_nobody_knows_a_method_probes_and_learns_all():
     request = replace(PANDA, robot="random_arm:3", controller="ukf_mfac", task="random", mismatch="none")
     experiment = build_experiment(request, Settings())
     knowledge = experiment.controller.servo.knowledge
-    assert (knowledge.nominal_jacobian, knowledge.nominal_sight, knowledge.train) == (None, None, None)
+    assert (knowledge.nominal_jacobian, knowledge.nominal_cameras, knowledge.train) == (None, None, None)
     config, known = (default_config(find_controller("ukf_mfac"), model_known=each) for each in (False, True))
     assert (config.initial.source, known.initial.source) == ("probe", "nominal")
     assert config.estimator == type(config.estimator)() != known.estimator

@@ -12,17 +12,23 @@ from kit.command import servobench
 from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.studies import map_lines, robustness
-from servobench.harness.studies.map_lines import KNOWN_LINES, LATENCY, LINES, MOVE, Line, find_lines
+from servobench.harness.studies import robustness
+from servobench.harness.studies import robustness as map_lines
 from servobench.harness.studies.robustness import (
+    KNOWN_LINES,
+    LATENCY,
+    LINES,
+    MOVE,
+    Line,
     draw_map,
+    find_lines,
     map_cells,
     moved_settings,
     predicted_limits,
     settling_median,
 )
 from servobench.plant.contract.sensing import SENSOR_AXES
-from servobench.plant.robot.mismatch_axes import Magnitude
+from servobench.plant.robot.mismatch import Magnitude
 
 
 def test_the_map_has_every_place_for_every_method_and_no_run_twice():

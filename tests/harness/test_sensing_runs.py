@@ -23,17 +23,16 @@ from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
 from servobench.harness.run.pose_error import pose_error
-from servobench.harness.run.pose_tasks import PoseTask, displaced, pose_start
+from servobench.harness.run.references import View
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
-from servobench.harness.run.views import View
+from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.inverse import closest_distance
-from servobench.plant.robot.pose_inverse import reach_pose
+from servobench.plant.robot.inverse import closest_distance, reach_pose
 
 PIXEL_WORDS = ["pixel", "pixel:hand", "stereo", "stereo:hand", "plate", "plate:hand"]
 

@@ -11,13 +11,15 @@ from rich.console import Console
 
 from kit.command import servobench
 from kit.folders import comparison, failed_only, made_up_row, sweep, write_folder
-from servobench.harness.analysis.cells import Cell
 from servobench.harness.analysis.comparison import split_conditions, split_tasks
 from servobench.harness.analysis.statistics import Estimate
-from servobench.harness.analysis.summary import outcome_legend, summary_legend, summary_tables, sweep_tables
 from servobench.harness.analysis.tables import (
-    compare_controllers,
-    judge_controllers,
+    Cell,
+    outcome_legend,
+    statistics_tables,
+    summary_legend,
+    summary_tables,
+    sweep_tables,
 )
 from servobench.harness.batch import results
 from servobench.harness.cli import terminal
@@ -43,6 +45,17 @@ def runs() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+def judge_controllers(runs):
+    """Return the first table of statistics."""
+    return next(statistics_tables(runs))[1]
+
+
+def compare_controllers(runs, metric=None, never=None):
+    """Return the table of pairs of one place."""
+    _, (_, pairs) = statistics_tables(runs, metric, never)
+    return pairs
+
+
 def test_each_controller_has_rates_medians_tails_and_failures(runs):
     quick, slow = judge_controllers(runs).to_dict("records")
     assert quick["settled, %"] == "100.0 [83.9, 100.0]"  # Wilson: 1/(1 + 1.96²/20)
@@ -60,7 +73,7 @@ def test_pairs_are_compared_on_common_seeds(runs):
     assert row["pairs"] == "20"
     assert row["difference in settling time, s"].startswith("-1.1")
     assert float(row["p after Holm"]) < 0.001
-    assert compare_controllers(runs[runs["controller"] == "quick"], never=10.0).empty
+    assert len(list(statistics_tables(runs[runs["controller"] == "quick"], never=10.0))) == 1
 
 
 def test_on_a_curve_pairs_are_compared_by_the_error_along_it(runs):

@@ -14,8 +14,8 @@ import numpy as np
 from servobench.fmus.compile import this_platform
 from servobench.fmus.controller_export import ControllerModel
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.controller_fmu import controller_model
 from servobench.harness.run.experiment import Experiment, build
+from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolved import resolve
 from servobench.plant.contract.signals import Command, Observation

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
+
 import numpy as np
 
 from servobench.harness.batch.workers import open_workers
 from servobench.harness.config.settings import flatten
 from servobench.harness.studies.tuning import scoring
-from servobench.harness.studies.tuning.campaign import TuningPlan, advance, open_methods
+from servobench.harness.studies.tuning.campaign import StudyRecord, TunedValues, TuningPlan, advance, open_methods
 from servobench.harness.studies.tuning.objective import TuningSet
 
 SMALL = TuningSet(robots=2)
@@ -48,3 +50,10 @@ def cost_by_formula(monkeypatch):
 
     monkeypatch.setattr(scoring, "evaluate", costs)
     return scored
+
+
+def read_tuned(path):
+    """Return the contents of a file of tuned values."""
+    data = tomllib.loads(path.read_text(encoding="utf-8"))
+    studies = tuple(StudyRecord(**record) for record in data["studies"])
+    return TunedValues(**{**data, "plants": tuple(data["plants"]), "studies": studies})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from servobench.plant.bench.bench import Bench
-from servobench.plant.bench.world import World
+from servobench.plant.bench.plant import World
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.sensing import SensingConfig, can_vary_sensing, vary_sensing
 from servobench.plant.contract.signals import Command, PlantSpec, Truth

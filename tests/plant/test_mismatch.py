@@ -9,8 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, parse_magnitudes, sample_mismatch
-from servobench.plant.robot.mismatch_axes import Magnitude
+from servobench.plant.robot.mismatch import MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
 from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
 
 POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))

@@ -11,17 +11,13 @@ import pytest
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import arm_urdf
-from servobench.plant.robot.arm import rotation_from_rpy
-from servobench.plant.robot.bodies import at_far_end, estimate_links
-from servobench.plant.robot.catalogue import ROBOTS, find_robot
-from servobench.plant.robot.clearance import segment_distance
-from servobench.plant.robot.limits import JointLimits, narrowed
-from servobench.plant.robot.makers import UNIVERSAL_ROBOTS
-from servobench.plant.robot.measured import nearest_title, read_calibration
+from servobench.plant.robot.arm import JointLimits, narrowed, rotation_from_rpy
+from servobench.plant.robot.catalogue import ROBOTS, find_robot, random_robot
+from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, nearest_title, read_calibration
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.random_arm import random_robot
-from servobench.plant.robot.teaching import find_workspace
+from servobench.plant.robot.robot import at_far_end, estimate_links
 from servobench.plant.robot.ur5 import nominal_ur5
+from servobench.plant.robot.workspace import find_workspace, segment_distance
 
 RNG = np.random.default_rng(7)
 

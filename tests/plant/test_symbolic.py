@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from servobench.plant.cameras.symbolic import feature_and_jacobian, geometry_of, symbolic_feature
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.symbolic import feature_and_jacobian, geometry_of, symbolic_feature
 from servobench.plant.robot.ur5 import nominal_ur5, ur5_arm_from_calibration
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Final, Literal, final
+from typing import Final, Literal, NamedTuple, final
 
 import numpy as np
 
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
-from servobench.controllers.estimate import Estimate
-from servobench.controllers.laws.law import Law, Stage
+from servobench.controllers.laws.law import Estimate, Law, Stage
 from servobench.controllers.laws.mpc.blocks import Blocks, bridging_shares
 from servobench.controllers.laws.mpc.closed_form import (
     UnlimitedPlan,
@@ -19,10 +18,8 @@ from servobench.controllers.laws.mpc.closed_form import (
     move_weights,
     preview_weights,
 )
-from servobench.controllers.laws.mpc.limits import exceeds, joint_bounds, view_rows
-from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver
-from servobench.controllers.laws.mpc.state import MpcState, Plan
-from servobench.controllers.laws.preview import check_preview, sampled
+from servobench.controllers.laws.mpc.qp import QpBounds, QpProgram, QpShape, Solver, exceeds, joint_bounds, view_rows
+from servobench.controllers.periods import check_preview, sampled
 from servobench.controllers.stages.limit import scale_to_limit
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.faults import SolverFailed
@@ -72,6 +69,44 @@ class MpcConfig:
         """Check across fields."""
         if len(self.view_tangent) not in (0, 2):
             raise ValueError(f"view_tangent must be empty or (horizontal, vertical), got {self.view_tangent}")
+
+
+class Plan(NamedTuple):
+    """The moves of the last command and how they were found.
+
+    Attributes:
+        moves: dq_1 … dq_H, or the one constant step, (..., moves, n), rad.
+        success: (...), 1 where they are the optimum, 0 where the fallback was sent; NaN before the first command.
+        iterations: (...), of the solver; 0 without an active limit.
+        active_limits: (...), NaN without a solution.
+    """
+
+    moves: FloatArray
+    success: FloatArray
+    iterations: FloatArray
+    active_limits: FloatArray
+
+
+class MpcState(NamedTuple):
+    """The state of the predictive law.
+
+    Attributes:
+        sent: (..., D, n), rad, the steps sent in the last `delay` seconds, the newest one last.
+        last: (..., n), rad, the last step sent.
+        fallbacks: (...), commands without a solution so far.
+        J: (..., m, n), m/rad, of the last command, for the diagnostics; NaN before, as the next two.
+        targets: (..., moves, m), of the last command.
+        final: (..., m), m, error at the end of the horizon if the arm stood still.
+        plan: of the last command.
+    """
+
+    sent: FloatArray
+    last: FloatArray
+    fallbacks: FloatArray
+    J: FloatArray
+    targets: FloatArray
+    final: FloatArray
+    plan: Plan
 
 
 @final

@@ -7,25 +7,27 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from servobench.controllers.servo import ServoController
-from servobench.harness.analysis.loops.arm import ArmModel
 from servobench.harness.analysis.loops.equilibrium import PLANT, TASK, Source, Warm, linear_controller, warm_up
-from servobench.harness.analysis.loops.identification import (
+from servobench.harness.analysis.loops.response import (
+    POINTS,
+    LoopResponse,
+    Margins,
     SmallMotions,
     controller_response,
     excite,
+    frequencies,
     simulated_step,
     step_responses,
 )
-from servobench.harness.analysis.loops.margins import POINTS, LoopResponse, Margins, frequencies
-from servobench.harness.analysis.loops.matrices import StateSpace, closed_loop, is_stable
+from servobench.harness.analysis.loops.systems import ArmModel, StateSpace, closed_loop, is_stable
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
+from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolved import ResolvedRun
-from servobench.harness.run.tasks import find_task
-from servobench.harness.run.teaching import taught
-from servobench.harness.run.threads import one_thread
+from servobench.harness.run.tasks import find_task, taught
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
@@ -33,6 +35,11 @@ from servobench.plant.robot.mismatch import Mismatch
 
 STEP_DURATION = 4.0  # [s] of the step responses
 FAST_POINTS = 150  # of the frequency axis where only the delay margin is wanted
+LEGEND = (
+    "Gain margin: factor on the command. Delay margin: further latency of the camera. M_s: largest singular value of "
+    "the sensitivity at the feature. Disk margin: for changes of each feature by itself. A dash: the loop is unstable. "
+    "Linearised loops have frozen estimators; how these adapt is not judged."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,3 +211,47 @@ def _identified(name: str, warm: Warm) -> LoopAnalysis:
     response = LoopResponse(frequency, controller, arm)
     step = step_responses(loop, m, n, round(STEP_DURATION / arm.period))
     return LoopAnalysis(name, "identified", True, response.margins(), response, step, None)
+
+
+def loop_table(loops: Sequence[LoopAnalysis]) -> pd.DataFrame:
+    """Return a row for each loop; margins of a loop that is unstable are NaN, its limits 0."""
+    rows = []
+    for loop in loops:
+        margins, stable = loop.margins, loop.stable
+        numbers = {
+            "gain_margin": margins.gain,
+            "gain_reduction_margin": margins.gain_reduction,
+            "phase_margin_deg": np.rad2deg(margins.phase),
+            "delay_margin_s": margins.delay,
+            "crossover_rad_s": margins.crossover,
+            "sensitivity_peak": margins.sensitivity_peak,
+            "complementary_peak": margins.complementary_peak,
+            "disk_margin": margins.disk,
+            "overshoot": max(0.0, float(loop.step.max()) - 1.0),
+        }
+        known = {name: value if stable else np.nan for name, value in numbers.items()}
+        rows.append(
+            {"controller": loop.name, "model": loop.model, "stable": stable, **known,
+             "latency_limit_s": loop.latency_limit}
+        )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def printed(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table as text for a terminal."""
+    columns = {"controller": table["controller"], "gain\nmargin": _text(table["gain_margin"], 2)}
+    if "simulated_gain_margin" in table:
+        columns["gain,\nsimulated"] = _text(table["simulated_gain_margin"], 2)
+        columns["latency\nlimit, ms"] = _text(1000.0 * table["latency_limit_s"], 0)
+        columns["latency,\nsimulated"] = _text(1000.0 * table["simulated_latency_limit_s"], 0)
+        return pd.DataFrame(columns)
+    columns["phase\nmargin, °"] = _text(table["phase_margin_deg"], 0)
+    columns["delay\nmargin, ms"] = _text(1000.0 * table["delay_margin_s"], 0)
+    columns["peak\nM_s"] = _text(table["sensitivity_peak"], 2)
+    columns["disk\nmargin"] = _text(table["disk_margin"], 2)
+    columns["over-\nshoot, %"] = _text(100.0 * table["overshoot"], 0)
+    return pd.DataFrame(columns)
+
+
+def _text(values: pd.Series[float], digits: int) -> pd.Series[str]:
+    return values.map(lambda value: "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.{digits}f}")

@@ -1,30 +1,52 @@
-"""All studies of all methods, advanced in step, and the best of each method chosen on a second set of robots.
+"""All studies of all methods, advanced in step; the best of each method, chosen on other robots; and its check.
 
-In a round every study asks for the one point that it needs next; all runs of the points that no ledger knows yet are
-carried out by the workers, and the ledgers of their methods take the costs. What is decided is decided in this process
-from the ledgers only: so the outcome is the same for any number of workers, and for a call that was interrupted and
+In each round every study asks for the one point that it needs next; all runs of the points that no ledger knows yet are
+carried out by the workers, and the ledgers of their methods take the costs. Every decision is made in this process from
+the ledgers alone: so the outcome is the same for any number of workers, and for a call that was interrupted and
 repeated.
+
+The check of tuned values: on the second set of robots no change of one value may improve the score by much. The changes
+are those of the coordinate search: each other value of each switch, and 20 % more and less of each number.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import final
+from typing import Any, Final, final
 
 from servobench.harness.batch.lock import LOCK
 from servobench.harness.batch.workers import Workers
-from servobench.harness.config.defaults import file_stem
+from servobench.harness.config.defaults import default_config, file_stem
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.studies.tuning.files import StudyRecord, TunedValues, write_tuned
-from servobench.harness.studies.tuning.ledger import LEDGER, Ledger
 from servobench.harness.studies.tuning.objective import TuningSet, score
-from servobench.harness.studies.tuning.scoring import SECOND, Wanted, fill, open_ledger, refuse_broken_defaults
-from servobench.harness.studies.tuning.spaces import Point, default_values, find_space, find_tunable, nested_settings
-from servobench.harness.studies.tuning.study import StudyOutcome, first_points, study
+from servobench.harness.studies.tuning.scoring import (
+    LEDGER,
+    SECOND,
+    Ledger,
+    Wanted,
+    fill,
+    open_ledger,
+    refuse_broken_defaults,
+)
+from servobench.harness.studies.tuning.search import StudyOutcome, first_points, neighbours, study
+from servobench.harness.studies.tuning.spaces import (
+    Point,
+    default_values,
+    find_space,
+    find_tunable,
+    nested_settings,
+    values_of,
+)
+from servobench.plant.contract.files import write_atomically
 from servobench.plant.contract.settings import Count, Periods, settings
+
+HEADING = "# Tuned values, made by `servobench tune`: the table [settings] replaces defaults. Scores: less is better.\n"
+TOLERANCE: Final = 0.03  # [1] share of the score by which no change may improve it
 
 
 @settings
@@ -235,3 +257,152 @@ def write_results(folder: Path, methods: Sequence[Method]) -> Mapping[str, Tuned
     for name, tuned in results.items():
         write_tuned(folder / f"{file_stem(name)}.toml", tuned)
     return results
+
+
+@dataclass(frozen=True)
+class StudyRecord:
+    """One of the studies of a method."""
+
+    seed: int  # of the sampler
+    trials: int  # of the sampler, known settings included
+    best_trial: int  # the number of the best one; 0 is that of the defaults
+    best_trial_score: float
+    search_points: int  # scored by the coordinate search that began there
+    search_complete: bool  # whether no change of one value improves the score; False: its budget ended first
+    score: float  # at its end
+    second_score: float  # of the same settings on the second set
+    settings: Mapping[str, Any]  # nested values
+
+
+@dataclass(frozen=True)
+class TunedValues:
+    """What the studies of a method found, all of it in the file; the best one on the second set is in use."""
+
+    controller: str
+    plants: tuple[str, ...]  # on which the runs took place
+    robots: int  # under each condition (`--robots`)
+    offset: int  # of the seeds in the tuning range (`--offset`)
+    runs_a_trial: int
+    runs_of_second_set: int
+    date: str  # day on which the file was written, UTC
+    version: str  # of servobench
+    score: float  # of these values
+    score_of_defaults: float  # of the defaults of the controller's class
+    second_score: float  # of these values on the second set of robots
+    second_score_of_defaults: float
+    checked_score: float  # of these values on the subset `TuningSet.checked`
+    checked_score_of_defaults: float
+    settings: Mapping[str, Any]  # nested values
+    studies: tuple[StudyRecord, ...]  # empty for values that were found under another objective and only scored anew
+
+    def tuning_set(self) -> TuningSet:
+        """Return the runs on which the values were found."""
+        return TuningSet(self.plants, self.robots, self.offset)
+
+
+def write_tuned(path: Path, tuned: TunedValues) -> None:
+    """Write the file atomically."""
+    tables = ("settings", "studies")
+    header = {item.name: getattr(tuned, item.name) for item in fields(tuned) if item.name not in tables}
+    if not tuned.studies:
+        header["studies"] = ()
+    text = HEADING + _table("", header)
+    text += _table("settings", tuned.settings)
+    for record in tuned.studies:
+        values = {item.name: getattr(record, item.name) for item in fields(record)}
+        text += "\n[[studies]]\n" + _table("", {key: value for key, value in values.items() if key != "settings"})
+        text += _table("studies.settings", record.settings)
+    write_atomically(path, lambda partial: partial.write_text(text, encoding="utf-8"))
+
+
+def _table(name: str, values: Mapping[str, Any]) -> str:
+    plain = {key: value for key, value in values.items() if not isinstance(value, Mapping)}
+    nested = {key: value for key, value in values.items() if isinstance(value, Mapping)}
+    heading = f"\n[{name}]\n" if name and (plain or not nested) else ""
+    lines = "".join(f"{key} = {_value(value)}\n" for key, value in plain.items())
+    return heading + lines + "".join(_table(f"{name}.{key}", value) for key, value in nested.items())
+
+
+def _value(value: object) -> str:
+    """Return a number, a switch, a text or a list of these as TOML; JSON writes them in the same way."""
+    return json.dumps(list(value) if isinstance(value, tuple) else value)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of one value of a method's settings in use, and what came of it."""
+
+    controller: str
+    key: str
+    before: Any
+    after: Any
+    score_before: float
+    score_after: float
+
+    @property
+    def gain(self) -> float:
+        """Share of the score that the change gains; negative if it loses."""
+        return 1.0 - self.score_after / self.score_before
+
+
+class Check:
+    """The settings in use of some methods with all their changes, on one set of runs."""
+
+    def __init__(self, folder: Path, controllers: Sequence[str], runs: TuningSet, keys: Sequence[str] = ()) -> None:
+        """Open the ledgers, in which a check goes on where it stopped.
+
+        Args:
+            folder: of the ledgers; made if needed.
+            controllers: names of methods with a search space.
+            runs: the runs on which changes are judged.
+            keys: the keys that are changed; none for all.
+
+        Raises:
+            ConfigurationError: a name or a file that cannot be used.
+        """
+        make_folder(folder)
+        self._runs = runs
+        self._changes: list[tuple[Ledger, str, str, Point, Point]] = []
+        for name in controllers:
+            refuse_broken_defaults(name, runs)
+            ledger = open_ledger(folder, name, runs, SECOND)
+            space, values = find_space(name), values_of(name, default_config(find_tunable(name)))
+            self._changes += [
+                (ledger, name, key, values, other)
+                for key, other in neighbours(space, values)
+                if (not keys or key in keys) and nested_settings(other) != nested_settings(values)
+            ]
+
+    def __len__(self) -> int:
+        """Return the number of points to score, those known already included."""
+        return len(self._scored())
+
+    def known(self) -> int:
+        """Return how many of the points the ledgers know."""
+        return sum(self._scored().values())
+
+    def _scored(self) -> dict[str, bool]:
+        """Return whether a point is known, for each."""
+        points = [(ledger, name, nested_settings(point)) for ledger, name, point in self._points()]
+        return {f"{name}{nested}": ledger.costs(nested) is not None for ledger, name, nested in points}
+
+    def _points(self) -> list[Wanted]:
+        return [(ledger, name, point) for ledger, name, _, *points in self._changes for point in points]
+
+    def carry_out(self, workers: Workers) -> Iterator[str]:
+        """Score what the ledgers lack, and yield the controller of each point."""
+        yield from fill(self._points(), self._runs, workers)
+
+    def changes(self) -> list[Change]:
+        """Return every change whose scores are known."""
+        known = []
+        for ledger, name, key, values, other in self._changes:
+            before, after = (ledger.costs(nested_settings(point)) for point in (values, other))
+            if before is not None and after is not None:
+                known.append(Change(name, key, values[key], other[key], score(before), score(after)))
+        return known
+
+
+def improvements(changes: Sequence[Change]) -> list[Change]:
+    """Return the changes that gain more than the tolerance, the largest first."""
+    return sorted((change for change in changes if change.gain > TOLERANCE), key=lambda change: -change.gain)

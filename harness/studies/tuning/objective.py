@@ -34,10 +34,10 @@ from servobench.harness.batch.compare import TUNING, tuning_seeds
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
-from servobench.harness.run.ending import COMPLETED
+from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest, read_mismatch
 from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
-from servobench.harness.run.together import side_by_side_key
+from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.sensing import can_vary_sensing
 from servobench.plant.contract.settings import Periods, settings
 

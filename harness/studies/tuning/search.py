@@ -1,20 +1,39 @@
-"""The coordinate search that ends a study: one value at a time, until no change of one value improves the score.
+"""One study of one method: first points that are known to matter, trials of a sampler, then a coordinate search.
 
-    switch: each of its other values         number: 1.2 and 0.8 times its value, within its range
-
-A change that lowers the score by more than `ACCEPTED` is kept and the same value is changed again; after a whole round
-without such a change the search ends. `servobench.harness.studies.tuning.check` makes the same changes.
+A study is a generator that yields the points whose scores it needs. Each trial's sampler is seeded by the study's seed
+and the number of the trial, so that a study given the same scores asks for the same points: one that was interrupted is
+repeated with the scores of the ledger up to where it stopped. There is no pruning.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
+import warnings
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+import optuna
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.exceptions import ExperimentalWarning
+from optuna.samplers import TPESampler
 
-from servobench.harness.studies.tuning.spaces import Distribution, Point, Space, nested_settings
+from servobench.controllers.controller import ControllerEntry
+from servobench.harness.config.defaults import apply_settings, tuned_settings
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.studies.tuning.spaces import (
+    SPACES,
+    Distribution,
+    Point,
+    Space,
+    default_values,
+    find_space,
+    find_tunable,
+    is_switch,
+    nested_settings,
+    values_of,
+)
+from servobench.plant.contract.seeds import named_seed
 
 STEP: Final = 0.2  # [1] share of a number by which it is changed
 STEP_FROM_ZERO: Final = 0.05  # [1] share of the range's upper end by which a number of 0 is changed
@@ -31,25 +50,50 @@ class Found:
     complete: bool  # whether no change improves the score; False: the budget ended first
 
 
-def changes(distribution: Distribution, value: Any) -> list[Any]:  # noqa: ANN401 - a number or a choice
-    """Return the values that the search and the check try instead of `value`."""
-    if isinstance(distribution, CategoricalDistribution):
-        return [choice for choice in distribution.choices if choice != value]
-    reached = [_step(distribution, value, sign) for sign in (1, -1)]
-    return [other for other in dict.fromkeys(reached) if other != value]
+@dataclass(frozen=True)
+class StudyOutcome:
+    """What a study found."""
+
+    trials: int  # trials of the sampler, the first points included
+    best_trial: int  # number of the best one, from 0; the first is that of the defaults
+    best_trial_score: float
+    found: Found  # where the coordinate search went from there
 
 
-def _step(distribution: FloatDistribution | IntDistribution, value: float, sign: int) -> float:
-    size = STEP * abs(value) or STEP_FROM_ZERO * distribution.high
-    if distribution.step is not None:
-        size = distribution.step * max(1, round(size / distribution.step))
-    moved = min(max(value + sign * size, distribution.low), distribution.high)
-    return int(moved) if isinstance(distribution, IntDistribution) else moved
+def study(
+    name: str, space: Space, first: Sequence[Point], trials: int, search: int, seed: int
+) -> Generator[Point, float, StudyOutcome]:
+    """Search for the best point of a space.
+
+    Args:
+        name: of the controller; with the seed it decides what the sampler draws.
+        space: where.
+        first: points that are tried before the sampler is asked, the defaults first.
+        trials: number of trials, the first points included; at least 1.
+        search: most points that the coordinate search may ask for; 0 for none.
+        seed: of the sampler.
+    """
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sampled = optuna.create_study(direction="minimize")
+    tried: list[tuple[float, Point]] = []
+    for number in range(trials):
+        if number < len(first):
+            sampled.enqueue_trial(dict(first[number]))
+        sampled.sampler = _sampler(named_seed(seed, f"{name}, trial {number}"))
+        with np.errstate(all="ignore"):  # the sampler's densities may underflow
+            trial = sampled.ask(dict(space))
+        score = yield trial.params
+        tried.append((score, trial.params))
+        sampled.tell(trial, score)
+    best = min(range(trials), key=lambda number: tried[number][0])
+    found = yield from coordinate_search(space, tried[best][1], tried[best][0], search)
+    return StudyOutcome(trials, best, tried[best][0], found)
 
 
-def neighbours(space: Space, values: Point) -> list[tuple[str, Point]]:
-    """Return every point that differs from `values` by one change, with the key that is changed."""
-    return [(key, {**values, key: other}) for key in space for other in changes(space[key], values[key])]
+def _sampler(seed: int) -> TPESampler:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ExperimentalWarning)
+        return TPESampler(seed=seed, multivariate=True)
 
 
 def coordinate_search(space: Space, values: Point, score: float, budget: int) -> Generator[Point, float, Found]:
@@ -81,3 +125,83 @@ def coordinate_search(space: Space, values: Point, score: float, budget: int) ->
         idle = 0 if improved else idle + 1
         at += not improved
     return Found(values, score, asked, complete=True)
+
+
+def changes(distribution: Distribution, value: Any) -> list[Any]:  # noqa: ANN401 - a number or a choice
+    """Return the values that the search and the check try instead of `value`."""
+    if isinstance(distribution, CategoricalDistribution):
+        return [choice for choice in distribution.choices if choice != value]
+    reached = [_step(distribution, value, sign) for sign in (1, -1)]
+    return [other for other in dict.fromkeys(reached) if other != value]
+
+
+def _step(distribution: FloatDistribution | IntDistribution, value: float, sign: int) -> float:
+    size = STEP * abs(value) or STEP_FROM_ZERO * distribution.high
+    if distribution.step is not None:
+        size = distribution.step * max(1, round(size / distribution.step))
+    moved = min(max(value + sign * size, distribution.low), distribution.high)
+    return int(moved) if isinstance(distribution, IntDistribution) else moved
+
+
+def neighbours(space: Space, values: Point) -> list[tuple[str, Point]]:
+    """Return every point that differs from `values` by one change, with the key that is changed."""
+    return [(key, {**values, key: other}) for key in space for other in changes(space[key], values[key])]
+
+
+def first_points(name: str) -> list[Point]:
+    """Return the points that every study of a controller tries first, each once.
+
+    They are the defaults of its class, the tuned values in use, the defaults with each value of each switch, and the
+    tuned values with what other methods' tuned values say of the keys that both have.
+    """
+    entry, space = find_tunable(name), find_space(name)
+    default = default_values(entry)
+    own = tuned_point(entry) or default
+    switches = [key for key in space if is_switch(space[key])]
+    flips = [{**default, key: other} for key in switches for other in changes(space[key], default[key])]
+    points = [default, own, *flips, *_borrowed(name, own)]
+    return list({str(nested_settings(point)): point for point in points}.values())
+
+
+def tuned_point(entry: ControllerEntry) -> Point | None:
+    """Return the tuned values in use as a point of the controller's space; None if there are none that fit."""
+    settings = tuned_settings(entry.name)
+    if not settings:
+        return None
+    try:
+        values = values_of(entry.name, apply_settings(entry, settings))
+    except ConfigurationError:
+        return None  # a file of an earlier version
+    return inside(find_space(entry.name), values, default_values(entry))
+
+
+def _borrowed(name: str, own: Point) -> Iterator[Point]:
+    """Yield `own` with the tuned values of each other method for the keys that both have."""
+    space = find_space(name)
+    for other in SPACES:
+        settings = {} if other == name else tuned_settings(other)
+        shared = {key: value for key, value in _flat(settings) if key in space}
+        if shared:
+            yield inside(space, {**own, **shared}, own)
+
+
+def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - nested tables
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def inside(space: Space, values: Point, otherwise: Point) -> Point:
+    """Return `values` where they lie in the space; what a number is outside of its range becomes the range's end."""
+    return {key: _within(space[key], values[key], otherwise[key]) for key in space}
+
+
+def _within(distribution: Distribution, value: Any, otherwise: Any) -> Any:  # noqa: ANN401 - a number or a choice
+    if isinstance(distribution, CategoricalDistribution):
+        return value if value in distribution.choices else otherwise
+    within = min(max(value, distribution.low), distribution.high)
+    if distribution.step is None:
+        return within
+    return type(within)(distribution.low + distribution.step * round((within - distribution.low) / distribution.step))

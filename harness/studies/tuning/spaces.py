@@ -21,6 +21,7 @@ from typing import Any, Final, TypeAlias
 
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
+from servobench.controllers.aids import RANGES, SWITCHES
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.config.registry import find_controller
 from servobench.harness.config.settings import ConfigurationError, flatten
@@ -40,16 +41,8 @@ def _log(low: float, high: float) -> FloatDistribution:
 
 _SWITCH: Final = CategoricalDistribution((False, True))
 _AIDS: Final[Space] = {
-    "aids.delay": CategoricalDistribution(("ignored", "identified")),
-    "aids.response": CategoricalDistribution(("ignored", "identified")),
-    "aids.noise": CategoricalDistribution(("given", "identified")),
-    "aids.filter": _SWITCH,
-    "aids.model": CategoricalDistribution(("own", "nominal", "map")),
-    "aids.feedforward": _SWITCH,
-    "aids.limit": CategoricalDistribution(("scale", "clip", "redistribute")),
-    "aids.map_walk": _log(0.03, 3.0),  # 1/√m
-    "aids.map_error": _log(0.01, 0.1),  # with more the identified noise would be too small, and the delay biased
-    "aids.posture_gain": FloatDistribution(0.1, 1.0),  # 1/s
+    **{f"aids.{name}": CategoricalDistribution(aid.tuned) for name, aid in SWITCHES.items() if aid.tuned},  # type: ignore[arg-type]
+    **{f"aids.{name}": FloatDistribution(each.low, each.high, log=each.log) for name, each in RANGES.items()},
 }
 _P: Final[Space] = {
     "law.proportional_gain": _log(0.5, 30.0),  # 1/s

@@ -16,8 +16,8 @@ from servobench.plant.rendered.bullet.engine import pybullet
 from servobench.plant.rendered.drives import RigidBody
 from servobench.plant.rendered.engine import MIN_OVERLAP, Overlap
 from servobench.plant.rendered.urdf import Box, arm_mechanics, boxes_urdf, room_boxes
-from servobench.plant.robot.bodies import GRAVITY
 from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.robot import GRAVITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

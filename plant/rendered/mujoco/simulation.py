@@ -22,7 +22,7 @@ from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Simu
 from servobench.plant.rendered.mujoco.engine import mujoco
 from servobench.plant.rendered.mujoco.model import read_urdf
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
-from servobench.plant.robot.bodies import GRAVITY
+from servobench.plant.robot.robot import GRAVITY
 
 STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, the shortest that MuJoCo integrates well
 

@@ -1,0 +1,155 @@
+"""Projection updates of the Jacobian: Broyden's rank-one update and compact-form dynamic linearisation (CFDL).
+
+    broyden   Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / ‖Δq‖²,          0 < η ≤ 1
+    cfdl      Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²),    0 < η < 2,  μ > 0
+
+Broyden's is the smallest change of Ĵ that explains the last motion; η = 1 satisfies ĴΔq = Δy exactly, and so takes all
+of the noise in. η = 1 and μ → 0 make the compact form Broyden's update; μ keeps it steady at rest and under noise.
+
+Sources: C. G. Broyden, "A class of methods for solving nonlinear simultaneous equations", 1965; for visual servoing
+M. Jägersand, O. Fuentes, R. Nelson, 1997. Z. Hou, S. Jin, "Model Free Adaptive Control: Theory and Applications", 2013,
+pseudo-Jacobian by the projection algorithm with reset.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple, final
+
+import numpy as np
+from annotated_types import Le, Lt
+
+from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.estimators.estimator import Estimator, Motion
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import branch, norm, outer
+from servobench.plant.contract.settings import NonNegative, Positive, settings
+from servobench.plant.contract.signals import BoolArray
+
+
+@settings
+class BroydenConfig:
+    """Settings of Broyden's update."""
+
+    step_factor: Annotated[Positive, Le(1.0)] = 0.2
+    """[1] η; the rule has no model of noise, so a part of each motion's misfit is left for the next ones."""
+    min_joint_step: Positive = 0.01
+    """[rad] smaller motions are left out; 1.4 mm of noise in Δy is then at most 0.14 m/rad."""
+
+
+def projection_update(
+    J: FloatArray, joint_step: FloatArray, feature_step: FloatArray, *, step_factor: float, regularisation: float
+) -> FloatArray:
+    """Return J + η (Δy − JΔq) Δqᵀ / (μ + ‖Δq‖²); Broyden's update for μ = 0, the compact-form one for μ > 0.
+
+    Args:
+        J: (..., m, n), m/rad.
+        joint_step: Δq, (..., n), rad.
+        feature_step: Δy, (..., m), m.
+        step_factor: η.
+        regularisation: μ, rad².
+    """
+    square = np.vecdot(joint_step, joint_step)
+    gain = step_factor * joint_step / (regularisation + square)[..., None]
+    return np.asarray(J + outer(feature_step - np.matvec(J, joint_step), gain))
+
+
+class BroydenState(NamedTuple):
+    """Ĵ, (..., m, n), m/rad, and whether the last motion was used, (...)."""
+
+    J: FloatArray
+    updated: BoolArray
+
+
+@final
+class BroydenEstimator(Estimator[BroydenState]):
+    """Ĵ ← Ĵ + η (Δy − ĴΔq) Δqᵀ / ‖Δq‖² for every motion above a minimum ‖Δq‖."""
+
+    def __init__(self, config: BroydenConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
+        self._config = config
+
+    def start(self, jacobian: FloatArray) -> BroydenState:
+        """Start from Ĵ₀, (..., m, n), m/rad."""
+        return BroydenState(jacobian, np.full(jacobian.shape[:-2], False))
+
+    def update(self, state: BroydenState, motion: Motion) -> BroydenState:
+        """Correct by one motion."""
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        return branch(large, self._correct, state._replace(updated=large), motion)
+
+    def _correct(self, state: BroydenState, motion: Motion) -> BroydenState:
+        dq, dy = motion.joint_step, motion.feature_step
+        return state._replace(
+            J=projection_update(state.J, dq, dy, step_factor=self._config.step_factor, regularisation=0.0)
+        )
+
+    def diagnostics(self, state: BroydenState) -> Diagnostics:
+        """Return whether the last motion was used."""
+        return {"estimator_updated": state.updated}
+
+
+@settings
+class CfdlConfig:
+    """Settings of the compact-form estimate."""
+
+    step_factor: Annotated[Positive, Lt(2.0)] = 0.5
+    """[1] η; half of the fastest rate."""
+    regularisation: Positive = 1e-3
+    """[rad²] μ, the square of 0.03 rad: smaller motions change Φ little."""
+    min_joint_step: NonNegative = 0.005
+    """[rad] smaller motions are left out: 1 mm of noise hides them."""
+    reset: bool = True
+    """Return to Φ₀ when Φ loses its sign or vanishes."""
+    reset_norm: NonNegative = 1e-2
+    """[m/rad] ‖Φ‖ below which Φ counts as vanished."""
+
+
+class CfdlState(NamedTuple):
+    """Φ and Φ₀, (..., m, n), m/rad; whether the last motion was used and how often Φ was reset, (...)."""
+
+    J: FloatArray
+    J0: FloatArray
+    updated: BoolArray
+    resets: FloatArray
+
+
+@final
+class CfdlEstimator(Estimator[CfdlState]):
+    """Φ ← Φ + η (Δy − ΦΔq) Δqᵀ / (μ + ‖Δq‖²), back to Φ₀ when sign(Φ) ≠ sign(Φ₀) or ‖Φ‖ vanishes.
+
+    Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly
+    changes the sign of single entries, so the sign of the whole is taken: ⟨Φ, Φ₀⟩ = trace(ΦᵀΦ₀) ≤ 0 counts as changed.
+    The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, what was learnt stays.
+    """
+
+    def __init__(self, config: CfdlConfig, knowledge: RobotKnowledge | None = None) -> None:
+        """Take the settings; nothing about the robot is needed."""
+        self._config = config
+
+    def start(self, jacobian: FloatArray) -> CfdlState:
+        """Start from Φ₀, (..., m, n), m/rad."""
+        lead = jacobian.shape[:-2]
+        return CfdlState(jacobian, jacobian, np.full(lead, False), np.zeros(lead))
+
+    def update(self, state: CfdlState, motion: Motion) -> CfdlState:
+        """Correct by one motion."""
+        large = norm(motion.joint_step) >= self._config.min_joint_step
+        return branch(large, self._correct, state._replace(updated=large), motion)
+
+    def _correct(self, state: CfdlState, motion: Motion) -> CfdlState:
+        config, dq, dy = self._config, motion.joint_step, motion.feature_step
+        J = projection_update(state.J, dq, dy, step_factor=config.step_factor, regularisation=config.regularisation)
+        state = state._replace(J=J)
+        if not config.reset:
+            return state
+        flat, first = J.reshape(*J.shape[:-2], -1), state.J0.reshape(*J.shape[:-2], -1)
+        lost = (np.vecdot(flat, first) <= 0.0) | (np.vecdot(flat, flat) < config.reset_norm**2)
+        return branch(lost, _restarted, state)
+
+    def diagnostics(self, state: CfdlState) -> Diagnostics:
+        """Return whether the last motion was used and how often Φ was reset in this run."""
+        return {"estimator_updated": state.updated, "jacobian_resets": state.resets}
+
+
+def _restarted(state: CfdlState) -> CfdlState:
+    return state._replace(J=state.J0, resets=state.resets + 1.0)

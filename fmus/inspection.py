@@ -1,0 +1,189 @@
+"""Reads an FMU (version, interfaces, platforms, capabilities, variables), and checks it.
+
+The checks are those of the archive and the description (by fmpy), and a run against the reference inside it.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fmpy.validation import validate_fmu as validate_by_fmpy
+
+from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import FmuError
+from servobench.plant.fmu.archive import extract_fmu
+from servobench.plant.fmu.description import FmuDescription, Variable, parse_description, read_description
+from servobench.plant.fmu.instances import open_instance
+from servobench.plant.fmu.port import Port
+
+TOLERANCE = 1e-9  # [1] largest relative difference of a run from the reference
+
+
+@dataclass(frozen=True)
+class VariableInformation:
+    """One variable of the model description."""
+
+    name: str
+    type: str
+    shape: tuple[int, ...]
+    causality: str
+    variability: str
+    unit: str
+    start: str
+    description: str
+
+
+@dataclass(frozen=True)
+class FmuInformation:
+    """Content of a model description.
+
+    Attributes:
+        fmi_version: as written.
+        model_name: display name.
+        token: GUID or instantiation token.
+        tool: generation tool.
+        interfaces: those of co-simulation, model exchange and scheduled execution that it offers, each with the names
+            of its capabilities.
+        platforms: folders below binaries/.
+        has_sources: whether it holds its C sources.
+        variables: all of them, in order.
+    """
+
+    fmi_version: str
+    model_name: str
+    token: str
+    tool: str
+    interfaces: Mapping[str, tuple[str, ...]]
+    platforms: tuple[str, ...]
+    has_sources: bool
+    variables: tuple[VariableInformation, ...]
+
+
+def read_information(path: Path) -> FmuInformation:
+    """Read the FMU at `path`.
+
+    Raises:
+        ValueError: it is not an FMU.
+    """
+    root = extract_fmu(path)
+    description = parse_description(path, root)
+    binaries = root / "binaries"
+    return FmuInformation(
+        fmi_version=str(description.fmiVersion),
+        model_name=str(description.modelName),
+        token=str(description.guid or description.instantiationToken),
+        tool=str(description.generationTool or "unknown"),
+        interfaces=_interfaces(root),
+        platforms=tuple(sorted(item.name for item in binaries.iterdir())) if binaries.is_dir() else (),
+        has_sources=(root / "sources").is_dir(),
+        variables=tuple(_variable(variable) for variable in description.modelVariables),
+    )
+
+
+INTERFACES = {
+    "CoSimulation": "co-simulation",
+    "ModelExchange": "model exchange",
+    "ScheduledExecution": "scheduled execution",
+}
+
+
+def _interfaces(root: Path) -> dict[str, tuple[str, ...]]:
+    """Return the capabilities by interface from the XML, since fmpy does not read all of FMI 3."""
+    description = ET.parse(root / "modelDescription.xml").getroot()
+    elements = {name: description.find(tag) for tag, name in INTERFACES.items()}
+    return {
+        name: tuple(
+            key
+            for key, value in element.attrib.items()
+            if key.startswith(("can", "needs", "provides")) and value in ("true", "1")
+        )
+        for name, element in elements.items()
+        if element is not None
+    }
+
+
+def _variable(variable: Any) -> VariableInformation:  # noqa: ANN401 - as above
+    axes = variable.dimensions or ()
+    sizes = [each.start if each.start is not None else getattr(each.variable, "start", None) for each in axes]
+    return VariableInformation(
+        name=variable.name,
+        type=variable.type,
+        shape=tuple(int(size) for size in sizes if size is not None),
+        causality=variable.causality or "local",
+        variability=variable.variability or "continuous",
+        unit=variable.unit or "",
+        start=str(variable.start or ""),
+        description=variable.description or "",
+    )
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Result of the checks.
+
+    Attributes:
+        problems: one line for each; empty if there are none.
+        deviation: largest difference from the reference run, or None without a reference run.
+    """
+
+    problems: tuple[str, ...]
+    deviation: float | None
+
+
+def validate_fmu(path: Path) -> Validation:
+    """Check the FMU at `path`.
+
+    Raises:
+        ValueError: it is not a co-simulation FMU of FMI 2 or 3.
+    """
+    root = extract_fmu(path)
+    description = read_description(path, root)
+    problems = [" ".join(str(problem).split()) for problem in validate_by_fmpy(str(path))]
+    deviation = None
+    if (root / INPUT_FILE).is_file() and (root / OUTPUT_FILE).is_file():
+        try:
+            deviation = _deviation(description, root)
+        except (FmuError, ValueError) as error:
+            problems.append(f"the reference run failed: {error}")
+    if deviation is not None and not deviation <= TOLERANCE:
+        problems.append(f"the run differs from the reference by {deviation:.3g}, allowed is {TOLERANCE:g}")
+    return Validation(tuple(problems), deviation)
+
+
+def _deviation(description: FmuDescription, root: Path) -> float:
+    """Run the FMU under the reference commands and return the largest difference of its outputs."""
+    header_in, commands = read_table((root / INPUT_FILE).read_text(encoding="utf-8"))
+    header_out, wanted = read_table((root / OUTPUT_FILE).read_text(encoding="utf-8"))
+    inputs, outputs = Port(_variables(description, header_in)), Port(_variables(description, header_out))
+    if commands.shape[1] != inputs.values.size + 1 or wanted.shape != (len(commands), outputs.values.size + 1):
+        raise ValueError("the reference tables do not fit the FMU's variables")
+    instance = open_instance(description, root)
+    try:
+        write, read = instance.writer(inputs), instance.reader(outputs)
+        times = commands[:, 0]
+        instance.start(float(times[0]))
+        came: FloatArray = np.empty_like(wanted[:, 1:])
+        for k, time in enumerate(times):
+            read()
+            came[k] = outputs.values
+            inputs.values[:] = commands[k, 1:]
+            write()
+            if k + 1 < len(times):
+                instance.stepper(float(times[k + 1] - time))(float(time))
+    finally:
+        instance.close()
+    size = np.maximum(1.0, np.abs(wanted[:, 1:]))  # pixels of a point beside a camera are large
+    return float((np.abs(came - wanted[:, 1:]) / size).max())
+
+
+def _variables(description: FmuDescription, header: list[str]) -> list[Variable]:
+    """Return the variables of the columns; in FMI 3 the columns `name[1]`, … belong to one array variable."""
+    known = {variable.name for variable in description.variables}
+    names = [name if name in known else name.partition("[")[0] for name in header[1:]]
+    return [variable for name in dict.fromkeys(names) for variable in description.find(name, "reference run")]

@@ -1,0 +1,468 @@
+"""Arrays whose numbers are CasADi expressions, in the place of numpy's, and numpy's ufuncs over them.
+
+An array is a table of places in a buffer, one column of expressions. Whatever numpy does to the order and the shape of
+an array it does to the table, so that views, slices and broadcasting are numpy's own; writing to a view changes the
+buffer that it shares. A buffer holds plain numbers until an expression is written to it, and such an array can be used
+wherever numpy wants numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, ClassVar, TypeAlias
+
+import casadi
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.mixins import NDArrayOperatorsMixin
+
+Expression: TypeAlias = Any  # of CasADi: MX
+Places: TypeAlias = npt.NDArray[np.intp]
+Operation = Callable[..., Expression]
+DTYPES = {"b": np.dtype(np.bool_), "i": np.dtype(np.int_), "f": np.dtype(np.float64)}
+
+
+class NotTraceable(ValueError):
+    """Code cannot be recorded: it decides by a number of the run, or calls what has no expression."""
+
+
+class Buffer:
+    """Numbers or expressions, which arrays share.
+
+    Attributes:
+        content: (N,) numbers, or an expression (N, 1).
+    """
+
+    def __init__(self, content: Any) -> None:  # noqa: ANN401 - numbers or an expression
+        """Hold a content."""
+        self.content = content
+
+    @property
+    def constant(self) -> bool:
+        """Whether it holds plain numbers."""
+        return isinstance(self.content, np.ndarray)
+
+
+class Traced(NDArrayOperatorsMixin):
+    """An array of expressions.
+
+    Attributes:
+        buffer: of its numbers.
+        places: of its entries in the buffer.
+        kind: of its numbers, as numpy's: "b", "i" or "f".
+    """
+
+    function: ClassVar[Callable[..., Any]]
+    """Carries out a function of numpy that is no ufunc; `servobench.fmus.trace.record` sets it."""
+    flags: ClassVar[SimpleNamespace] = SimpleNamespace(writeable=True)
+
+    def __init__(self, buffer: Buffer, places: Places, kind: str = "f") -> None:
+        """Show a part of a buffer."""
+        self.buffer, self.places, self.kind = buffer, places, kind
+
+    @classmethod
+    def of(cls, expression: Expression, shape: tuple[int, ...], kind: str = "f") -> Traced:
+        """Return the array (shape) of an expression (N, 1), in row-major order."""
+        return cls(Buffer(expression), np.arange(expression.numel()).reshape(shape), kind)
+
+    @classmethod
+    def plain(cls, numbers: npt.NDArray[Any]) -> Traced:
+        """Return an array of numbers to which expressions can be written."""
+        kind = numbers.dtype.kind if numbers.dtype.kind in DTYPES else "f"
+        return cls(
+            Buffer(np.array(numbers, dtype=np.float64).reshape(-1)),
+            np.arange(numbers.size).reshape(numbers.shape),
+            kind,
+        )
+
+    @property
+    def constant(self) -> bool:
+        """Whether its entries are plain numbers."""
+        return self.buffer.constant
+
+    def numbers(self) -> npt.NDArray[Any]:
+        """Return the numbers of a constant array.
+
+        Raises:
+            NotTraceable: it has expressions.
+        """
+        if not self.constant:
+            raise NotTraceable("it decides by a number that is known in the run only")
+        values: npt.NDArray[Any] = self.buffer.content[self.places]
+        return values.astype(DTYPES[self.kind])
+
+    def flat(self) -> Expression:
+        """Return its entries as an expression (size, 1), in row-major order."""
+        if self.constant:
+            return casadi.MX(casadi.DM(self.buffer.content[self.places.reshape(-1)]))
+        return gathered(self.buffer.content, self.places)
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:  # noqa: ANN401
+        """Carry out a ufunc."""
+        return _carry_out(ufunc, method, inputs, options)
+
+    def __array_function__(self, function: Any, types: Any, arguments: Any, options: Any) -> Any:  # noqa: ANN401
+        """Carry out another function."""
+        del types
+        return Traced.function(function, arguments, options)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:  # noqa: ANN401
+        """Return the numbers of a constant array."""
+        del copy
+        return np.asarray(self.numbers(), dtype=dtype)
+
+    def __bool__(self) -> bool:
+        """Return the truth of a constant array of one entry."""
+        return bool(self.numbers())
+
+    def __int__(self) -> int:
+        """Return a constant."""
+        return int(self.numbers())
+
+    __index__ = __int__
+
+    def __float__(self) -> float:
+        """Return a constant."""
+        return float(self.numbers())
+
+    def __len__(self) -> int:
+        """Return the size of the first axis."""
+        return len(self.places)
+
+    def __iter__(self) -> Iterator[Traced]:
+        """Yield the entries of the first axis."""
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, key: Any) -> Traced:  # noqa: ANN401 - any index
+        """Return a view, or a copy of the entries that a traced index names along the first axis."""
+        if isinstance(key, Traced):
+            return self[key.numbers()] if key.constant or key.kind == "b" else picked(self, key)
+        return Traced(self.buffer, np.asarray(self.places[_plain_key(key)]), self.kind)
+
+    def __setitem__(self, key: Any, value: Any) -> None:  # noqa: ANN401 - any index, any array
+        """Write to the buffer."""
+        places = np.asarray(self.places[_plain_key(key)])
+        if isinstance(value, Traced) and not value.constant:
+            content = casadi.MX(self.buffer.content) if not self.constant else casadi.MX(casadi.DM(self.buffer.content))
+            content.nz[places.reshape(-1).tolist()] = spread(value, places.shape).flat()
+            self.buffer.content = content
+        elif self.constant:
+            numbers = value.numbers() if isinstance(value, Traced) else value
+            self.buffer.content = self.buffer.content.copy()
+            self.buffer.content[places] = numbers
+        else:
+            numbers = np.broadcast_to(np.asarray(value, dtype=np.float64), places.shape)
+            content = casadi.MX(self.buffer.content)
+            content.nz[places.reshape(-1).tolist()] = casadi.MX(casadi.DM(numbers.reshape(-1)))
+            self.buffer.content = content
+
+    def arranged(self, places: Places) -> Traced:
+        """Return a view with another table of places."""
+        return Traced(self.buffer, np.asarray(places), self.kind)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Sizes of its axes."""
+        return self.places.shape
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes."""
+        return self.places.ndim
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return self.places.size
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of its numbers, as numpy's."""
+        return DTYPES[self.kind]
+
+    @property
+    def T(self) -> Traced:
+        """Transpose."""
+        return self.arranged(self.places.T)
+
+    @property
+    def mT(self) -> Traced:
+        """Transpose of the last two axes."""
+        return self.arranged(self.places.mT)
+
+    def reshape(self, *shape: Any) -> Traced:  # noqa: ANN401 - as numpy's
+        """Return the entries in another shape."""
+        return self.arranged(self.places.reshape(*shape))
+
+    def swapaxes(self, one: int, other: int) -> Traced:
+        """Return a view with two axes exchanged."""
+        return self.arranged(self.places.swapaxes(one, other))
+
+    def copy(self) -> Traced:
+        """Return a copy with a buffer of its own."""
+        return Traced.plain(self.numbers()) if self.constant else Traced.of(self.flat(), self.shape, self.kind)
+
+    def astype(self, dtype: npt.DTypeLike) -> Traced:
+        """Return the numbers as another type; whole ones are cut off."""
+        kind = np.dtype(dtype).kind
+        if kind == "i" and self.kind == "f":
+            cut: Traced = np.where(self < 0.0, np.ceil(self), np.floor(self))  # type: ignore[assignment]
+            return Traced(cut.buffer, cut.places, "i")
+        if kind == "b" and self.kind != "b":
+            return self != 0.0  # type: ignore[no-any-return]
+        return Traced(self.buffer, self.places, kind)
+
+    def setflags(self, **flags: bool) -> None:
+        """Do nothing: traced arrays are always writeable."""
+
+    def tobytes(self) -> bytes:
+        """Return bytes that equal those of no other array, so that a memo of it is never used for another one."""
+        return b"traced %d %d" % (id(self), next(_COUNTER))
+
+    def _called(self, name: str, *arguments: Any, **options: Any) -> Any:  # noqa: ANN401 - as numpy's
+        return getattr(np, name)(self, *arguments, **options)
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - a method of numpy's arrays
+        """Return a method that numpy has as a function as well."""
+        if name not in METHODS:
+            raise AttributeError(f"Traced has no attribute {name!r}")
+        return lambda *arguments, **options: self._called(name, *arguments, **options)
+
+
+def _counter() -> Iterator[int]:
+    number = 0
+    while True:
+        yield number
+        number += 1
+
+
+_COUNTER = _counter()
+METHODS = {
+    "sum", "mean", "max", "min", "any", "all", "argmin", "argmax", "cumsum", "trace", "diagonal", "take", "dot",
+    "repeat", "ravel", "squeeze", "transpose", "clip",
+}  # fmt: skip
+
+
+def _plain_key(key: Any) -> Any:  # noqa: ANN401 - any index
+    if isinstance(key, tuple):
+        return tuple(_plain_key(each) for each in key)
+    return key.numbers() if isinstance(key, Traced) else key
+
+
+def gathered(content: Expression, places: Places) -> Expression:
+    """Return entries of an expression (N, 1) as one (size, 1)."""
+    flat = places.reshape(-1)
+    if flat.size == content.numel() and np.array_equal(flat, np.arange(flat.size)):
+        return content
+    if content.numel() == 1:
+        return casadi.repmat(content, flat.size, 1)
+    return content.nz[flat.tolist()] if flat.size else casadi.MX(0, 1)
+
+
+def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
+    """Return an array broadcast to a shape."""
+    return array.arranged(np.broadcast_to(array.places, shape))
+
+
+def as_traced(value: Any) -> Traced:  # noqa: ANN401 - anything array-like
+    """Return an array as one of these."""
+    return value if isinstance(value, Traced) else Traced.plain(np.asarray(value))
+
+
+def picked(array: Any, index: Traced) -> Traced:  # noqa: ANN401 - any array
+    """Return the entries that an index (†), known in the run only, names along the first axis, (†, *)."""
+    table = as_traced(array)
+    rest = table.shape[1:]
+    width = int(np.prod(rest))
+    begin = casadi.vec(casadi.repmat(width * index.flat().T, width, 1))
+    along = np.tile(np.arange(width, dtype=np.float64), index.size)
+    return Traced.of(table.flat().nz[begin + casadi.DM(along)], (*index.shape, *rest), table.kind)
+
+
+def joined(arrays: Sequence[Any], arrange: Callable[[list[Places]], Places]) -> Traced:
+    """Return arrays as one: `arrange` puts the tables of their places together as numpy would the arrays."""
+    parts = [as_traced(array) for array in arrays]
+    ends = np.cumsum([0, *(part.size for part in parts)])
+    tables = [first + np.arange(part.size).reshape(part.shape) for first, part in zip(ends, parts, strict=False)]
+    kind = max((part.kind for part in parts), key="bif".index)
+    content = casadi.vertcat(*(part.flat() for part in parts))
+    return Traced(Buffer(content), arrange(tables), kind)
+
+
+LARGEST = float(np.finfo(np.float64).max)
+
+
+def _rounded(x: Expression) -> Expression:
+    """Return the nearest whole number; of two the even one."""
+    nearest = casadi.floor(x + 0.5)
+    tie = casadi.logic_and(nearest - x == 0.5, casadi.fmod(nearest, 2.0) != 0.0)
+    return nearest - tie
+
+
+def _remainder(x: Expression, y: Expression) -> Expression:
+    return x - y * casadi.floor(x / y)
+
+
+ARITHMETIC: Mapping[str, Operation] = {
+    "add": lambda x, y: x + y, "subtract": lambda x, y: x - y, "multiply": lambda x, y: x * y,
+    "divide": lambda x, y: x / y, "power": lambda x, y: x**y, "negative": lambda x: -x, "positive": lambda x: x,
+    "absolute": casadi.fabs, "fabs": casadi.fabs, "square": lambda x: x * x, "sqrt": casadi.sqrt, "exp": casadi.exp,
+    "expm1": casadi.expm1, "log": casadi.log, "log1p": casadi.log1p, "sin": casadi.sin, "cos": casadi.cos,
+    "tan": casadi.tan, "arcsin": casadi.asin, "arccos": casadi.acos, "arctan": casadi.atan, "arctan2": casadi.atan2,
+    "sinh": casadi.sinh, "cosh": casadi.cosh, "tanh": casadi.tanh, "hypot": casadi.hypot, "sign": casadi.sign,
+    "copysign": casadi.copysign, "floor": casadi.floor, "ceil": casadi.ceil, "rint": _rounded,
+    "maximum": casadi.fmax, "minimum": casadi.fmin, "remainder": _remainder,
+    "floor_divide": lambda x, y: casadi.floor(x / y), "reciprocal": lambda x: 1.0 / x,
+}  # fmt: skip
+COMPARISONS: Mapping[str, Operation] = {
+    "less": lambda x, y: x < y, "less_equal": lambda x, y: x <= y, "greater": lambda x, y: x > y,
+    "greater_equal": lambda x, y: x >= y, "equal": lambda x, y: x == y, "not_equal": lambda x, y: x != y,
+    "logical_and": casadi.logic_and, "logical_or": casadi.logic_or, "logical_not": casadi.logic_not,
+    "isfinite": lambda x: casadi.fabs(x) <= LARGEST,
+    "isnan": lambda x: casadi.logic_not(casadi.fabs(x) <= np.inf),
+}  # fmt: skip
+OF_TRUTH: Mapping[str, str] = {"bitwise_and": "logical_and", "bitwise_or": "logical_or", "invert": "logical_not"}
+FROM_TRUTH = {"add": 0.0, "multiply": 1.0, "maximum": -np.inf, "minimum": np.inf, "logical_or": 0.0, "logical_and": 1.0}
+
+
+def _carry_out(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Carry out a ufunc, or a reduction by one, with at least one array of expressions.
+
+    Raises:
+        NotTraceable: it has no expression.
+    """
+    options = dict(options)
+    outputs = options.pop("out", None)
+    options.pop("dtype", None)
+    if all(not isinstance(each, Traced) or each.constant for each in inputs):
+        numbers = [each.numbers() if isinstance(each, Traced) else each for each in inputs]
+        result = getattr(ufunc, method)(*numbers, **_plain_options(options, outputs))
+    elif method == "__call__":
+        result = _called(ufunc, inputs, options, outputs)
+    elif method == "reduce":
+        result = reduced(ufunc.__name__, inputs[0], **options)
+    else:
+        raise NotTraceable(f"it calls numpy.{ufunc.__name__}.{method}, which has no exported form")
+    if outputs is None:
+        return result
+    if not isinstance(outputs[0], Traced):
+        raise NotTraceable(f"numpy.{ufunc.__name__} writes to an array of numbers")
+    outputs[0][...] = result
+    return outputs[0]
+
+
+def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]:  # noqa: ANN401 - as numpy's
+    """Return the options of a ufunc of numbers; where it writes only to some entries, those before are numbers too."""
+    plain = {name: value.numbers() if isinstance(value, Traced) else value for name, value in options.items()}
+    if "where" in plain and outputs is not None:
+        plain["out"] = np.array(outputs[0].numbers())
+    return plain
+
+
+def _called(ufunc: np.ufunc, inputs: Sequence[Any], options: Mapping[str, Any], outputs: Any) -> Traced:  # noqa: ANN401
+    name = ufunc.__name__
+    if name in PRODUCTS:
+        return PRODUCTS[name](*map(as_traced, inputs))
+    result = elementwise(name, *inputs)
+    chosen = options.get("where", True)
+    return result if chosen is True else choose(chosen, result, outputs[0])
+
+
+def elementwise(name: str, *inputs: Any) -> Traced:  # noqa: ANN401 - anything array-like
+    """Return a ufunc of its name, entry by entry."""
+    arrays = [as_traced(each) for each in inputs]
+    if name in OF_TRUTH and all(each.kind == "b" for each in arrays):
+        name = OF_TRUTH[name]
+    if name in COMPARISONS:
+        return mapped(COMPARISONS[name], arrays, "b")
+    if name not in ARITHMETIC:
+        raise NotTraceable(f"it calls numpy.{name}, which has no exported form")
+    whole = all(each.kind != "f" for each in arrays) and name != "divide"
+    return mapped(ARITHMETIC[name], arrays, "i" if whole else "f")
+
+
+def mapped(operation: Operation, arrays: Sequence[Traced], kind: str) -> Traced:
+    """Return an operation, entry by entry, of arrays that are broadcast against each other."""
+    shape = np.broadcast_shapes(*(each.shape for each in arrays))
+    size = int(np.prod(shape))
+    if size == 0:
+        return Traced.of(casadi.MX(0, 1), shape, kind)
+    parts = [each.flat() if each.size == 1 else spread(each, shape).flat() for each in arrays]
+    result = operation(*parts)
+    if result.numel() != size:
+        result = casadi.repmat(result, size, 1)
+    return Traced.of(result, shape, kind)
+
+
+def choose(chosen: Any, one: Any, other: Any) -> Traced:  # noqa: ANN401 - anything array-like
+    """Return `one` where chosen, else `other`."""
+    arrays = [as_traced(each) for each in (chosen, one, other)]
+    kind = max((each.kind for each in arrays[1:]), key="bif".index)
+    return mapped(casadi.if_else, arrays, kind)
+
+
+def reduced(name: str, array: Any, axis: Any = 0, keepdims: bool = False, initial: Any = None) -> Traced:  # noqa: ANN401
+    """Return the reduction by a ufunc of its name over axes, None for all."""
+    if name in OF_TRUTH:
+        name = OF_TRUTH[name]
+    if name not in FROM_TRUTH:
+        raise NotTraceable(f"it calls numpy.{name}.reduce, which has no exported form")
+    table = as_traced(array)
+    axes = tuple(range(table.ndim)) if axis is None else (axis,) if isinstance(axis, int) else tuple(axis)
+    axes = tuple(each % table.ndim for each in axes)
+    kept = tuple(size for i, size in enumerate(table.shape) if i not in axes)
+    length = int(np.prod([table.shape[i] for i in axes]))
+    count = int(np.prod(kept))
+    last = table.arranged(np.moveaxis(table.places, axes, range(-len(axes), 0)).reshape(count, length))
+    kind = "b" if name.startswith("logical") else "i" if table.kind in "bi" else "f"
+    operation = ARITHMETIC.get(name) or COMPARISONS[name]
+    result: Expression
+    if name == "add" and length:
+        result = casadi.vec(casadi.sum1(casadi.reshape(last.flat(), length, count)))
+    else:
+        result = last[:, 0].flat() if length else casadi.MX(casadi.DM(np.full(count, FROM_TRUTH[name])))
+        for j in range(1, length):
+            result = operation(result, last[:, j].flat())
+    if name.startswith("logical") and length == 1:
+        result = result != 0.0
+    if initial is not None:
+        result = operation(result, float(initial))
+    shape = tuple(1 if i in axes else size for i, size in enumerate(table.shape)) if keepdims else kept
+    return Traced.of(result, shape, kind)
+
+
+def matmul(a: Traced, b: Traced) -> Traced:
+    """Return a @ b, (..., i, j); vectors as numpy has them."""
+    if a.ndim == 1:
+        return matmul(a[None, :], b)[..., 0, :]
+    if b.ndim == 1:
+        return matmul(a, b[:, None])[..., 0]
+    (i, k), j = a.shape[-2:], b.shape[-1]
+    if b.shape[-2] != k:
+        raise ValueError(f"matmul: {a.shape} does not fit {b.shape}")
+    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    left, right = spread(a, (*lead, i, k)).reshape(-1, i, k), spread(b, (*lead, k, j)).reshape(-1, k, j)
+    if 0 in (i, j, k) or len(left) == 0:
+        return Traced.of(casadi.MX.zeros(int(np.prod((*lead, i, j))), 1), (*lead, i, j))
+    # Row-major entries are the column-major ones of the transpose, and (A B)ᵀ = Bᵀ Aᵀ.
+    products = [
+        casadi.vec(casadi.mtimes(casadi.reshape(B.flat(), j, k), casadi.reshape(A.flat(), k, i)))
+        for A, B in zip(left, right, strict=True)
+    ]
+    return Traced.of(casadi.vertcat(*products), (*lead, i, j))
+
+
+def vecdot(a: Traced, b: Traced) -> Traced:
+    """Return a·b over the last axis, (...)."""
+    if a.ndim == 1 == b.ndim:
+        return Traced.of(casadi.dot(a.flat(), b.flat()), ())
+    return reduced("add", elementwise("multiply", a, b), axis=-1)
+
+
+PRODUCTS: Mapping[str, Callable[[Traced, Traced], Traced]] = {
+    "matmul": matmul,
+    "vecdot": vecdot,
+    "matvec": lambda A, x: matmul(A, x[..., None])[..., 0],
+    "vecmat": lambda x, A: matmul(x[..., None, :], A)[..., 0, :],
+}

@@ -1,0 +1,209 @@
+"""All figures of a results folder, from its tables alone."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from servobench.harness.analysis.comparison import with_places
+from servobench.harness.batch import results
+from servobench.harness.pictures.measures import ACCURACY, EFFORT, SMOOTHNESS, draw_measures, draw_step_times
+from servobench.harness.pictures.paths import draw_paths
+from servobench.harness.pictures.responses import (
+    draw_features,
+    draw_jacobians,
+    draw_joint_motion,
+    draw_moves,
+    draw_tracking,
+)
+from servobench.harness.pictures.style import (
+    NARROW,
+    TEXT,
+    WIDE,
+    Layout,
+    Styles,
+    divisions,
+    figure_style,
+    method_styles,
+    save_figure,
+)
+from servobench.harness.pictures.tracks import Ensembles, Group, load_ensembles, load_groups, shown_until
+
+FOLDER = "figures"
+LETTERS = 15.0  # of a title in an inch
+MOVES_A_FIGURE = 4
+TASKS_A_FIGURE = 4
+BLOCKS_A_FIGURE = 4
+HEADINGS = {
+    "errors": "Error of moves over time",
+    "features": "Measured features of moves",
+    "paths": "True paths of moves, to scale",
+    "tracking": "Error along the curve, and measured features",
+    "tracking_path": "Desired and true path, to scale",
+    "jacobian": "Error of the estimated Jacobian",
+    "settling": "When each run settled, and with what error it ended",
+    "effort": "Control effort and saturation of each run",
+    "smoothness": "How smoothly each run drives the joints",
+    "step_times": "Time of a controller's step",
+    "joint_speeds": "What is commanded of the joints",
+}
+OVER_SEEDS = ("errors", "jacobian", "tracking")  # kinds that show a median and a band
+OF_FIRST_SEED = ("features", "paths", "tracking_path", "joint_speeds")
+T = TypeVar("T")
+
+
+class NamedFigure(NamedTuple):
+    """A figure and what it is called."""
+
+    kind: str  # what it shows, one of HEADINGS
+    stem: str  # name of its file without ending
+    title: str  # the heading and what its runs have in common
+    tasks: tuple[str, ...]  # that it shows
+    figure: Figure
+
+
+def draw_figures(folder: Path) -> list[Path]:
+    """Draw the runs of each plant and mismatch into the folder's `figures`; return the files, PNG and PDF.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    return [
+        path for named in folder_figures(folder) for path in save_figure(named.figure, folder / FOLDER / named.stem)
+    ]
+
+
+def folder_figures(folder: Path) -> Iterator[NamedFigure]:
+    """Yield every figure of a results folder, one in memory at a time.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    for place, plan in _plans(folder, moves=MOVES_A_FIGURE, tasks=TASKS_A_FIGURE, blocks=BLOCKS_A_FIGURE):
+        if (named := _carry_out(place, plan, WIDE)) is not None:
+            yield named
+
+
+def page_figures(folder: Path, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
+    """Yield figures of a results folder for a page, of each the wide and the narrow form; of tasks, one by one.
+
+    Args:
+        folder: the results folder.
+        kinds: those that are wanted, keys of `HEADINGS`.
+
+    Raises:
+        ConfigurationError: not a results folder.
+    """
+    for place, plan in _plans(folder, moves=1, tasks=1, blocks=1):
+        if plan.kind in kinds:
+            wide, narrow = (_carry_out(place, plan, layout) for layout in (WIDE, NARROW))
+            if wide is not None and narrow is not None:
+                yield wide, narrow
+
+
+class _Plan(NamedTuple):
+    """A figure that can be drawn."""
+
+    kind: str
+    what: str  # of the tasks the group has, where they need more than one figure
+    tasks: tuple[str, ...]
+    draw: Callable[[Layout], Figure | None]
+
+
+class _Place(NamedTuple):
+    """Where the runs of a figure were made."""
+
+    group: Group
+    runs: pd.DataFrame
+
+
+def _plans(folder: Path, *, moves: int, tasks: int, blocks: int) -> Iterator[tuple[_Place, _Plan]]:
+    """Yield the figures of a folder, which at most so many moves, tasks and blocks of paths share."""
+    runs = with_places(results.load_runs(folder))
+    styles = method_styles(runs["controller"].tolist())
+    for group in load_groups(folder):
+        chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
+        ensembles = load_ensembles(folder, chosen)
+        for plan in (
+            *_move_plans(group, ensembles, styles, moves, blocks),
+            *_curve_plans(group, ensembles, styles),
+            *_cost_plans(group, chosen, ensembles, styles, tasks),
+        ):
+            yield _Place(group, chosen), plan
+
+
+def _carry_out(place: _Place, plan: _Plan, layout: Layout) -> NamedFigure | None:
+    """Return a figure with its name and heading."""
+    with figure_style(TEXT):
+        figure = plan.draw(layout)
+    if figure is None:
+        return None
+    kind, what, plant, mismatch = plan.kind, plan.what, place.group.plant, place.group.mismatch
+    details = ", ".join(filter(None, (what, f"{plant}, mismatch {mismatch}", _sample(kind, place.group, place.runs))))
+    wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
+    figure.suptitle(f"{HEADINGS[kind]}\n{wrapped}", fontsize=TEXT + 1.0)
+    words = "_".join(part for part in (kind, what, plant, mismatch) if part)
+    stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
+    return NamedFigure(kind, stem, f"{HEADINGS[kind]}: {details}", plan.tasks, figure)
+
+
+def _sample(kind: str, group: Group, runs: pd.DataFrame) -> str:
+    """Return words for the seeds that a figure shows, and how."""
+    seeds = runs["seed"].nunique()
+    if kind in OF_FIRST_SEED or seeds == 1:
+        return f"seed {group.seed}"
+    if kind not in OVER_SEEDS:
+        return f"{seeds} seeds"
+    words = f"median of {seeds} seeds, band: the middle 80 %"
+    return f"{words}; features of seed {group.seed}" if kind == "tracking" else words
+
+
+def _move_plans(
+    group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int, blocks: int
+) -> Iterator[_Plan]:
+    moves = group.select(point_to_point=True)
+    for what, part in _parts(moves, size):
+        own = {task: ensembles[task] for task in part}
+        until = {task: shown_until(own[task]) for task in part}
+        yield _Plan("errors", what, tuple(part), partial(draw_moves, own, styles))
+        yield _Plan("features", what, tuple(part), partial(draw_features, part, until, styles))
+    heads = divisions(name for tracks in moves.values() for name in tracks)
+    for what, part in _parts(moves, max(1, blocks // len(heads))):
+        yield _Plan("paths", what, tuple(part), partial(draw_paths, part, styles))
+
+
+def _curve_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles) -> Iterator[_Plan]:
+    for task, tracks in group.select(point_to_point=False).items():
+        yield _Plan("tracking", task, (task,), partial(draw_tracking, ensembles[task], tracks, styles))
+        yield _Plan("tracking_path", task, (task,), partial(draw_paths, {task: tracks}, styles))
+
+
+def _cost_plans(
+    group: Group, runs: pd.DataFrame, ensembles: Mapping[str, Ensembles], styles: Styles, size: int
+) -> Iterator[_Plan]:
+    everything = tuple(group.tasks)
+    yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
+    several = len(runs) > 1  # of a single run, its row in the table of runs says it all
+    for what, measured in _parts(dict.fromkeys(runs["task"] if several else ()), size):
+        chosen = runs[runs["task"].isin(list(measured))]
+        for kind, columns in (("settling", ACCURACY), ("effort", EFFORT), ("smoothness", SMOOTHNESS)):
+            yield _Plan(kind, what, tuple(measured), partial(draw_measures, chosen, columns, styles))
+    yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
+    for task, tracks in group.tasks.items():
+        until = shown_until(ensembles[task])
+        yield _Plan("joint_speeds", task, (task,), partial(draw_joint_motion, tracks, until))
+
+
+def _parts(tasks: Mapping[str, T], size: int) -> Iterator[tuple[str, dict[str, T]]]:
+    """Yield tasks in parts for a figure each, and words for the part where there are several."""
+    names = list(tasks)
+    for first in range(0, len(names), size):
+        part = names[first : first + size]
+        yield "" if len(names) <= size else "-".join(part), {name: tasks[name] for name in part}

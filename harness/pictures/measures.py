@@ -1,0 +1,398 @@
+"""Figures of metrics: of each run, of computing times, and of settled runs over a condition that varies."""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.measures import MEASURES
+from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
+from servobench.harness.pictures.style import (
+    LETTER,
+    TEXT,
+    WIDE,
+    Layout,
+    MethodStyle,
+    Styles,
+    add_legend,
+    label_rows,
+    panel_grid,
+)
+from servobench.harness.pictures.tracks import Ensembles
+from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.checks import FloatArray
+
+SETTLING, NEVER = "settling_time_s", 1.3  # and where a run without a value stands, over the largest value
+ACCURACY: Final = (SETTLING, "rms_error_evaluated")
+EFFORT: Final = ("control_effort_rad", "saturation_fraction")
+SMOOTHNESS: Final = ("joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3", "command_switches")
+PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
+LINE: Final = 0.165  # [in] a controller
+WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
+MAX_RANGE: Final = 1e6  # largest over smallest value that an axis shows
+NAME_LETTERS: Final = 20  # of a controller's name in a line beside an axis, for each column of a layout
+LETTERS: Final = 16.0  # of a label in an inch
+NUMBERS: Final = 0.25  # [in] beside the names
+LEAST_ROWS: Final = 4  # controllers for which a panel has room
+SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
+UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
+LINE_LETTERS: Final = 30  # of a line of text within a panel
+Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
+SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
+SWEPT = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
+
+
+class _Dots(NamedTuple):
+    """A measure of the table of runs as it is drawn."""
+
+    column: str
+    label: str
+    factor: float
+
+
+def draw_measures(runs: pd.DataFrame, columns: Sequence[str], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+    """Draw measures of every run, a column a task, a row a measure, a line a controller; None without values.
+
+    The measures of a single task are beside each other, on a narrow sheet below each other.
+
+    A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
+
+    Args:
+        runs: of one plant and mismatch.
+        columns: of the table of runs; those without any value are left out.
+        styles: controller -> style.
+        layout: of the figure; a narrow one is for a single task.
+    """
+    rows = [_dots(name, runs) for name in columns if name in runs and runs[name].notna().any()]
+    if not rows:
+        return None
+    alone = runs["task"].nunique() == 1
+    figure = _draw_one_task(runs, rows, styles, layout) if alone else _draw_each_task(runs, rows, styles)
+    notes = ["bar: median"] if runs.groupby(["task", "controller"]).size().max() > 1 else []
+    notes += ["hollow: the run ended early"] if (runs["status"] != COMPLETED).any() else []
+    if rows[0].column == SETTLING and _unsettled(runs).any():
+        notes.append("at the right edge and counted: never settled")
+    if notes:
+        words = textwrap.fill("; ".join(notes), round(LETTERS * layout.width))
+        figure.supxlabel(words, fontsize=TEXT - 0.5)
+    return figure
+
+
+def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -> Figure:
+    """Draw measures of several tasks: a row a measure, a column a task."""
+    tasks, names = runs["task"].unique().tolist(), runs["controller"].unique().tolist()
+    height = 0.55 + LINE * max(LEAST_ROWS, len(names))
+    figure = Figure(figsize=(WIDE.width, 0.65 + len(rows) * height), layout="constrained")
+    parts = np.atleast_1d(np.array(figure.subfigures(len(rows), 1), dtype=object))
+    for part, row in zip(parts, rows, strict=True):
+        panels = part.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
+        for axes, task in zip(panels, tasks, strict=True):
+            _draw_dots(axes, runs[runs["task"] == task], names, styles, row)
+            axes.set_title(task)
+            _name_rows(axes, names, WIDE)
+        part.supxlabel(row.label, fontsize=TEXT)
+    return figure
+
+
+def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, layout: Layout) -> Figure:
+    """Draw measures of one task beside each other, as many as the layout has columns."""
+    names = runs["controller"].unique().tolist()
+    rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
+    columns = min(layout.columns, len(rows))
+    lines = -(-len(rows) // columns)
+    beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
+    letters = round((layout.width - beside) / columns / LETTER)
+    words = [textwrap.fill(row.label, letters) for row in rows]
+    height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
+    figure = Figure(figsize=(layout.width, 0.35 + lines * height), layout="constrained")
+    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
+    for axes, row, label in zip(panels, rows, words, strict=False):
+        _draw_dots(axes, runs, names, styles, row)
+        _name_rows(axes, names, layout)
+        axes.set_xlabel(label)
+    for axes in panels[len(rows) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _name_rows(axes: Axes, names: Sequence[str], layout: Layout) -> None:
+    axes.set_yticks(range(len(names)), [_short_name(name, layout) for name in names])
+    axes.set_ylim(len(names) - 0.4, -0.6)
+
+
+def _short_name(name: str, layout: Layout) -> str:
+    """Return the end of a name, which says more than its begin, in as many letters as there is room for."""
+    letters = NAME_LETTERS * min(2, layout.columns)
+    return name if len(name) <= letters else f"…{name[1 - letters :]}"
+
+
+def draw_step_times(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+    """Draw how long a controller's step takes: 1 to 99 % as a line, the middle half as a bar; None without values.
+
+    Steps that take longer than the control period are marked and, on a wide sheet, counted.
+    """
+    names = list(dict.fromkeys(name for ensembles in tasks.values() for name in ensembles))
+    times = {name: 1e-3 * np.concatenate([e[name].step_time for e in tasks.values() if name in e]) for name in names}
+    known = {name: values for name, values in times.items() if len(values)}
+    if not known:
+        return None
+    periods = [ensemble.period for ensembles in tasks.values() for ensemble in ensembles.values()]
+    limit = 1e3 * max([period for period in periods if math.isfinite(period)], default=math.nan)
+    inside = ConstrainedLayoutEngine(rect=(0.0, 0.0, 0.98, 1.0))  # fine pictures have slightly wider bold letters
+    figure = Figure(figsize=(layout.width, 1.15 + 0.24 * max(3, len(known))), layout=inside)
+    axes = figure.add_subplot()
+    top = 1.4 * max(float(np.max(values)) for values in known.values())
+    for i, (name, values) in enumerate(known.items()):
+        _draw_times(axes, i, values, limit, styles[name])
+        if layout is WIDE:
+            _write_times(axes, i, values, limit)
+    if layout is WIDE:
+        axes.annotate("median, 99 %, largest", (1.01, 1.0), xycoords="axes fraction", va="bottom",
+                      fontsize=TEXT - 0.5, xytext=(0, 2), textcoords="offset points")  # fmt: skip
+    if math.isfinite(limit):
+        top = max(top, 1.6 * limit)
+        axes.axvline(limit, color="black", linestyle=(0, (2, 2)), linewidth=1.0)
+        axes.axvspan(limit, top, facecolor="0.93", edgecolor="0.75", hatch="////", linewidth=0.0, zorder=0)
+        axes.annotate(f"control period, {limit:g} ms", (limit, 1.0), xycoords=("data", "axes fraction"),
+                      ha="right", va="bottom", fontsize=TEXT - 0.5, xytext=(0, 2),
+                      textcoords="offset points")  # fmt: skip
+    axes.set(xscale="log", xlabel="time of a controller's step [ms]" if layout is WIDE else "time of a step [ms]")
+    axes.set_xlim(right=top)
+    _name_rows(axes, list(known), layout)
+    axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    return figure
+
+
+def _draw_times(axes: Axes, i: int, values: FloatArray, limit: float, style: MethodStyle) -> None:
+    low, first, middle, third, high = np.percentile(values, PERCENTILES)
+    axes.plot([low, high], [i, i], color=style.colour, linewidth=1.2, marker="|", markersize=7)
+    axes.plot([first, third], [i, i], color=style.colour, linewidth=6.0, solid_capstyle="butt", alpha=0.45)
+    axes.plot(middle, i, color=style.colour, marker=style.marker or "o", markersize=6.0, markeredgecolor="black",
+              markerfacecolor=style.face)  # fmt: skip
+    if values.max() > limit:
+        axes.plot(values.max(), i, color="black", marker="X", markersize=6.5, linestyle="")
+
+
+def _write_times(axes: Axes, i: int, values: FloatArray, limit: float) -> None:
+    middle, high = np.percentile(values, (50.0, 99.0))
+    late = int(np.count_nonzero(values > limit))
+    words = f"{_short(middle)}, {_short(high)}, {_short(values.max())}"
+    if late:
+        words += f"\n{late} of {len(values)} too slow"
+    axes.annotate(words, (1.01, i), xycoords=("axes fraction", "data"), va="center", fontsize=TEXT - 0.5,
+                  fontweight="bold" if late else None, linespacing=1.0)  # fmt: skip
+
+
+def _short(milliseconds: float) -> str:
+    """Return a time with its unit and at most three digits."""
+    return f"{1000.0 * milliseconds:.0f} µs" if milliseconds < 0.9995 else f"{milliseconds:.3g} ms"
+
+
+def _dots(column: str, runs: pd.DataFrame) -> _Dots:
+    unit, factor = MEASURES[column].scale(runs)
+    name = MEASURES[column].name
+    if column == "rms_error_evaluated":
+        name = "RMS error of the judged part"
+        name += ": end of a move, last lap of a curve" if runs["task"].nunique() > 1 else ""
+    if column == "command_switches":
+        name, unit = "sign switches of large commands", "count"
+    return _Dots(column, f"{name} [{unit}]", factor)
+
+
+def _unsettled(runs: pd.DataFrame) -> pd.Series[bool]:
+    """Return which moves never settled."""
+    moves = runs.reindex(columns=["task_kind"])["task_kind"] != "curve"
+    return moves & settling_times(runs).isna()
+
+
+def _applies(runs: pd.DataFrame, row: _Dots) -> bool:
+    """Return whether a measure says something about a task: a curve has no settling time."""
+    moves = runs.reindex(columns=["task_kind"])["task_kind"] != "curve"
+    return bool(runs[row.column].notna().any()) and (row.column != SETTLING or bool(moves.any()))
+
+
+def _draw_dots(axes: Axes, runs: pd.DataFrame, names: list[str], styles: Styles, row: _Dots) -> None:
+    """Draw a measure of the runs of one task."""
+    values = row.factor * runs[row.column].astype(float)
+    floor = values.max() / MAX_RANGE
+    values = values.where(~((values > 0.0) & (values < floor)), floor)
+    never = _unsettled(runs) if row.column == SETTLING else pd.Series(False, runs.index)
+    values = values.where(~never)
+    if row.column == SETTLING:
+        values = values.where(runs.reindex(columns=["task_kind"])["task_kind"] != "curve")
+    largest, least = float(values.max()), float(values.min())
+    wide = least > 0.0 and largest / least > WIDE_RANGE
+    edge = largest * (NEVER if never.any() else 1.06) if largest > 0.0 else 1.0
+    if wide:
+        edge = largest * (largest / least) ** 0.08
+    if values.isna().all() and not never.any():
+        axes.tick_params(axis="x", bottom=False, labelbottom=False)
+        axes.text(0.5, 0.5, "does not apply", transform=axes.transAxes, ha="center", va="center", color="0.4",
+                  fontsize=TEXT - 1.0)  # fmt: skip
+    for i, name in enumerate(names):
+        own, style = runs["controller"] == name, styles[name]
+        for completed in (True, False):
+            chosen = own & ((runs["status"] == COMPLETED) == completed)
+            points = values.where(~never, edge)[chosen].dropna().to_numpy()
+            if len(points) == 0:  # an empty line that is not clipped would count as a mark at the origin
+                continue
+            face = style.colour if completed else "none"
+            axes.plot(points, np.full(len(points), i), color=style.colour, marker=style.marker or "o", linestyle="",
+                      markersize=4.5, markerfacecolor=face, markeredgewidth=0.7, alpha=0.55, clip_on=False)  # fmt: skip
+        middle = values[own].fillna(math.inf).median() if row.column == SETTLING else values[own].median()
+        if own.sum() > 1 and math.isfinite(middle):
+            axes.plot(middle, i, color="black", marker="|", markersize=9, markeredgewidth=1.6, linestyle="")
+        if never[own].any():
+            axes.annotate(f"{never[own].sum()} of {own.sum()}", (edge, i), ha="left", va="center", xytext=(5, 0),
+                          textcoords="offset points", fontsize=TEXT - 2.0)  # fmt: skip
+    if wide:
+        axes.set_xscale("log")
+        axes.set_xlim(least / (edge / largest), edge)
+        axes.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    else:
+        axes.set_xlim(0.0, edge)
+        axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
+
+
+def draw_places(
+    axes: Axes,
+    places: Sequence[float],
+    values: Mapping[str, Sequence[Estimate]],
+    styles: Mapping[str, MethodStyle],
+) -> None:
+    """Draw an estimate with its interval for each method at each place; the methods stand beside each other.
+
+    Args:
+        axes: where.
+        places: abscissae, ascending; marks are spread over a part of the first distance.
+        values: method -> an estimate a place; an infinite one is left out, an infinite end leaves the picture.
+        styles: method -> style.
+    """
+    width = SPREAD * (places[1] - places[0] if len(places) > 1 else 1.0)
+    for k, (name, estimates) in enumerate(values.items()):
+        style = styles[name]
+        shift = width * ((k + 0.5) / len(values) - 0.5)
+        x = np.array(places, dtype=float) + shift
+        y, low, high = (np.array([getattr(e, part) for e in estimates]) for part in ("value", "low", "high"))
+        known = np.isfinite(y)
+        if known.any():
+            y, top = y[known], float(np.max(y[known]))
+            below = y - np.where(np.isfinite(low), low, np.nan)[known]
+            above = np.where(np.isinf(high[known]), 10.0 * (1.0 + top), high[known]) - y  # out of the picture
+            axes.errorbar(
+                x[known], y, yerr=np.nan_to_num(np.vstack([below, above])).clip(0.0), color=style.colour,
+                linestyle="none", marker=style.marker or "_", markersize=4.5, linewidth=1.2,
+                elinewidth=1.0, capsize=2.0, label=name,
+            )  # fmt: skip
+
+
+def draw_curves(
+    axes: Axes, places: Sequence[float], values: Curves, styles: Mapping[str, MethodStyle], top: float
+) -> None:
+    """Draw an estimate over a quantity, a line a method with its interval as a band; abscissae are to scale.
+
+    Methods with the same curve share one line, and the panel names them.
+
+    Args:
+        axes: where.
+        places: abscissae, ascending.
+        values: method -> an estimate a place; an infinite one is a mark at the upper edge.
+        styles: method -> style.
+        top: upper edge of the panel.
+    """
+    x, shared = np.array(places, dtype=float), []
+    groups = same_curves(values)
+    for names in groups:
+        first, style = names[0], styles[names[0]]
+        y, low, high = (np.array([getattr(e, part) for e in values[first]]) for part in ("value", "low", "high"))
+        known = ~np.isnan(y)
+        if not known.any():
+            continue
+        edges = np.nan_to_num(np.vstack([np.where(np.isnan(low), y, low), high])[:, known], posinf=1.05 * top)
+        axes.fill_between(x[known], *edges, color=style.colour, alpha=0.12, linewidth=0.0)
+        _draw_line(axes, x[known], y[known], style, first, top)
+        for name in names[1:]:
+            axes.plot([], [], label=name, **styles[name].line_arguments(1))
+        if len(names) > 1:
+            shared.append(("all methods" if len(groups) == 1 else ", ".join(names), y))
+    for names_text, y in shared:
+        constant = f", {y[0]:g} throughout" if (y == y[0]).all() else ""
+        words = textwrap.fill(f"one line{constant}: {names_text}", LINE_LETTERS)
+        upper = float(np.nanmean(np.minimum(y, top))) < top / 2.0
+        level, side = (0.96, "top") if upper else (0.04, "bottom")
+        axes.text(0.03, level, words, transform=axes.transAxes, va=side, fontsize=TEXT - 2.0,
+                  bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.0})  # fmt: skip
+    axes.set_ylim(-0.02 * top, top)
+
+
+def same_curves(values: Curves) -> list[list[str]]:
+    """Return the methods, those with the same values and intervals everywhere together."""
+    groups: dict[str, list[str]] = {}
+    for name, estimates in values.items():
+        groups.setdefault(repr([(e.value, e.low, e.high) for e in estimates]), []).append(name)
+    return list(groups.values())
+
+
+def _draw_line(axes: Axes, x: FloatArray, y: FloatArray, style: MethodStyle, name: str, top: float) -> None:
+    look: dict[str, Any] = {"color": style.colour, "markerfacecolor": style.face, "markersize": 4.5, "linewidth": 1.2}
+    beyond = ~np.isfinite(y)
+    shown = np.where(beyond, UPPER * top, y)
+    axes.plot(x, shown, label=name, linestyle=style.line, marker=style.marker, markevery=~beyond, **look)
+    if beyond.any():
+        axes.plot(x[beyond], np.full(np.count_nonzero(beyond), UPPER * top), linestyle="none", marker=6,
+                  **(look | {"markersize": 6.5}))  # fmt: skip
+
+
+def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -> Figure | None:
+    """Draw the share of settled runs with its 95 % Wilson interval over each condition that varies, if one does."""
+    sweeps = _sweeps(runs)
+    if not sweeps:
+        return None
+    figure, panels = panel_grid(len(sweeps), 2.5, layout)
+    for axes, (label, part) in zip(panels, sweeps.items(), strict=True):
+        shares = {key: settled_share(own) for key, own in part.groupby(["controller", "size"])}
+        names, sizes = part["controller"].unique(), sorted(part["size"].unique())
+        values = {name: [shares.get((name, size), NO_ESTIMATE) for size in sizes] for name in names}
+        draw_curves(axes, sizes, values, styles, top=104.0)
+        axes.set_xlabel(label)
+    label_rows(panels, "settled runs [%]")
+    figure.suptitle("How many moves settle over what is varied; bands are 95 % intervals", fontsize=TEXT + 1.0)
+    add_legend(figure, panels)
+    return figure
+
+
+def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return for each condition with at least two sizes the runs concerned, with the column `size`.
+
+    Where a sweep says along which axis a run stands, the axes are its own, and the numbers that vary at one place of
+    an axis; else the mismatches are read, and runs without mismatch have size 0 on each axis.
+    """
+    none = runs.head(0)
+    places = [runs] if "axis" not in runs else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
+    sweeps = {
+        label: runs.assign(size=factor * runs[name].astype(float))
+        for name, (label, factor) in SWEPT.items()
+        if name in runs and any(own[name].nunique() > 1 for own in places)
+    }
+    if "axis" not in runs or (runs["axis"].fillna("") == "").all():
+        none = runs[runs["mismatch"] == "none"].assign(size=0.0)
+        runs = runs.assign(**runs["mismatch"].str.extract(SIZED_AXIS))
+    along = runs[runs["axis"].fillna("") != ""]
+    along = along.assign(size=along["magnitude"].astype(float))
+    for (axis, unit), group in along.groupby(["axis", "unit"], sort=False):
+        name = str(axis).replace("_", " ")
+        sweeps[f"{name} [{unit}]" if unit else name] = pd.concat([none, group]) if len(none) else group
+    known = {label: part.dropna(subset=["size"]) for label, part in sweeps.items()}
+    return {label: part for label, part in known.items() if part["size"].nunique() > 1}

@@ -1,0 +1,356 @@
+"""Figures over time: errors of moves and curves, estimated Jacobians, measured features and commanded joints.
+
+| figure of the paper | shows | here |
+|---|---|---|
+| 4 | errors of the point-to-point moves; the measured features | `draw_moves`, `draw_features` |
+| 5 | paths of these moves in space | `servobench.harness.pictures.paths` |
+| 6 | a tracked curve: error, desired and measured features | `draw_tracking` |
+| 7 | the tracked curve in space | `servobench.harness.pictures.paths` |
+| 8 | the arm at eight places on the circle | `servobench.harness.pictures.film` |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servobench.harness.pictures.style import (
+    BLACK,
+    BLUE,
+    CAMERA_MOVES,
+    DESIRED,
+    END_MARK,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SETTLED,
+    SKY,
+    TEXT,
+    VERMILION,
+    WIDE,
+    Layout,
+    Styles,
+    add_legend,
+    divisions,
+    plain_logarithms,
+)
+from servobench.harness.pictures.tracks import (
+    BAND,
+    WINDOW,
+    Ensemble,
+    Ensembles,
+    Track,
+    Tracks,
+    each,
+    label_of,
+    longest,
+    quantile,
+    shown_until,
+)
+from servobench.plant.contract.checks import FloatArray
+
+COLUMNS: Final = 2
+LINE: Final = 0.17  # [in] of the legend
+DrawPanel = Callable[[Axes, Ensembles, Styles], None]
+COMMAND: Final = "joint_velocity_command_"
+JOINTS: Final = (
+    (BLUE, "-"),
+    (VERMILION, (0, (4, 1))),
+    (GREEN, "-."),
+    (ORANGE, (0, (6, 1, 1, 1))),
+    (PURPLE, (0, (2, 1))),
+    (SKY, "-"),
+    (BLACK, ":"),
+)  # looks of joints in their order
+ROW: Final = 0.72  # [in] a controller
+QUANTITIES: Final = ("joint speed [rad/s]", "acceleration [rad/s²]", "jerk [rad/s³]")
+EXACT: Final = 1e-7  # [%] of an estimate that counts as the truth
+FLOOR: Final = 0.1  # settling bands: the least error that is told apart over time
+OUTSIDE: Final = 1e12  # of every picture
+MAX_ERROR: Final = 1e6  # [error unit] up to which an axis reaches
+
+
+def draw_moves(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure:
+    """Draw the error of each task over time: median and band over seeds, and where runs settled (figure 4).
+
+    With aids and as published are beside each other where there are both. The time ends when methods have settled.
+    """
+    figure, panels = _draw_tasks(tasks, styles, draw_error, layout)
+    low, high = error_limits([ensemble for ensembles in tasks.values() for ensemble in ensembles.values()])
+    if high > 0.0:
+        panels[0][0].set_ylim(low if low > 0.0 else None, high)
+    for axes, task in panels:
+        until, end = shown_until(tasks[task]), max(float(own.time[-1]) for own in tasks[task].values())
+        if until < end:
+            axes.set_xlim(-0.02 * until, until)
+            axes.set_xlabel(f"time [s]; the move lasts {end:.2g} s")
+    return figure
+
+
+def draw_jacobians(tasks: Mapping[str, Ensembles], styles: Styles, layout: Layout = WIDE) -> Figure | None:
+    """Draw how far the estimated Jacobian is from the true one, over seeds; None if no run knows it."""
+    known = {
+        task: {name: own for name, own in ensembles.items() if np.isfinite(own.jacobian_error).any()}
+        for task, ensembles in tasks.items()
+    }
+    known = {task: ensembles for task, ensembles in known.items() if ensembles}
+    return _draw_tasks(known, styles, draw_jacobian, layout)[0] if known else None
+
+
+def draw_features(
+    tasks: Mapping[str, Tracks], until: Mapping[str, float], styles: Styles, layout: Layout = WIDE
+) -> Figure:
+    """Draw a column for each task with each feature as it was measured in one run of each controller (figure 4).
+
+    Args:
+        tasks: task -> controller -> run.
+        until: task -> the time at which its column ends [s].
+        styles: controller -> style.
+        layout: of the figure; a narrow one is for a single task.
+    """
+    features = _features(tasks)
+    figure = Figure(figsize=(layout.width, 1.1 + 1.3 * len(features)), layout="constrained")
+    panels = figure.subplots(len(features), len(tasks), sharex="col", sharey="row", squeeze=False)
+    for column, (task, whole) in zip(panels.T, tasks.items(), strict=True):
+        tracks = each(Track.overview, whole)
+        for axes, feature in zip(column, features, strict=True):
+            draw_feature(axes, tracks, styles, feature)
+        column[0].set_title(task)
+        column[-1].set_xlabel("time [s]")
+        if until[task] < longest(tracks).time[-1]:
+            column[-1].set_xlim(-0.02 * until[task], until[task])
+    for axes in panels[:, 1:].ravel():
+        axes.set_ylabel("")
+    figure.align_ylabels(panels[:, 0])
+    add_legend(figure, panels.ravel())
+    return figure
+
+
+def draw_tracking(ensembles: Ensembles, tracks: Tracks, styles: Styles, layout: Layout = WIDE) -> Figure:
+    """Draw the error along a curve over seeds, and below it the measured features of one run (figure 6).
+
+    Of a long run, features are drawn at its end only. On a narrow sheet there are errors only.
+    """
+    if layout.columns < COLUMNS:
+        figure, drawn = _draw_tasks({"": ensembles}, styles, draw_error, layout)
+        for axes, _ in drawn:
+            axes.set_ylabel(f"{axes.get_ylabel()},\nRMS over {WINDOW:g} s")
+        return figure
+    features, long = _features({"": tracks}), any(track.long for track in tracks.values())
+    heads = divisions(ensembles)
+    figure = Figure(figsize=(layout.width, 3.1 + 1.15 * len(features)), layout="constrained")
+    panels = figure.subplots(
+        1 + len(features), len(heads), sharex=False if long else "col", sharey="row", squeeze=False,
+        height_ratios=[2.2, *[1.0] * len(features)],
+    )  # fmt: skip
+    closing = each(Track.closing, tracks)
+    for column, (head, names) in zip(panels.T, heads.items(), strict=True):
+        draw_error(column[0], {name: ensembles[name] for name in names}, styles)
+        column[0].set_title(head)
+        column[0].set_ylabel(f"{column[0].get_ylabel()},\nRMS over {WINDOW:g} s")
+        shown = {name: closing[name] for name in names if name in closing}
+        for axes, feature in zip(column[1:], features, strict=True):
+            if shown:
+                draw_feature(axes, shown, styles, feature)
+        column[-1].set_xlabel("time [s], the end of the run" if long else "time [s]")
+        if long:
+            column[0].set_xlabel("time [s]")
+    for axes in panels[:, 1:].ravel():
+        axes.set_ylabel("")
+    figure.align_ylabels(panels[:, 0])
+    add_legend(figure, panels.ravel())
+    return figure
+
+
+def _draw_tasks(
+    tasks: Mapping[str, Ensembles], styles: Styles, draw: DrawPanel, layout: Layout
+) -> tuple[Figure, list[tuple[Axes, str]]]:
+    """Draw a panel for each task and division of methods; return the figure, and the panels with their tasks."""
+    cells = [
+        (task, head, {name: ensembles[name] for name in names})
+        for task, ensembles in tasks.items()
+        for head, names in divisions(ensembles).items()
+    ]
+    columns = min(COLUMNS, layout.columns, len(cells))
+    rows = -(-len(cells) // columns)
+    names = {name for ensembles in tasks.values() for name in ensembles}
+    panel = 2.8 if columns == 1 and layout is WIDE else 2.0
+    height = 0.6 + panel * rows + LINE * (2 + len(names) * (0.25 if layout is WIDE else 1.0))
+    figure = Figure(figsize=(layout.width, height), layout="constrained")
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
+    panels = []
+    for axes, (task, head, ensembles) in zip(grid.flat, cells, strict=False):
+        draw(axes, ensembles, styles)
+        axes.set(title=", ".join(filter(None, (task, head))), xlabel="time [s]")
+        panels.append((axes, task))
+    for axes in grid[:, 1:].flat:
+        axes.set_ylabel("")
+    for axes in grid.flat[len(cells) :]:
+        axes.set_visible(False)
+    add_legend(figure, [axes for axes, _ in panels])
+    return figure, panels
+
+
+def _features(tasks: Mapping[str, Tracks]) -> list[str]:
+    """Return the names of the features in the order of the plant; those of the richest track count."""
+    return max((track.features for tracks in tasks.values() for track in tracks.values()), key=len)
+
+
+def draw_error(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
+    """Draw the true error over time: its median and band over seeds, logarithmic, and where runs settled."""
+    first = next(iter(ensembles.values()))
+    draw_over_seeds(axes, ensembles, styles, lambda ensemble: ensemble.shown_error)
+    low, high = error_limits(ensembles.values())
+    if high > 0.0:
+        plain_logarithms(axes)
+        axes.set_ylim(low if low > 0.0 else None, high)
+    mark_settling_band(axes, first)
+    if first.point_to_point:
+        _mark_settling_times(axes, ensembles, styles)
+    if math.isfinite(first.camera_moved_at):
+        axes.axvline(first.camera_moved_at, color="0.4", linewidth=0.9, linestyle="-.", label=CAMERA_MOVES)
+    axes.set_ylabel(f"true error [{first.error_unit[0]}]")
+
+
+def error_limits(ensembles: Collection[Ensemble]) -> tuple[float, float]:
+    """Return between which errors these runs are shown [error unit]; 0 where that is not known.
+
+    Errors of a small part of the settling band are left out: there is noise, and a median tells it better.
+    """
+    largest = [float(ensemble.error[np.isfinite(ensemble.error)].max(initial=0.0)) for ensemble in ensembles]
+    band = next(iter(ensembles)).settling_band
+    return FLOOR * band if math.isfinite(band) else 0.0, min(1.6 * max(largest), MAX_ERROR)
+
+
+def draw_jacobian(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
+    """Draw the relative error of the estimated Jacobian over time, its median and band over seeds, logarithmic."""
+    exact = [name for name, ensemble in ensembles.items() if np.nanmax(ensemble.jacobian_error, initial=0.0) < EXACT]
+    others = {name: ensemble for name, ensemble in ensembles.items() if name not in exact}
+    draw_over_seeds(axes, others, styles, lambda ensemble: ensemble.jacobian_error)
+    for name in exact:
+        axes.plot([], [], label=f"{name} (exact)", **styles[name].line_arguments(1))
+    axes.set_ylabel("Jacobian error [%]")
+    if any((np.asarray(line.get_ydata(), dtype=np.float64) > 0.0).any() for line in axes.get_lines()):
+        plain_logarithms(axes)
+    else:
+        axes.text(0.5, 0.5, "no values", transform=axes.transAxes, ha="center", va="center", color="0.4")
+
+
+def draw_over_seeds(
+    axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles, curve: Callable[[Ensemble], FloatArray]
+) -> None:
+    """Draw the median of a curve over seeds, and between which values most seeds are.
+
+    Args:
+        axes: where.
+        ensembles: controller -> its runs.
+        styles: controller -> style.
+        curve: of an ensemble, (r, k).
+    """
+    for name, ensemble in ensembles.items():
+        values, style = curve(ensemble), styles[name]
+        low, middle, high = (quantile(values, share) for share in BAND)
+        known = np.isfinite(middle)
+        if not known.any():
+            continue
+        if len(values) > 1:
+            axes.fill_between(ensemble.time, np.minimum(low, OUTSIDE), np.minimum(high, OUTSIDE), color=style.colour,
+                              alpha=min(0.18, 0.5 / len(ensembles)), linewidth=0.0)  # fmt: skip
+        shown = np.where(known, middle, np.nan)
+        axes.plot(ensemble.time, shown, label=name, **style.line_arguments(len(shown)))
+        if ensemble.mostly_ended:
+            last = np.flatnonzero(known)[-1]
+            axes.plot(ensemble.time[last], middle[last], color=style.colour, **END_MARK)
+
+
+def draw_feature(axes: Axes, tracks: Tracks, styles: Styles, feature: str) -> None:
+    """Draw a feature of one run of each controller as it was measured, and the desired one."""
+    whole = longest(tracks)
+    axes.plot(whole.time, whole.column(f"reference_{feature}"), **DESIRED)
+    for name, track in tracks.items():
+        values = track.column(f"feature_{feature}")
+        if not np.isfinite(values).any():
+            continue
+        axes.plot(track.time, values, label=name, **styles[name].line_arguments(len(values)))
+        if not track.completed:
+            last = np.flatnonzero(np.isfinite(values))[-1]
+            axes.plot(track.time[last], values[last], color=styles[name].colour, **END_MARK)
+    axes.set_ylabel(f"measured\n{label_of(feature)}")
+
+
+def mark_settling_band(axes: Axes, runs: Track | Ensemble) -> None:
+    """Draw the error within which a run counts as settled, where the table of runs tells it."""
+    if math.isfinite(runs.settling_band):
+        label = f"settling band, {runs.settling_band:g} {runs.error_unit[0]}"
+        axes.axhline(runs.settling_band, color="0.4", linewidth=0.9, linestyle=(0, (2, 2)), label=label)
+
+
+def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: Styles) -> None:
+    """Mark on the settling band the median settling time of each controller."""
+    for name, ensemble in ensembles.items():
+        if math.isfinite(ensemble.settling_time) and math.isfinite(ensemble.settling_band):
+            style = styles[name]
+            edge = style.colour if style.hollow else "black"
+            axes.plot(ensemble.settling_time, ensemble.settling_band, marker="v", markersize=6.5, linestyle="",
+                      color=style.colour, markeredgecolor=edge, markeredgewidth=1.4 if style.hollow else 0.6,
+                      markerfacecolor=style.face, zorder=11, gid=SETTLED)  # fmt: skip
+
+
+def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:
+    """Draw what one run of each controller asks of the joints; None without commands.
+
+    Args:
+        tracks: controller -> run.
+        until: the time at which the figure ends [s]; a long run is shown at its end.
+        layout: of the figure; three columns need a wide one.
+    """
+    shown = each(Track.closing, tracks)
+    columns = max(([n for n in track.table.columns if n.startswith(COMMAND)] for track in shown.values()), key=len)
+    if not columns:
+        return None
+    height = 1.2 + max(ROW, 1.6 / len(shown)) * len(shown)
+    figure = Figure(figsize=(layout.width, height), layout="constrained")
+    panels = figure.subplots(len(shown), 3, sharex=True, sharey="col", squeeze=False)
+    for line, (name, track) in zip(panels, shown.items(), strict=True):
+        for number, column in enumerate(columns):
+            _draw_joint(line, track, column, number)
+        for axes, words in zip(line, _words(track), strict=True):
+            axes.text(0.985, 0.93, words, transform=axes.transAxes, ha="right", va="top", fontsize=TEXT - 1.5,
+                      bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0})  # fmt: skip
+        line[0].set_ylabel(name.replace(":", ":\n"), rotation=0, ha="right", va="center", fontsize=TEXT - 0.5)
+    for axes, title in zip(panels[0], QUANTITIES, strict=True):
+        axes.set_title(title)
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]")
+    if not longest(tracks).long:
+        panels[0, 0].set_xlim(-0.02 * until, until)
+    figure.align_ylabels(panels[:, 0])
+    add_legend(figure, panels[0])
+    return figure
+
+
+def _draw_joint(line: np.ndarray, track: Track, column: str, number: int) -> None:
+    colour, dashes = JOINTS[number % len(JOINTS)]
+    look = {"color": colour, "linestyle": dashes, "linewidth": 0.9}
+    values: FloatArray = track.column(column)
+    period = float(track.time[1] - track.time[0]) if len(values) > 1 else 1.0
+    label = column.removeprefix(COMMAND).rpartition("_rad_s")[0]
+    for order, axes in enumerate(line):
+        draw: Callable[..., object] = axes.step if order == 0 else axes.plot
+        extra = {"where": "post"} if order == 0 else {}
+        if len(values) > order:
+            draw(track.time[order:], np.diff(values, n=order) / period**order, label=label, **look, **extra)
+
+
+def _words(track: Track) -> list[str]:
+    """Return what stands in each panel of a run."""
+    numbers = [
+        track.row.get(name) for name in ("command_switches", "joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3")
+    ]
+    forms = ("{:.0f} sign switches", "RMS {:.3g}", "RMS {:.3g}")
+    return ["" if n is None or np.isnan(n) else form.format(n) for n, form in zip(numbers, forms, strict=True)]

@@ -1,0 +1,189 @@
+"""Controllers and closed loops made ready for export as FMUs.
+
+The step of a controller is recorded, and a run of it is kept inside the FMU for comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+
+from servobench.controllers.controller import ControllerEntry
+from servobench.controllers.servo import Servo, ServoController, ServoState
+from servobench.fmus.controller_export import (
+    COMMAND,
+    FEATURE,
+    JACOBIAN,
+    POSITION,
+    REFERENCE,
+    SEEN,
+    ControllerModel,
+    ControllerRun,
+    controller_groups,
+)
+from servobench.fmus.export import ExportOptions, default_actuation, product
+from servobench.fmus.product import Product
+from servobench.fmus.trace.arrays import NotTraceable
+from servobench.fmus.trace.record import Recorded, record
+from servobench.harness.config.registry import find_controller
+from servobench.harness.config.robots import find_robot
+from servobench.harness.config.settings import ConfigurationError, Settings, flatten
+from servobench.harness.run.experiment import Experiment, build, draw
+from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.faults import RunFault
+from servobench.plant.contract.signals import Observation, trusted_observation
+
+REFERENCE_PERIODS: Final = 200  # of the run inside the FMU, at most
+TOLERANCE: Final = 1e-9
+
+
+def controller_model(request: RunRequest, settings: Settings) -> ControllerModel:
+    """Return a controller ready for export, for the robot and the sensing of a request.
+
+    Args:
+        request: of the run inside the FMU.
+        settings: overrides of the defaults.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
+    """
+    entry = find_controller(request.controller)
+    if entry.needs_truth:
+        raise ConfigurationError(f"controller {entry.name!r} cannot be exported: it is given the true robot")
+    resolved = resolve(request, settings)
+    experiment = build(resolved)
+    try:
+        return _model(entry, resolved, experiment)
+    finally:
+        experiment.plant.close()
+
+
+def _model(entry: ControllerEntry, resolved: ResolvedRun, experiment: Experiment) -> ControllerModel:
+    controller, spec = experiment.controller, experiment.plant.spec
+    if not isinstance(controller, ServoController):
+        raise ConfigurationError(
+            f"controller {entry.name!r} cannot be exported: it is not composed of an estimator and a law"
+        )
+    rows = 1 + experiment.run.preview_rows
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {
+        "time": ((), "f"),
+        POSITION: ((spec.n,), "f"),
+        FEATURE: ((spec.m,), "f"),
+        SEEN: ((spec.m,), "b"),
+        REFERENCE: ((rows, spec.m), "f"),
+    }
+    try:
+        recorded = record(controller.servo, _start, _step, shapes)
+    except NotTraceable as error:
+        raise ConfigurationError(f"controller {entry.name!r} has no exported form: {error}") from error
+    run = _run(experiment)
+    difference = _difference(recorded, run)
+    if not difference <= TOLERANCE:
+        raise ConfigurationError(
+            f"controller {entry.name!r} has no exported form for this robot and sensing: over a run it would "
+            f"differ from the original by {difference:.1g}, allowed is {TOLERANCE:g}"
+        )
+    return ControllerModel(
+        name=entry.name,
+        summary=entry.summary,
+        recorded=recorded,
+        groups=controller_groups(spec.n, spec.m, rows, spec.feature_unit),
+        period=spec.period,
+        run=run,
+        settings="\n".join(f"{key} = {value}" for key, value in flatten(resolved.controller).items()),
+    )
+
+
+def _difference(recorded: Recorded, run: ControllerRun) -> float:
+    """Return the largest difference of the recorded outputs from those of a run, as `fmu validate` counts it."""
+    inputs = np.column_stack([run.time, *run.inputs.values()])
+    wanted = np.column_stack(list(run.outputs.values()))
+    state, _ = recorded.start(inputs[0])
+    came = np.empty_like(wanted)
+    for k, row in enumerate(inputs):
+        state, output, _ = recorded.step(state, row)
+        came[k] = np.asarray(output).reshape(-1)
+    return float((np.abs(came - wanted) / np.maximum(1.0, np.abs(wanted))).max())
+
+
+def _observation(inputs: Mapping[str, Any]) -> Observation:
+    valid = inputs[SEEN]
+    both = inputs[POSITION], inputs[FEATURE]
+    return trusted_observation(inputs["time"], *both, np.logical_and.reduce(valid, axis=-1), valid)
+
+
+def _start(servo: Servo, inputs: Mapping[str, Any]) -> ServoState:
+    return servo.start(_observation(inputs))
+
+
+def _step(servo: Servo, state: ServoState, inputs: Mapping[str, Any]) -> tuple[ServoState, FloatArray]:
+    """Return the new state, and command and Jacobian in one row."""
+    state, velocity = servo.step(state, _observation(inputs), inputs[REFERENCE])
+    jacobian = servo.jacobian(state)
+    known = np.where(np.isnan(jacobian), 0.0, jacobian)
+    return state, np.concatenate([velocity, known.reshape(-1)])
+
+
+def _run(experiment: Experiment) -> ControllerRun:
+    """Carry out the run that the FMU repeats to be compared; it may end early."""
+    seen, answered = [], []
+    try:
+        for observation, reference, command, jacobian in islice(_periods(experiment), REFERENCE_PERIODS):
+            rows = observation.joint_position, observation.feature, observation.valid.astype(np.float64), reference
+            seen.append([observation.time, *(np.ravel(row) for row in rows)])
+            answered.append([command, np.ravel(jacobian)])
+    except RunFault as fault:
+        if not answered:
+            raise ConfigurationError(f"the run that is kept inside the FMU failed at once: {fault}") from fault
+    time, *inputs = (np.array(column) for column in zip(*seen, strict=True))
+    outputs = (np.array(column) for column in zip(*answered, strict=True))
+    return ControllerRun(
+        time,
+        dict(zip((POSITION, FEATURE, SEEN, REFERENCE), inputs, strict=True)),
+        dict(zip((COMMAND, JACOBIAN), outputs, strict=True)),
+    )
+
+
+def _periods(experiment: Experiment) -> Iterator[tuple[Observation, FloatArray, FloatArray, FloatArray]]:
+    """Yield observation, reference, command and estimated Jacobian of each period."""
+    plant, controller, rows = experiment.plant, experiment.controller, 1 + experiment.run.preview_rows
+    count = experiment.periods
+    desired = experiment.scenario.reference.sampled(plant.spec.period, count + rows - 1)
+    observation = plant.reset(0)
+    controller.reset(observation, 0)
+    for k in range(count):
+        reference = desired[k : k + rows]
+        command = controller.step(observation, reference)
+        estimate = controller.estimated_jacobian()
+        unknown = np.zeros((plant.spec.m, plant.spec.n))
+        yield observation, reference, command.joint_velocity, unknown if estimate is None else estimate
+        observation = plant.step(command)
+
+
+def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:
+    """Return plant and controller of a run whose target rests, and how long the run is [s].
+
+    The plant begins where the run does; the reference of the controller starts as the target of the run.
+
+    Raises:
+        ConfigurationError: a name or setting that cannot be used, or a controller that has no exported form.
+    """
+    resolved = resolve(request, settings)
+    drawn, robot = draw(resolved), find_robot(request.robot)
+    if drawn.true is None:
+        raise ConfigurationError(f"plant {request.plant} brings a robot of its own, which is not exported")
+    run: RunSettings = resolved.run
+    reference = drawn.scenario.reference.sampled(run.period, 1 + run.preview_rows)
+    actuation = default_actuation(robot)
+    if drawn.scenario.start is not None:
+        actuation = replace(actuation, home=drawn.scenario.start)
+    words = f"{request.mismatch}, seed {request.seed}"
+    plant = product(ExportOptions(2, drawn.true, actuation, mismatch=words, robot=robot))
+    controller = controller_model(request, settings).product(2, {REFERENCE: reference.reshape(-1)})
+    return plant, controller, drawn.scenario.duration

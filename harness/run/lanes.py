@@ -1,0 +1,282 @@
+"""Runs that advance together: many robots, targets and seeds under one method, on one plant with a lane for each run.
+
+The same loop that carries out one run steps a plant, a controller and a log of many lanes. A run that ends early leaves
+plant and controller; the loop goes on with the others and keeps its last values in its place. An error in a step of the
+controller concerns some lanes only, but does not say which: the step is pure, so it is repeated with ever fewer lanes
+until the failing run is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast, final
+
+import numpy as np
+import numpy.typing as npt
+
+from servobench.controllers.controller import Controller, Diagnostics
+from servobench.controllers.servo import Servo, ServoController, ServoState
+from servobench.harness.config.registry import find_controller, find_plant
+from servobench.harness.run.experiment import Drawn, assemble, draw, loop_settings
+from servobench.harness.run.log import StepLog, Steps
+from servobench.harness.run.loop import LoopSettings
+from servobench.harness.run.resolved import ResolvedRun
+from servobench.plant.bench.bench import Bench
+from servobench.plant.bench.plant import Plant
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import stack, take
+from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth, trusted_observation
+
+LaneIndex = npt.NDArray[np.intp]
+
+
+class AllEnded(Exception):
+    """No run is under way any more."""
+
+
+@final
+class Ends:
+    """Which runs are still under way, and how the others ended.
+
+    Attributes:
+        running: indices of the runs that are under way, ascending.
+        faults: what ended a run, by its index.
+        rows: rows of the log that such a run has.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Start `count` runs."""
+        self.count, self.running = count, np.arange(count)
+        self.faults: dict[int, Exception] = {}
+        self.rows: dict[int, int] = {}
+
+    def end(self, lane: int, fault: Exception, rows: int) -> None:
+        """End one run; the first fault counts.
+
+        Raises:
+            AllEnded: it was the last one.
+        """
+        if lane not in self.faults:
+            self.faults[lane], self.rows[lane] = fault, rows
+            self.running = self.running[self.running != lane]
+        if not len(self.running):
+            raise AllEnded
+
+    def spread(self, values: npt.NDArray[Any], before: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return values of the runs under way in their places among all runs; the others keep those from before."""
+        if len(self.running) == self.count:
+            return values
+        spread = before.copy()
+        spread[self.running] = values
+        return spread
+
+
+class _Member:
+    """A plant or controller of the runs that were under way when it was last asked."""
+
+    def __init__(self, ends: Ends) -> None:
+        self.ends = ends
+        self._mine = ends.running
+
+    def left(self) -> LaneIndex | None:
+        """Return which of its own lanes are still under way, or None if all are."""
+        if len(self._mine) == len(self.ends.running):
+            return None
+        stay = np.flatnonzero(np.isin(self._mine, self.ends.running))
+        self._mine = self.ends.running
+        return stay
+
+
+@final
+class ManyBenches(Plant):
+    """A bench of many lanes, as the loop sees it."""
+
+    def __init__(self, bench: Bench, ends: Ends) -> None:
+        """Take the bench, which has a lane for each run."""
+        self.spec: PlantSpec = bench.spec
+        self._bench, self._ends, self._member, self._k = bench, ends, _Member(ends), 0
+
+    def reset(self, seed: Any) -> Observation:  # noqa: ANN401 - a seed of each run
+        """See `Plant.reset`."""
+        self._seen = self._bench.reset(seed)
+        self._truth = self._bench.truth()
+        return self._seen
+
+    def step(self, command: Command) -> Observation:
+        """See `Plant.step`; a run whose plant fails ends."""
+        self._leave()
+        if len(self._ends.running) < self._ends.count:
+            command = Command(take(command.joint_velocity, self._ends.running))
+        seen = self._bench.step(command)
+        faults = self._bench.faults
+        if faults:
+            lanes = self._ends.running
+            for lane, fault in faults.items():
+                self._ends.end(int(lanes[lane]), fault, self._k)
+            stay = self._member.left()
+            if stay is not None:
+                self._bench.keep(stay)
+                seen = take(seen, stay)
+        self._k += 1
+        self._seen = self._spread(seen)
+        return self._seen
+
+    def truth(self) -> Truth:
+        """See `Plant.truth`."""
+        self._leave()
+        truth, last = self._bench.truth(), self._truth
+        jacobian = truth.jacobian
+        if jacobian is not None and last.jacobian is not None:
+            jacobian = self._ends.spread(jacobian, last.jacobian)
+        self._truth = Truth(self._ends.spread(truth.feature, last.feature), jacobian)
+        return self._truth
+
+    def move_camera(self, X_BC: FloatArray) -> None:
+        """See `Plant.move_camera`."""
+        self._leave()
+        self._bench.move_camera(X_BC[self._ends.running])
+
+    def close(self) -> None:
+        """See `Plant.close`."""
+        self._bench.close()
+
+    def _leave(self) -> None:
+        stay = self._member.left()
+        if stay is not None:
+            self._bench.keep(stay)
+
+    def _spread(self, seen: Observation) -> Observation:
+        names = ("joint_position", "feature", "feature_valid", "valid")
+        arrays = [self._ends.spread(getattr(seen, name), getattr(self._seen, name)) for name in names]
+        return trusted_observation(seen.time, *arrays)
+
+
+@final
+class ManyServos(Controller):
+    """A composed controller of many lanes, as the loop sees it."""
+
+    def __init__(self, servo: Servo, ends: Ends) -> None:
+        """Take the servo, which has a lane for each run where its parts know the true robot."""
+        self._servo, self._ends, self._member, self._k = servo, ends, _Member(ends), 0
+
+    def reset(self, observation: Observation, seed: Any) -> None:  # noqa: ANN401 - a seed of each run
+        """See `Controller.reset`; no part of a servo draws random numbers."""
+        self._state = self._servo.start(observation)
+        self._u = np.zeros_like(observation.joint_position)
+        self._jacobian = self._servo.jacobian(self._state)
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """See `Controller.step`; a run whose controller fails ends.
+
+        Raises:
+            Exception: a step failed, and repeated with fewer lanes it does not.
+        """
+        stay = self._member.left()
+        if stay is not None:
+            self._state = take(self._state, stay)
+        given, lanes = (observation, reference), self._ends.running
+        if len(lanes) < self._ends.count:
+            given = take(given, lanes)
+        try:
+            self._state, u = self._servo.step(self._state, *given)
+        except Exception:
+            failing = failing_lanes(self._servo, self._state, given, np.arange(len(lanes)))
+            if not failing:
+                raise
+            for lane, fault in failing:
+                self._ends.end(int(lanes[lane]), fault, self._k)
+            return self.step(observation, reference)
+        self._k += 1
+        self._u = self._ends.spread(u, self._u)
+        self._jacobian = self._ends.spread(self._servo.jacobian(self._state), self._jacobian)
+        return Command(self._u)
+
+    def estimated_jacobian(self) -> FloatArray:
+        """See `Controller.estimated_jacobian`."""
+        return self._jacobian
+
+    def diagnostics(self) -> Diagnostics:
+        """Return nothing: runs side by side keep no steps."""
+        return {}
+
+
+def failing_lanes(
+    servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: LaneIndex
+) -> list[tuple[int, Exception]]:
+    """Return the lanes in which a step fails, and what each raises as a single run, by halving."""
+    try:
+        servo.step(take(state, lanes), *take(given, lanes))
+    except Exception as error:  # noqa: BLE001 - whatever a part raises
+        if len(lanes) == 1:
+            return [(int(lanes[0]), _as_single_run(servo, state, given, int(lanes[0]), error))]
+        half = len(lanes) // 2
+        return [*failing_lanes(servo, state, given, lanes[:half]), *failing_lanes(servo, state, given, lanes[half:])]
+    return []
+
+
+def _as_single_run(servo: Servo, state: ServoState, given: tuple[Any, ...], lane: int, error: Exception) -> Exception:
+    try:
+        servo.step(take(state, lane), *take(given, lane))
+    except Exception as own:  # noqa: BLE001 - the same error with the words of a single run
+        return own
+    return error
+
+
+@final
+class ManyLogs(StepLog):
+    """The log of runs side by side, without times and diagnostics."""
+
+    def __init__(self, spec: PlantSpec, periods: int, ends: Ends) -> None:
+        """Prepare an empty log with a lane for each run."""
+        super().__init__(spec, periods, (ends.count,))
+        self._ends = ends
+
+    def end(self, lanes: npt.NDArray[np.bool_], fault: Exception) -> None:
+        """End the runs in the lanes."""
+        for lane in np.flatnonzero(lanes):
+            self._ends.end(int(lane), fault, self._count)
+
+    def steps(self) -> Steps:
+        """Return the rows so far, without times."""
+        for time in (self._rows.controller_time, self._rows.plant_time):
+            time.fill(np.nan)
+        return super().steps()
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """Runs made ready: plant, controller and reference with a lane for each."""
+
+    bench: Bench
+    servo: Servo
+    drawn: tuple[Drawn, ...]  # the true robot and the task of each run
+    desired: FloatArray  # (B, periods + preview, m) [unit of the feature]
+    loop: LoopSettings
+
+
+def side_by_side_key(run: ResolvedRun) -> Hashable | None:
+    """Return what runs of one campaign must share to advance together; None for a run that goes alone."""
+    request = run.request
+    if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
+        return None
+    moved = request.mismatch.size("camera_move") > 0.0
+    names = request.plant, request.controller, request.task, request.noise_factor, request.latency, moved, request.robot
+    return (*names, request.mismatch.sensor, request.sensing, id(run.run), id(run.controller), id(run.task))
+
+
+def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Together:
+    """Make runs of one `side_by_side_key` ready.
+
+    Raises:
+        Exception: whatever a run alone would raise, or runs that cannot advance together.
+    """
+    first, drawn = runs[0], tuple(draw(run) for run in runs)
+    moved = [each.moved.camera for each in drawn if each.moved is not None]
+    loop = loop_settings(first.run, drawn[0].scenario.duration, np.stack(moved) if moved else None)
+    rows = loop.periods + loop.preview
+    desired = np.stack([each.scenario.reference.sampled(first.run.period, rows) for each in drawn])
+    robots, starts = stack([each.true for each in drawn]), np.array([each.scenario.start for each in drawn])
+    plant, controller = assemble(first, robots, starts, keep)
+    return Together(cast(Bench, plant), cast(ServoController, controller).servo, drawn, desired, loop)

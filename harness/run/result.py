@@ -1,0 +1,208 @@
+"""The result of a run: its rows, and how it ended: a status, a reason in one line and, for a failure, a short trace.
+
+The place of an error is the deepest line of the user's own code: of a script, of a notebook or of a plug-in, but not of
+this package, of the standard library or of another installed one. An error without such a line has the place in this
+package. A `RunFault` is no defect and has a place only if a plug-in raised it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import site
+import sysconfig
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from multiprocessing import parent_process
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from servobench.harness.config.settings import ConfigurationError
+from servobench.plant.contract.faults import RunFault
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from servobench.plant.bench.plant import ImageArray
+
+COMPLETED = "completed"
+NUMERICAL_ERROR = "numerical_error"
+CRASHED = "crashed"
+TIMED_OUT = "timed_out"  # given by the driver of a batch, which has the limits
+OUT_OF_MEMORY = "out_of_memory"
+
+TRACE_FRAMES: Final = 12  # the deepest ones of a trace, which shows no more
+PACKAGE, HARNESS = __name__.partition(".")[0], str(Path(__file__).parents[1])
+
+
+class WrongAnswer(TypeError):
+    """A method of a controller or a plant returned something else than its contract says, or cannot be called by it."""
+
+    def __init__(self, text: str, method: Callable[..., Any]) -> None:
+        """Say what is wrong with what a method returned, and which one it is."""
+        super().__init__(text)
+        self.method = method
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended."""
+
+    status: str = COMPLETED
+    reason: str = ""  # one line with the place; empty for a run that completed
+    trace: str = ""  # lines; empty where there is nothing to look for
+
+    @classmethod
+    def of(cls, error: BaseException) -> Ending:
+        """Return how a run ended that an error ended."""
+        error = _behind(error)
+        place = _place(error)
+        where = f" ({place})" if place else ""
+        trace = _trace(error) if place else ""
+        if isinstance(error, RunFault):
+            return cls(error.status, f"{_one_line(error)}{where}", trace)
+        if isinstance(error, FloatingPointError):
+            return cls(NUMERICAL_ERROR, f"{_one_line(error)}{where}", trace)
+        status = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
+        return cls(status, f"{describe_error(error)}{where}", trace)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The result of a run.
+
+    Attributes:
+        row: the run's row in the table of runs.
+        steps: one row a period; None if not asked for.
+        picture: the last picture of the camera; None without a camera or if not asked for.
+        trace: of the error that ended the run, for the log of failures; empty without one.
+    """
+
+    row: dict[str, Any]
+    steps: pd.DataFrame | None
+    picture: ImageArray | None = field(default=None, repr=False)
+    trace: str = ""
+
+    @classmethod
+    def failed(cls, identity: Mapping[str, Any], ending: Ending) -> RunResult:
+        """Return the result of a run of which only the columns of its request and its ending are known."""
+        known = {"status": ending.status, "outcome": ending.status, "periods": 0, "reason": ending.reason}
+        return cls({**identity, **known, "mismatch_values": "{}"}, None, trace=ending.trace)
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the kind and the message of an error as one line."""
+    return f"{type(error).__name__}: {_one_line(error)}".removesuffix(": ")
+
+
+def is_defect(error: BaseException) -> bool:
+    """Return whether an error is a defect of somebody's code, and no fault that a run may end with."""
+    return not isinstance(error, RunFault)
+
+
+def ends_batch(error: BaseException) -> bool:
+    """Return whether an error is Ctrl-C; no Ctrl-C reaches a worker process, where code of users raised it itself."""
+    return isinstance(error, KeyboardInterrupt) and parent_process() is None
+
+
+def log_entry(row: Mapping[str, Any], trace: str) -> str:
+    """Return what the log of failures says about a run; nothing about one that completed.
+
+    Args:
+        row: its row in the table of runs.
+        trace: of its `Ending`.
+    """
+    if row.get("status", COMPLETED) == COMPLETED:
+        return ""
+    lines = "".join(f"    {line}\n" for line in trace.splitlines())
+    return f"{row['run_id']}: {row['status']}: {row.get('reason', '')}\n{lines}\n"
+
+
+class _Place(NamedTuple):
+    file: str
+    line: int
+    function: str
+
+    def __str__(self) -> str:
+        return f"{Path(self.file).name}:{self.line} in {self.function}"
+
+
+def _behind(error: BaseException) -> BaseException:
+    """Return the error in code of users of which a line for the command line was made, or the error itself."""
+    behind = error
+    while isinstance(behind, ConfigurationError) and behind.__cause__ is not None:
+        behind = behind.__cause__
+    return behind if any(_is_users(frame) for frame, _ in traceback.walk_tb(behind.__traceback__)) else error
+
+
+def _place(error: BaseException) -> _Place | None:
+    """Return the line to look at; None for a fault that this package raised."""
+    if isinstance(error, WrongAnswer):
+        return _beginning(error.method)
+    frames = list(traceback.walk_tb(error.__traceback__))
+    own = [(frame, line) for frame, line in frames if _is_users(frame)]
+    if not own and is_defect(error):
+        own = [(frame, line) for frame, line in frames if _module(frame) == PACKAGE]
+    if not own:
+        return None
+    frame, line = own[-1]
+    function = frame.f_code.co_qualname
+    return _Place(frame.f_code.co_filename, line, frame.f_code.co_name if "<locals>" in function else function)
+
+
+def _beginning(method: Callable[..., Any]) -> _Place | None:
+    """Return where a method is defined; None for one without source."""
+    function = inspect.unwrap(getattr(method, "__func__", method))
+    code = getattr(function, "__code__", None)
+    return _Place(code.co_filename, code.co_firstlineno, code.co_qualname) if code else None
+
+
+def _module(frame: FrameType) -> str:
+    return str(frame.f_globals.get("__name__", "")).partition(".")[0]
+
+
+def _is_users(frame: FrameType) -> bool:
+    module, file = _module(frame), frame.f_code.co_filename
+    if module == PACKAGE or (file.startswith("<") and not file.startswith("<ipython")):
+        return False
+    return module in _plugin_packages() or not any(Path(file).is_relative_to(folder) for folder in _libraries())
+
+
+@cache
+def _plugin_packages() -> frozenset[str]:
+    """Return the top-level packages of other distributions that publish something for this package."""
+    groups = (group for group in entry_points().groups if group.startswith(f"{PACKAGE}."))
+    points = (point for group in groups for point in entry_points(group=group))
+    return frozenset(point.module.partition(".")[0] for point in points) - {PACKAGE}
+
+
+@cache
+def _libraries() -> tuple[str, ...]:
+    """Return the folders of the standard library and of what is installed."""
+    paths = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    return *paths, *site.getsitepackages(), site.getusersitepackages()
+
+
+def _trace(error: BaseException) -> str:
+    """Return a trace from the first line that is not the harness's, and those of the errors behind it."""
+    whole = shown = traceback.TracebackException.from_exception(error, compact=True)
+    if isinstance(error, WrongAnswer) and (place := _beginning(error.method)):
+        whole.stack = traceback.StackSummary.from_list([traceback.FrameSummary(*place)])
+        return "".join(whole.format())
+    seen: set[int] = set()
+    while shown is not None and id(shown) not in seen:
+        seen.add(id(shown))
+        inner = next((i for i, frame in enumerate(shown.stack) if not frame.filename.startswith(HARNESS)), 0)
+        shown.stack = traceback.StackSummary.from_list(shown.stack[inner:][-TRACE_FRAMES:])
+        shown = shown.__cause__ or shown.__context__  # type: ignore[assignment]
+    return "".join(whole.format())
+
+
+def _one_line(error: BaseException) -> str:
+    try:
+        return " ".join(str(error).split())
+    except BaseException as second:  # noqa: BLE001 - code of users
+        return f"its text cannot be had, which raises {type(second).__name__}"

@@ -1,0 +1,190 @@
+"""Starts and targets for cameras that see pixels: drawn until the target is in view, or found for a displaced pose.
+
+A posture is fit if the nominal cameras see all features away from the edges of their images and the true ones see them
+at all, the target faces the first camera, the parts on the flange are above the table, and the workspace knows of no
+contact there. The box of joint positions from which postures are drawn keeps away from the limits.
+
+The poses are those of the four canonical tasks of Gans, Hutchinson and Corke, "Performance Tests for Visual Servo
+Control Systems, with Application to Partitioned Approaches to Visual Servo Control", International Journal of Robotics
+Research 22 (2003). The arm's home is the goal, and its image is the reference. At the start the target stands
+differently before the first camera:
+
+    X_CT(start) = D X_CT(home)
+
+| task | D |
+|---|---|
+| `axis_turn` | a turn about the optical axis |
+| `retreat` | nearer along the optical axis, so that the camera has to retreat |
+| `camera_turn` | a turn about the camera's y axis through its centre |
+| `plane_turn` | a turn about an axis in the plane of the features, through their middle |
+
+The start is found on the nominal arm. Where an arm cannot reach it with the target in view, D is made smaller.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+from annotated_types import Gt, Le
+from scipy.spatial.transform import Rotation
+
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.contract.lanes import norm
+from servobench.plant.contract.settings import Positive, settings
+from servobench.plant.robot.inverse import reach_pose
+from servobench.plant.robot.robot import Robot
+
+DRAWN_AT_ONCE: Final = 256
+MAX_DRAWS: Final = 25_600
+PLANNED_SHARE: Final = 0.8  # of the images' half sides in which the planned cameras see the features
+TRUE_SHARE: Final = 0.95  # the same of the true ones
+FACING: Final = 0.7  # cosine of the angle at which the target's front is seen: 45°
+REACHED: Final = 1e-6  # of the error that `reach_pose` returns
+SHARES: Final = (1.0, 0.8, 0.6, 0.4, 0.2)  # of D that are tried
+STEPS: Final = 8  # in which the arm is led from home to the start
+IN_VIEW: Final = 0.9  # of the image's half sides in which the target is seen at the start
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """Where to draw.
+
+    Attributes:
+        lower: (n,) [rad].
+        upper: (n,) [rad].
+        shortest: motion from start to target that the ball of the planned fixed camera would need [m].
+        lowest: height of the ball, or of the camera on the hand, above the table [m].
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    shortest: float
+    lowest: float
+
+
+def draw_in_view(
+    box: Box, robot: Robot, nominal: EyeModel, true: EyeModel, generator: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return joint positions of start and target, (n,) and (n,) rad.
+
+    Args:
+        box: where to draw.
+        robot: the nominal one.
+        nominal: the same with its cameras as planned.
+        true: the true arm and cameras.
+        generator: of the draws.
+
+    Raises:
+        ValueError: too few postures are fit.
+    """
+    least = box.shortest * nominal.noise_unit  # the same way in the image, however near the camera is
+    found: list[FloatArray] = []
+    for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
+        drawn = generator.uniform(box.lower, box.upper, (DRAWN_AT_ONCE, robot.n))
+        for posture in drawn[_fit(drawn, box, robot, nominal, true)]:
+            for other in found:
+                if norm(nominal.feature(posture) - nominal.feature(other)) >= least:
+                    return other, posture
+            found.append(posture)
+    raise ValueError(
+        f"{len(found)} of {MAX_DRAWS} postures in the box keep the target in view, and no two of them are far enough "
+        "apart"
+    )
+
+
+def drawn_together(
+    start: FloatArray, target: FloatArray, robot: Robot, nominal: EyeModel, true: EyeModel
+) -> tuple[FloatArray, FloatArray]:
+    """Return start and target of a move, (n,) and (n,) rad, drawn together in tenths until both are in view.
+
+    They are drawn towards the arm's home, where the target is in the middle of the images.
+
+    Raises:
+        ValueError: not even near the home both are in view.
+    """
+    home = robot.workspace.home
+    for tenths in range(10, 0, -1):
+        both = home + 0.1 * tenths * (np.stack([start, target]) - home)
+        if _in_view(both, nominal, true).all():
+            return (start, target) if tenths == 10 else (both[0], both[1])
+    raise ValueError("start and target must be in view, and near the arm's home they are not; use another mismatch")
+
+
+def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: EyeModel, true: EyeModel) -> npt.NDArray[np.bool_]:
+    """Return which of the postures (k, n) rad are fit, (k,)."""
+    fit = robot.arm.ball_position(drawn)[:, 2] >= box.lowest
+    if robot.workspace.clear is not None:
+        fit &= robot.workspace.clear(drawn)
+    fit[fit] = _in_view(drawn[fit], nominal, true)
+    return np.asarray(fit)
+
+
+def _in_view(postures: FloatArray, nominal: EyeModel, true: EyeModel) -> npt.NDArray[np.bool_]:
+    """Return in which postures (k, n) rad the cameras see all features as they should, (k,)."""
+    points = nominal.points(postures)
+    planned = nominal.in_view(points, PLANNED_SHARE).all(axis=-1) & (nominal.facing(points) >= FACING)
+    return np.asarray(planned & true.in_view(true.points(postures), TRUE_SHARE).all(axis=-1))
+
+
+@settings
+class PoseTask:
+    """A move of a target with a pose, or of cameras before one, from a displaced start to home."""
+
+    displacement: Literal["axis_turn", "retreat", "camera_turn", "plane_turn"] = "axis_turn"
+    """which of the four canonical ones"""
+    angle: Annotated[float, Gt(0.0), Le(180.0)] = 45.0
+    """[deg] of a turn"""
+    nearer: Annotated[float, Gt(0.0), Le(0.8)] = 0.25
+    """[1] share of the distance by which the start is nearer, of a retreat"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
+
+
+def displaced(config: PoseTask, middle: FloatArray) -> FloatArray:
+    """Return D, (4, 4), for a target whose middle is at (3,) m in the camera frame at home; see the module."""
+    D, angle = np.eye(4), np.radians(config.angle)
+    match config.displacement:
+        case "axis_turn":
+            D[:3, :3] = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+        case "retreat":
+            D[2, 3] = -config.nearer * middle[2]
+        case "camera_turn":
+            D[:3, :3] = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+        case "plane_turn":
+            D[:3, :3] = Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix()
+            D[:3, 3] = middle - D[:3, :3] @ middle
+    return D
+
+
+def pose_start(config: PoseTask, robot: Robot, nominal: EyeModel) -> FloatArray:
+    """Return the start, (n,) rad, on the nominal arm with its cameras as planned.
+
+    Raises:
+        ValueError: no share of the displacement can be reached with the target in view.
+    """
+    camera, home = nominal.camera, robot.workspace.home
+    inverse = np.linalg.inv(camera)
+    middle = inverse[:3, :3] @ nominal.points(home).mean(axis=0) + inverse[:3, 3]
+    for share in SHARES:
+        start = _led(config, share, robot, nominal, middle)
+        if start is not None and nominal.in_view(nominal.points(start), IN_VIEW).all():
+            return start
+    raise ValueError(f"{robot.title} cannot reach the start of {config.displacement} with the target in view")
+
+
+def _led(config: PoseTask, share: float, robot: Robot, nominal: EyeModel, middle: FloatArray) -> FloatArray | None:
+    """Return the joint positions at a share of the displacement, led there from home in steps; None if out of reach."""
+    arm, limits, q, camera = robot.arm, robot.limits, robot.workspace.home, nominal.camera
+    at_home = arm.frames(q)[-1]
+    for step in np.linspace(0.0, share, STEPS + 1)[1:].tolist():
+        D = displaced(replace(config, angle=step * config.angle, nearer=step * config.nearer), middle)
+        moved = camera @ D @ np.linalg.inv(camera)  # of the target in the frame that the camera is mounted on
+        pose = moved @ at_home if nominal.mount == "fixed" else at_home @ np.linalg.inv(moved)
+        q, error = reach_pose(arm, pose, q, limits.lower, limits.upper)
+        if error > REACHED:
+            return None
+    return q

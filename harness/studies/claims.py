@@ -1,0 +1,424 @@
+"""The paper's seven claims: the runs behind them, and for each claim a verdict, evidence and its measurements.
+
+The rules, fixed before the runs were made:
+
+| claim | reproduced where |
+|---|---|
+| 1 faster | the paired settling time difference is below 0 (p < 0.05 after Holm) in all 12 pairings of move and rival |
+| 2 overshoot, path | both are larger than the rival's in all 12 pairings, in the same sense |
+| 3 alike | in all tasks the interval of the paired difference in settling time lies within ±10 % of the median |
+| 4 leaving the region | it costs both RBF methods more time than it costs `ukf_mfac`, and the proposed one most |
+| 5 circle | the second lap stays within 10 mm RMS in more than 80 % of robots, lower end of the interval |
+| 6 cheaper | its median step is shorter than that of `ukf_mpc` by a factor of 2, in the moves and on the circle |
+| 7 keeps up | learning online lowers the mean Jacobian error (p < 0.05 after Holm) in all five tasks |
+
+A rule that holds in none of its cases is *not reproduced*, one that holds in some *depends on* them. A case of so few
+robots that the rule could not hold in any event decides nothing. A run that never settles counts as its whole
+duration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isfinite
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from servobench.controllers.methods import PUBLISHED
+from servobench.harness.analysis.comparison import differences_of_pairs, settling_times
+from servobench.harness.analysis.statistics import (
+    NO_ESTIMATE,
+    Estimate,
+    holm,
+    median_with_interval,
+    signed_rank_p_value,
+    success_rate,
+)
+from servobench.harness.batch.blocks import Cell
+from servobench.harness.batch.compare import Batch
+from servobench.harness.config.registry import RENDERED
+from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.result import COMPLETED
+from servobench.plant.contract.settings import did_you_mean
+
+ALIKE_SHARE: Final = 0.10  # of the median settling time
+CLEAR_RATIO: Final = 2.0  # of step times, so large that every machine shows it
+MAX_CIRCLE_ERROR: Final = 0.010  # [m]
+MIN_CIRCLE_SHARE: Final = 0.8
+Tables = Mapping[str, pd.DataFrame]
+LEVEL: Final = 0.05
+DURATION: Final = 10.0  # [s] of a move
+REPRODUCED, NOT_REPRODUCED, DEPENDS = "reproduced", "not reproduced", "depends"
+UNDECIDED: Final = "too few robots to tell"
+PROPOSED: Final = "rbfnn_mfac"
+MPC: Final = "ukf_mpc"
+OTHERS: Final = ("rbf_pid", "ukf_mfac", MPC)
+MOVES: Final = ("exp1", "exp2", "exp3", "exp4")
+LEAVING: Final = ("exp1", "exp4")  # start or target lie outside the region in which networks are trained
+STAYING: Final = ("exp2", "exp3")
+CIRCLE: Final = "circle"
+MISMATCH: Final = "moderate"
+DIVISIONS: Final[Mapping[str, str]] = {  # how the methods are equipped -> what follows their names
+    "best equipped": "",
+    "as published": PUBLISHED,
+}
+FIRST_SEED: Final = 30_000  # far from the seeds that methods are tuned on
+MAIN: Final = "main"
+FROZEN: Final = "frozen"  # the Jacobian network as it was trained
+NO_EPSILON: Final = "no_epsilon"  # the paper as printed: no ε in either step size
+ENTRIES: Final = "entries"  # the paper's fit of the entries of ψ
+TIMED: Final = "timed"  # few runs, each by itself: how long steps take
+TIMED_ROBOTS: Final = 5  # 20 moves and 5 circles a method
+READINGS: Final[Mapping[str, Mapping[str, Any]]] = {
+    FROZEN: {"estimator": {"k2": 1e-9}},
+    NO_EPSILON: {"law": {"epsilon": 0.0}, "estimator": {"epsilon": 0.0}},
+    ENTRIES: {"training": {"controller": {"fit": "entries"}}},
+}
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One number behind an answer.
+
+    Attributes:
+        panel: what is measured, with its unit.
+        place: task.
+        label: controller, reading or pairing.
+        estimate: value and interval.
+        holds: whether the claim's rule holds here; None for a number that no rule judges, and where the robots are so
+            few that it could not hold whatever came out.
+    """
+
+    panel: str
+    place: str
+    label: str
+    estimate: Estimate
+    holds: bool | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to one claim on one plant.
+
+    Attributes:
+        claim: its number; readings of the paper have a name instead.
+        statement: the claim in a few words.
+        plant: on which the claim was tested.
+        verdict: reproduced, not reproduced, or depends on what.
+        evidence: one line.
+        measurements: the numbers, for the table and the figure.
+        division: how the methods were equipped.
+    """
+
+    claim: str
+    statement: str
+    plant: str
+    verdict: str
+    evidence: str
+    measurements: tuple[Measurement, ...]
+    division: str = "best equipped"
+
+    @property
+    def title(self) -> str:
+        """Number and statement, or the statement of a reading."""
+        return f"{self.claim}: {self.statement}" if self.claim.isdigit() else self.statement
+
+
+class Study(NamedTuple):
+    """Runs with common settings."""
+
+    name: str  # of its folder
+    settings: Settings  # overrides of the defaults
+    cells: tuple[Cell, ...]  # the runs
+    timed: bool = False  # each run goes by itself, so that its steps have times
+
+
+def find_divisions(text: str) -> tuple[str, ...]:
+    """Return the divisions that a user named: `equipped`, `published` or `both`.
+
+    Raises:
+        ConfigurationError: none of these.
+    """
+    words = {"both": tuple(DIVISIONS)} | {name.split()[-1]: (name,) for name in DIVISIONS}
+    if text not in words:
+        raise ConfigurationError(
+            f"--division must be one of {', '.join(sorted(words))}, got {text!r}{did_you_mean(text, words)}"
+        )
+    return words[text]
+
+
+def plain_names(division: str) -> dict[str, str]:
+    """Return the four methods without their division, by the names that they have in it."""
+    return {name + DIVISIONS[division]: name for name in (PROPOSED, *OTHERS)}
+
+
+def studies(plants: Sequence[str], seeds: int, division: str = "best equipped") -> list[Study]:
+    """Return the studies on `plants`: `seeds` robots for each move, two fifths of them for the circle.
+
+    Args:
+        plants: names.
+        seeds: number of robots.
+        division: a key of `DIVISIONS`.
+    """
+    suffix = DIVISIONS[division]
+    rendered = {name: {"scenery": False} for name in RENDERED}  # the same observations, bit for bit, in less time
+    robots = tuple(range(FIRST_SEED, FIRST_SEED + seeds))
+    some = robots[: max(2, 2 * seeds // 5)]
+
+    def cells(controllers: tuple[str, ...], tasks: tuple[str, ...], chosen: tuple[int, ...]) -> tuple[Cell, ...]:
+        names = tuple(name + suffix for name in controllers)
+        batch = Batch(tuple(plants), names, tasks, (MISMATCH,), chosen)
+        return tuple(Cell(request) for request in batch.requests())
+
+    four = (PROPOSED, *OTHERS)
+    main = Study(MAIN, Settings(rendered), cells(four, MOVES, robots) + cells(four, (CIRCLE,), some))
+    own = cells((PROPOSED,), (*MOVES, CIRCLE), some)
+    both = cells((PROPOSED, MPC), (*MOVES, CIRCLE), robots[:TIMED_ROBOTS])
+    return [
+        main,
+        Study(TIMED, Settings(rendered), both, timed=True),
+        *(Study(name, Settings({**rendered, PROPOSED + suffix: reading}), own) for name, reading in READINGS.items()),
+    ]
+
+
+def answer_all(tables: Tables, plant: str, division: str = "best equipped") -> list[Answer]:
+    """Return the answers for one plant and division.
+
+    Args:
+        tables: tables of runs by name of the study.
+        plant: name of the plant.
+        division: how the methods were equipped, a key of `DIVISIONS`.
+    """
+    own = {
+        name: table[table["plant"] == plant].reset_index(drop=True).replace({"controller": plain_names(division)})
+        for name, table in tables.items()
+    }
+    rules = (_faster, _overshoot_and_path, _alike, _leaving, _circle, _cheaper, _keeps_up)
+    answers = [
+        *(rule(own, plant) for rule in rules),
+        _reading(own, plant, NO_EPSILON, "ε = 0", "reading: both step sizes without ε, as printed"),
+        _reading(own, plant, ENTRIES, "entries", "reading: controller network fitted entry by entry"),
+    ]
+    return [replace(answer, division=division) for answer in answers]
+
+
+def _faster(tables: Tables, plant: str) -> Answer:
+    panel = "settling time, proposed − rival, s"
+    compared = pairings(tables[MAIN], "settling_time_s", panel, sign=-1, never=DURATION)
+    middles = medians(tables[MAIN], "settling time, median, s")
+    words = "; ".join(
+        f"{task} " + ", ".join(f"{m.label} {_seconds(m.estimate.value)}" for m in middles if m.place == task)
+        for task in MOVES
+    )
+    evidence = f"faster in {held(compared)} of {len(compared)} pairings; medians {words}"
+    return answer("1", "converges faster than the other three", plant, compared, evidence, middles)
+
+
+def _seconds(median: float) -> str:
+    """Return a median settling time in words; an infinite one is that of runs of which most never settle."""
+    return f"{median:.2f} s" if isfinite(median) else "never"
+
+
+def _overshoot_and_path(tables: Tables, plant: str) -> Answer:
+    runs = tables[MAIN]
+    over = pairings(runs, "overshoot", "overshoot, proposed − rival, %", sign=1, factor=100.0)
+    path = pairings(runs, "path_length_ratio", "path ratio, proposed − rival", sign=1)
+    evidence = f"larger overshoot in {held(over)} of {len(over)} pairings, longer path in {held(path)} of {len(path)}"
+    return answer("2", "its overshoot is larger and its path longer", plant, [*over, *path], evidence)
+
+
+def _alike(tables: Tables, plant: str) -> Answer:
+    measured = []
+    for task in MOVES:
+        times = by_seed(tables[MAIN], task, "settling_time_s", DURATION)
+        difference = median_with_interval(differences_of_pairs(times["ukf_mpc"], times["ukf_mfac"]).dropna())
+        inside = max(abs(difference.low), abs(difference.high)) <= ALIKE_SHARE * float(times["ukf_mfac"].median())
+        panel = "settling time, ukf_mpc − ukf_mfac, s"
+        measured.append(Measurement(panel, task, "ukf_mpc − ukf_mfac", difference, inside))
+    laps = [circle_error(tables[MAIN], name) for name in ("ukf_mfac", "ukf_mpc")]
+    differences = ", ".join(f"{m.place} {m.estimate:.2f} s" for m in measured)
+    circle = " against ".join(f"{m.estimate:.1f} mm ({m.label})" for m in laps)
+    return answer("3", "UKF+MPC and UKF+MFAC behave alike", plant, measured, f"{differences}; circle {circle}", laps)
+
+
+def _leaving(tables: Tables, plant: str) -> Answer:
+    runs = tables[MAIN].assign(time=settling_times(tables[MAIN]).fillna(DURATION))
+    leaving, staying = (
+        runs[runs["task"].isin(tasks)].pivot_table("time", "seed", "controller") for tasks in (LEAVING, STAYING)
+    )
+    cost = leaving - staying  # [s] by seed and controller
+    pairs = ((PROPOSED, "ukf_mfac"), ("rbf_pid", "ukf_mfac"), (PROPOSED, "rbf_pid"))
+    differences = [differences_of_pairs(cost[first], cost[second]).dropna() for first, second in pairs]
+    panel = "extra settling time where the region is left, s"
+    measured = []
+    for (first, second), difference, clear in zip(pairs, differences, significant(differences), strict=True):
+        middle = median_with_interval(difference)
+        measured.append(Measurement(panel, "exp1, exp4", f"{first} − {second}", middle, clear and middle.value > 0.0))
+    evidence = "; ".join(f"{m.label} {m.estimate:.2f} s" for m in measured)
+    return answer("4", "outside the region both RBF methods suffer, the proposed more", plant, measured, evidence)
+
+
+def _circle(tables: Tables, plant: str) -> Answer:
+    measured = [circle_error(tables[MAIN], name) for name in (PROPOSED, *OTHERS)]
+    own = tables[MAIN][(tables[MAIN]["task"] == CIRCLE) & (tables[MAIN]["controller"] == PROPOSED)]
+    good = int(((own["rms_error_evaluated"] <= MAX_CIRCLE_ERROR) & (own["status"] == COMPLETED)).sum())
+    rate, most = success_rate(good, len(own)), success_rate(len(own), len(own))
+    holds = rate.low > MIN_CIRCLE_SHARE if most.low > MIN_CIRCLE_SHARE or rate.high < MIN_CIRCLE_SHARE else None
+    share = Measurement("within 10 mm RMS, share", CIRCLE, PROPOSED, rate, holds)
+    words = ", ".join(f"{m.label} {m.estimate:.1f} mm" for m in measured)
+    evidence = f"within 10 mm in {good} of {len(own)}; medians {words}"
+    return answer("5", "tracks a circle of 0.3 m radius", plant, [share], evidence, measured)
+
+
+def _cheaper(tables: Tables, plant: str) -> Answer:
+    measured = []
+    for place, tasks in (("moves", MOVES), (CIRCLE, (CIRCLE,))):
+        runs = tables[TIMED][tables[TIMED]["task"].isin(tasks)]
+        times = runs.pivot_table(index=["task", "seed"], columns="controller", values="controller_time_median_us")
+        ratio = median_with_interval(times[PROPOSED] / times[MPC])
+        holds = ratio.value < 1.0 / CLEAR_RATIO
+        measured.append(Measurement(f"step time, proposed over {MPC}", place, PROPOSED, ratio, holds))
+    words = ", ".join(f"{_in_words(m.estimate.value)} {m.place}" for m in measured)
+    evidence = f"its median step is {words} (a factor of {CLEAR_RATIO:g} counts; the ratios are in measurements.csv)"
+    return answer("6", "its update costs less time than an optimising MPC", plant, measured, evidence)
+
+
+def _in_words(ratio: float) -> str:
+    """Return a ratio of times in words that do not change from machine to machine."""
+    if ratio < 1.0 / CLEAR_RATIO:
+        return "clearly shorter than that of ukf_mpc in"
+    return "clearly longer than that of ukf_mpc in" if ratio > CLEAR_RATIO else "about as long as that of ukf_mpc in"
+
+
+def _keeps_up(tables: Tables, plant: str) -> Answer:
+    online, frozen = (
+        table[table["controller"] == PROPOSED].set_index(["task", "seed"])["jacobian_error_mean"]
+        for table in (tables[MAIN], tables[FROZEN])
+    )
+    both = pd.DataFrame({"online": online, "frozen": frozen}).dropna()
+    tasks = (*MOVES, CIRCLE)
+    differences = [differences_of_pairs(both.loc[task]["online"], both.loc[task]["frozen"]) for task in tasks]
+    measured, levels, words = [], [], []
+    for task, difference, clear in zip(tasks, differences, significant(differences), strict=True):
+        middle = median_with_interval(100.0 * difference)
+        holds = clear and middle.value < 0.0
+        measured.append(Measurement("Jacobian error, online − as trained, %", task, PROPOSED, middle, holds))
+        level = {name: median_with_interval(100.0 * both.loc[task][name]) for name in ("online", "frozen")}
+        levels += [Measurement("Jacobian error, mean of a run, %", task, name, level[name]) for name in level]
+        words.append(f"{task} {level['online'].value:.1f} / {level['frozen'].value:.1f} %")
+    evidence = f"median error online / as trained: {', '.join(words)}"
+    return answer("7", "its estimator keeps up with the true Jacobian", plant, measured, evidence, levels)
+
+
+def _reading(tables: Tables, plant: str, name: str, label: str, statement: str) -> Answer:
+    """Compare the proposed method in another reading of the paper with the one that is the default here."""
+    usual = tables[MAIN][(tables[MAIN]["controller"] == PROPOSED) & tables[MAIN]["seed"].isin(tables[name]["seed"])]
+    measured, words, settled = [], [], []
+    for kind, table in (("default", usual), (label, tables[name])):
+        moves = table[table["task"].isin(MOVES)].set_index(["task", "seed"])
+        times = settling_times(moves)
+        share, time = success_rate(int(times.notna().sum()), len(moves)), median_with_interval(times)
+        lap = circle_error(table, PROPOSED, kind)
+        measured += [
+            Measurement("moves that settled, share", "moves", kind, share),
+            Measurement("settling time, median, s", "moves", kind, time),
+            lap,
+        ]
+        words.append(f"{kind}: settled {100 * share.value:.0f} %, median {time:.2f} s, circle {lap.estimate:.1f} mm")
+        settled.append(times.fillna(DURATION))
+    difference = differences_of_pairs(settled[1], settled[0])
+    verdict = "worse" if difference.mean() > 0.0 else "better"
+    if signed_rank_p_value(difference.to_numpy()) >= LEVEL:
+        verdict = "makes no difference"
+    return Answer(label, statement, plant, verdict, "; ".join(words), tuple(measured))
+
+
+def significant(differences: Sequence[pd.Series[float]]) -> list[bool | None]:
+    """Return for each sample of paired differences whether Wilcoxon's test rejects 0, after Holm over all of them.
+
+    None where not even differences of one sign would be rejected: their two-sided p-value is 2/2ⁿ with n pairs.
+    """
+    p_values = [signed_rank_p_value(values.to_numpy()) if len(values) else 1.0 for values in differences]
+    return [
+        p_value < LEVEL if 2.0 ** (1 - len(values)) < LEVEL else None
+        for p_value, values in zip(holm(p_values), differences, strict=True)
+    ]
+
+
+def pairings(
+    runs: pd.DataFrame, metric: str, panel: str, *, sign: int, never: float = np.nan, factor: float = 1.0
+) -> list[Measurement]:
+    """Compare the proposed method with each rival in each move.
+
+    Args:
+        runs: the table of runs.
+        metric: column.
+        panel: what is measured, with its unit.
+        sign: −1 where the claim says less, +1 where it says more.
+        never: replaces a missing value; NaN leaves the pair out.
+        factor: from the column's unit to the panel's.
+    """
+    tables = {task: by_seed(runs, task, metric, never) for task in MOVES}
+    found = {
+        (task, rival): differences_of_pairs(table[PROPOSED], table[rival]).dropna() * factor
+        for task, table in tables.items()
+        for rival in OTHERS
+    }
+    return [
+        Measurement(
+            panel,
+            task,
+            rival,
+            median_with_interval(difference) if len(difference) else NO_ESTIMATE,
+            clear and sign * difference.mean() > 0.0,
+        )
+        for ((task, rival), difference), clear in zip(found.items(), significant(list(found.values())), strict=True)
+    ]
+
+
+def by_seed(runs: pd.DataFrame, task: str, metric: str, never: float) -> pd.DataFrame:
+    """Return `metric` by seed and controller; `never` where a run has none or did not complete."""
+    own = runs[runs["task"] == task]
+    values = own[metric].where(own["status"] == COMPLETED).fillna(never)
+    return own.assign(value=values).pivot(index="seed", columns="controller", values="value")
+
+
+def medians(runs: pd.DataFrame, panel: str) -> list[Measurement]:
+    """Return the median settling time of each method in each move [s]."""
+    times = settling_times(runs).groupby([runs["task"], runs["controller"]])
+    estimates = {key: median_with_interval(values) for key, values in times}
+    return [Measurement(panel, task, name, estimates[task, name]) for task in MOVES for name in (PROPOSED, *OTHERS)]
+
+
+def circle_error(runs: pd.DataFrame, controller: str, label: str = "") -> Measurement:
+    """Return the median RMS error of the second lap [mm]; infinite if half of the runs do not complete."""
+    own = runs[(runs["task"] == CIRCLE) & (runs["controller"] == controller)]
+    error = median_with_interval(1000.0 * own["rms_error_evaluated"].where(own["status"] == COMPLETED))
+    return Measurement("circle, RMS of the second lap, mm", CIRCLE, label or controller, error)
+
+
+def held(measured: Sequence[Measurement]) -> int:
+    """Return in how many cases the rule holds."""
+    return sum(bool(m.holds) for m in measured)
+
+
+def answer(
+    claim: str,
+    statement: str,
+    plant: str,
+    judged: Sequence[Measurement],
+    evidence: str,
+    further: Sequence[Measurement] = (),
+) -> Answer:
+    """Return the answer whose verdict follows from the cases `judged`; `further` measurements are for the figure."""
+    count, decided = held(judged), sum(m.holds is not None for m in judged)
+    if count == len(judged):
+        verdict = REPRODUCED
+    elif count == decided:
+        verdict = UNDECIDED
+    else:
+        verdict = f"{DEPENDS}: holds in {count} of {decided}" if count else NOT_REPRODUCED
+    return Answer(claim, statement, plant, verdict, evidence, (*judged, *further))

@@ -1,1 +1,0 @@
-"""The paper's seven claims, answered by statistics that anyone can repeat."""

@@ -1,0 +1,197 @@
+"""The reproduction of the paper: carry out its runs, answer its claims, write tables and figures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from servobench.harness.analysis.statistics import NO_ESTIMATE
+from servobench.harness.batch import results
+from servobench.harness.batch.campaign import Campaign, Execution, carry_out
+from servobench.harness.config.registry import find_plant
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.pictures.measures import draw_places
+from servobench.harness.pictures.style import method_styles, save_figure
+from servobench.harness.studies.claims import DIVISIONS, MAIN, UNDECIDED, Answer, Measurement, answer_all, studies
+
+MIN_ROBOTS: Final = 6  # with fewer pairs, Wilcoxon's test cannot reach significance
+FIGURES: Final = "figures"
+READINGS = {"ε = 0": "reading_epsilon", "entries": "reading_entries"}  # claim -> name of its figure
+MAX_LABEL = 28  # characters of an ordinate's label on one line
+ANSWERS: Final = "answers.csv"
+MEASUREMENTS: Final = "measurements.csv"
+NUMBER: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.])")
+RELATIVE, ABSOLUTE = 0.1, 0.051  # tolerances of the numbers in the evidence: a tenth and a period
+Answers: TypeAlias = Mapping[tuple[str, ...], tuple[str, str]]  # claim, plant, division -> verdict, evidence
+
+
+def reproduce(
+    out: Path, plants: Sequence[str], robots: int, how: Execution, divisions: Sequence[str] = tuple(DIVISIONS)
+) -> list[Answer]:
+    """Carry out the runs and answer the claims.
+
+    Args:
+        out: folder for runs, tables and figures.
+        plants: names.
+        robots: number of robots for each move; two fifths of them for the circle.
+        how: how the runs are carried out.
+        divisions: how the methods are equipped, keys of `DIVISIONS`.
+
+    Returns:
+        The answers of all plants and divisions, by claim.
+
+    Raises:
+        ConfigurationError: too few robots, or a plant that is no UR5.
+    """
+    if robots < MIN_ROBOTS:
+        raise ConfigurationError(f"--seeds must be at least {MIN_ROBOTS} to tell methods apart, got {robots}")
+    if any(find_plant(name).own_robot for name in plants):
+        raise ConfigurationError("the claims are about a UR5; --plants names a plant with a robot of its own")
+    answers, main = [], {}
+    for division in divisions:
+        tables = {}
+        for study in studies(plants, robots, division):
+            folder = out / division.replace(" ", "_") / study.name
+            own = replace(how.of_part(folder), block=1 if study.timed else how.block)
+            carry_out(Campaign(study.cells, study.settings), folder, own)
+            tables[study.name] = results.load_runs(folder)
+        answers += [answer for plant in plants for answer in answer_all(tables, plant, division)]
+        main[division] = tables[MAIN]
+        manifest = results.read_manifest(folder.parent / MAIN)
+    answers.sort(key=lambda answer: (not answer.claim.isdigit(), answer.claim))
+    results.write_summary(out, main, manifest)
+    write_tables(answers, out)
+    (out / "answers.md").write_text(markdown_table(answers), encoding="utf-8")
+    draw_answers(answers, out / FIGURES)
+    return answers
+
+
+def draw_answers(answers: Sequence[Answer], folder: Path) -> list[Path]:
+    """Draw a figure for each claim, a column a plant and division, a row a measurement; return all files."""
+    files = []
+    for claim in dict.fromkeys(answer.claim for answer in answers):
+        figure = _draw([answer for answer in answers if answer.claim == claim])
+        files += save_figure(figure, folder / READINGS.get(claim, f"claim_{claim}"))
+    return files
+
+
+def _draw(answers: Sequence[Answer]) -> Figure:
+    panels = list(dict.fromkeys(m.panel for answer in answers for m in answer.measurements))
+    figure = Figure(figsize=(4.6 * len(answers), 2.6 * len(panels) + 0.6), layout="constrained")
+    grid = figure.subplots(len(panels), len(answers), squeeze=False, sharey="row")
+    for column, answer in enumerate(answers):
+        for row, panel in enumerate(panels):
+            _draw_panel(grid[row, column], [m for m in answer.measurements if m.panel == panel])
+        grid[0, column].set_title(f"{answer.plant}, {answer.division}:\n{answer.verdict}")
+    for row, panel in enumerate(panels):
+        grid[row, 0].set_ylabel(panel if len(panel) < MAX_LABEL else panel.replace(", ", ",\n", 1))
+    figure.suptitle(answers[0].title)
+    return figure
+
+
+def _draw_panel(axes: Axes, measured: Sequence[Measurement]) -> None:
+    if not measured:
+        axes.set_axis_off()
+        return
+    places = list(dict.fromkeys(m.place for m in measured))
+    labels = list(dict.fromkeys(m.label for m in measured))
+    known = {(m.label, m.place): m.estimate for m in measured}
+    values = {label: [known.get((label, place), NO_ESTIMATE) for place in places] for label in labels}
+    draw_places(axes, range(len(places)), values, method_styles(labels))
+    axes.set_xticks(range(len(places)), places)
+    axes.set_xlim(-0.6, len(places) - 0.4)
+    if "−" in measured[0].panel or " over " in measured[0].panel:  # a difference or a ratio: a line at "alike"
+        axes.axhline(0.0 if "−" in measured[0].panel else 1.0, color="black", linewidth=0.8)
+    else:
+        ends = np.array([[m.estimate.value, m.estimate.high] for m in measured])
+        axes.set_ylim(0.0, 1.15 * max(1e-9, float(np.max(ends[np.isfinite(ends)], initial=0.0))))
+    axes.grid(visible=True, alpha=0.3)
+    axes.legend(fontsize=7, frameon=False)
+
+
+def write_tables(answers: Sequence[Answer], folder: Path) -> None:
+    """Write a row for each claim, plant and division, and a row for each number behind the answers."""
+    pd.DataFrame(answers).drop(columns="measurements").to_csv(folder / ANSWERS, index=False)
+    rows = [
+        {"claim": answer.claim, "plant": answer.plant, "division": answer.division,
+         "measured": m.panel, "place": m.place, "label": m.label,
+         **asdict(m.estimate), "holds": m.holds}
+        for answer in answers
+        for m in answer.measurements
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(folder / MEASUREMENTS, index=False)
+
+
+def read_answers(path: Path) -> Answers:
+    """Return verdict and evidence by claim, plant and division from a table of answers.
+
+    Lines that begin with `#` are left out: the tables of docs/tables begin with how they were made.
+
+    Raises:
+        ConfigurationError: the file is not a table of answers.
+    """
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False, comment="#")
+        rows = table[["claim", "plant", "division", "verdict", "evidence"]].itertuples(index=False)
+        return {tuple(key): (verdict, evidence) for *key, verdict, evidence in rows}
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigurationError(f"{path} is not a table of answers: {' '.join(str(error).split())}") from error
+
+
+def differences(answers: Sequence[Answer], wanted: Answers) -> list[str]:
+    """Return a line for each answer that is not the one wanted.
+
+    Verdicts and words must be the same. Numbers of the evidence may differ by a tenth and a period: networks that are
+    fitted on another processor differ by rounding, which loops amplify.
+    """
+    lines = []
+    for answer in answers:
+        name = f"claim {answer.claim} on {answer.plant}, {answer.division}"
+        key = answer.claim, answer.plant, answer.division
+        if key not in wanted:
+            lines.append(f"{name}: not in the table")
+        elif wanted[key][0] != answer.verdict or not _agree(answer.evidence, wanted[key][1]):
+            lines.append(f"{name}: now {answer.verdict}: {answer.evidence}")
+    return lines
+
+
+def _agree(found: str, wanted: str) -> bool:
+    ours, theirs = ([float(number) for number in NUMBER.findall(text)] for text in (found, wanted))
+    same_words = NUMBER.sub("", found) == NUMBER.sub("", wanted)
+    return same_words and bool(np.allclose(ours, theirs, rtol=RELATIVE, atol=ABSOLUTE))
+
+
+def markdown_table(answers: Sequence[Answer]) -> str:
+    """Return the answers as a table in Markdown."""
+    lines = ["| claim | plant | division | verdict | evidence |", "|---|---|---|---|---|"]
+    for a in answers:
+        verdict = f"**{a.verdict}**{elsewhere(a, answers)}"
+        lines.append(f"| {a.title} | {a.plant} | {a.division} | {verdict} | {a.evidence} |")
+    return "\n".join(lines) + "\n"
+
+
+def elsewhere(answer: Answer, answers: Sequence[Answer]) -> str:
+    """Return a remark about the plants on which the same claim came out otherwise; empty if there is none.
+
+    In how many comparisons a claim holds is not compared, nor a verdict for which robots were too few.
+    """
+    others = [
+        other.plant
+        for other in answers
+        if (other.claim, other.division) == (answer.claim, answer.division)
+        and _outcome(other) != _outcome(answer)
+        and UNDECIDED not in (other.verdict, answer.verdict)
+    ]
+    return f" (otherwise on {', '.join(others)})" if others else ""
+
+
+def _outcome(answer: Answer) -> str:
+    return answer.verdict.partition(":")[0]

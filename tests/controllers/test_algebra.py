@@ -1,0 +1,78 @@
+"""Tests of the damped inverse, of the projection on the row space, and of motion in the null space."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from servobench.controllers.algebra import damped_inverse, project_to_row_space
+from servobench.controllers.stages.finish import step_with_posture
+
+
+def damped_inverse_by_svd(J, damping):
+    U, sigma, Vt = np.linalg.svd(J, full_matrices=False)
+    return (Vt.T * (sigma / (sigma**2 + damping**2))) @ U.T
+
+
+def test_the_projection_keeps_what_moves_the_feature_and_nothing_else():
+    rng = np.random.default_rng(5)
+    J, W = rng.normal(size=(2, 4)), rng.normal(size=(4, 3, 5))
+    projected = project_to_row_space(W, J)
+    np.testing.assert_allclose(np.einsum("mn,npl->mpl", J, projected), np.einsum("mn,npl->mpl", J, W), atol=1e-12)
+    null = np.eye(4) - np.linalg.pinv(J) @ J
+    np.testing.assert_allclose(np.einsum("ij,jpl->ipl", null, projected), 0.0, atol=1e-12)
+    np.testing.assert_allclose(project_to_row_space(projected, J), projected, atol=1e-12)
+
+
+@pytest.mark.parametrize("smallest", [1.0, 1e-2, 1e-6, 1e-12, 0.0])
+@pytest.mark.parametrize(("m", "n"), [(2, 4), (3, 6), (3, 3), (4, 2)])
+def test_the_projection_is_that_of_the_pseudo_inverse_however_close_to_singular(m, n, smallest):
+    rng = np.random.default_rng(7)
+    size = min(m, n)
+    left, right = (np.linalg.qr(rng.normal(size=(rows, size)))[0] for rows in (m, n))
+    J = left * np.array([1.0] * (size - 1) + [smallest]) @ right.T
+    kept = project_to_row_space(np.eye(n)[:, :, None], J)[:, :, 0]
+    rows = right if smallest > 0.0 else right[:, :-1]
+    rounding = 1e-15 / smallest if smallest > 0.0 else 0.0  # of J itself, which turns its weakest direction
+    np.testing.assert_allclose(kept, rows @ rows.T, atol=max(1e-9, rounding))
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6, 1e12])
+def test_the_damped_inverse_is_the_ridge_solution_at_any_size_of_the_jacobian(size):
+    J = size * np.random.default_rng(3).normal(size=(3, 6))
+    e = np.array([0.1, -0.2, 0.3])
+    stacked = np.vstack([J, 0.02 * np.eye(6)])
+    wanted = np.linalg.lstsq(stacked, np.concatenate([e, np.zeros(6)]), rcond=None)[0]
+    np.testing.assert_allclose(damped_inverse(J, 0.02) @ e, wanted, rtol=1e-9)
+
+
+@settings(max_examples=100)
+@given(seed=st.integers(0, 10**6), exponent=st.floats(-4.0, 8.0), damping=st.floats(1e-3, 1.0))
+def test_the_damped_inverse_is_that_by_singular_values(seed, exponent, damping):
+    J = 10.0**exponent * np.random.default_rng(seed).normal(size=(3, 6))
+    wanted = damped_inverse_by_svd(J, damping)
+    np.testing.assert_allclose(damped_inverse(J, damping), wanted, rtol=1e-7, atol=1e-7 * np.abs(wanted).max())
+
+
+def test_each_lane_is_inverted_by_the_formula_that_is_accurate_for_it():
+    """An ordinary Jacobian beside a huge singular one, of which the normal equations have no solution."""
+    ordinary, huge = np.random.default_rng(4).normal(size=(2, 2)), 1e9 * np.ones((2, 2))
+    both = damped_inverse(np.array([ordinary, huge, ordinary]), 0.02)
+    for lane, single in enumerate((ordinary, huge, ordinary)):
+        np.testing.assert_array_equal(both[lane], damped_inverse(single, 0.02))
+    np.testing.assert_allclose(both[1], damped_inverse_by_svd(huge, 0.02), rtol=1e-6)
+
+
+def test_the_damped_inverse_exists_where_the_jacobian_is_huge_and_singular():
+    J = 1e9 * np.ones((2, 2))
+    assert np.isfinite(damped_inverse(J, 0.02)).all()
+
+
+def test_a_posture_moves_the_joints_towards_it_and_the_feature_not_at_all():
+    rng = np.random.default_rng(1)
+    J, v, away = rng.normal(size=(2, 5)), rng.normal(size=2), rng.normal(size=5)
+    inverse = np.linalg.pinv(J)
+    step = step_with_posture(inverse, J, v, away, 0.3)
+    np.testing.assert_allclose(J @ step, v, atol=1e-12)
+    np.testing.assert_allclose(step - inverse @ v, 0.3 * (np.eye(5) - inverse @ J) @ away, atol=1e-12)
+    np.testing.assert_array_equal(step_with_posture(inverse, J, v, away, 0.0), inverse @ v)

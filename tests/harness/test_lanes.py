@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kit.plants import NEEDS_BULLET
+from servobench.controllers.laws.mfac import MfacLaw
+from servobench.controllers.methods import METHODS
+from servobench.harness.config.settings import Settings
+from servobench.harness.run.episode import carry_out, carry_out_together
+from servobench.harness.run.lanes import side_by_side_key
+from servobench.harness.run.request import RunRequest
+from servobench.harness.run.resolved import resolve
+from servobench.plant.contract.faults import FilterDiverged
+
+ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}}, "random": {"duration": 2.5}}
+PROBED = {"mfac+rls": {"initial": {"source": "probe", "settle_periods": 3, "average_periods": 1}}}
+
+
+def lossy(probability, periods):
+    sensing = {"kinematic": {"sensing": {"drop_probability": probability}}}
+    return {**sensing, "run": {"lost_after": 0.05 * periods}, "random": {"duration": 2.5}}
+
+
+SEEDS = (40001, 40002, 40003, 40004, 40005)
+
+
+def runs(controller, settings, plant="kinematic", mismatch="severe", task="random"):
+    return [resolve(RunRequest(plant, controller, task, mismatch, seed), Settings(settings)) for seed in SEEDS]
+
+
+def rows(results):
+    return [{name: value for name, value in each.row.items() if "_time_" not in name or "settling" in name}
+            for each in results]  # fmt: skip
+
+
+def one_by_one(resolved):
+    return rows(carry_out(run, steps=False) for run in resolved)
+
+
+@pytest.mark.parametrize("controller", [name for name in METHODS if METHODS[name].side_by_side])
+def test_rows_of_runs_side_by_side_are_those_of_each_run_alone(controller):
+    together = runs(controller, ROUGH, mismatch="severe+camera_move=60deg")
+    assert side_by_side_key(together[0]) is not None
+    alone = one_by_one(together)
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+    np.testing.assert_equal(rows(carry_out_together([together[4], together[1]])), [alone[4], alone[1]])
+
+
+def test_runs_with_a_disturbed_sensor_go_side_by_side_but_not_with_others():
+    words = "moderate+stable=1.3+outliers=20%+occlusions=10%+jitter=80ms"
+    together = runs("ukf_mfac:published", {"random": {"duration": 2.5}}, mismatch=words)
+    assert together[0].plant.sensing.outliers == 0.2
+    assert side_by_side_key(together[0]) != side_by_side_key(runs("ukf_mfac:published", {}, mismatch="moderate")[0])
+    alone = one_by_one(together)
+    assert len({row["valid_share"] if "valid_share" in row else row["rms_error"] for row in alone}) == len(SEEDS)
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+
+
+def test_probing_runs_go_side_by_side():
+    together = runs("mfac+rls", {**ROUGH, **PROBED})
+    np.testing.assert_equal(rows(carry_out_together(together)), one_by_one(together))
+
+
+def test_runs_that_lose_the_feature_leave_the_others_alone():
+    together = runs("ukf_mfac", lossy(0.7, 9))
+    alone = one_by_one(together)
+    assert {row["status"] for row in alone} == {"completed", "feature_lost"}
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+
+
+@pytest.mark.parametrize("kind", [FilterDiverged, FloatingPointError, np.linalg.LinAlgError, KeyError])
+def test_whatever_a_part_raises_ends_only_the_runs_that_it_concerns(kind, monkeypatch):
+    command = MfacLaw.command
+
+    def fragile(self, state, estimate, observation, reference):
+        bad = (observation.time > 0.3) & (observation.feature[..., 0] > 0.05)
+        if np.any(bad):
+            raise kind(f"the feature is at {observation.feature[..., 0].tolist()}")
+        return command(self, state, estimate, observation, reference)
+
+    together = runs("ukf_mfac:published", ROUGH)
+    monkeypatch.setattr(MfacLaw, "command", fragile)
+    alone = one_by_one(together)
+    assert {"completed"} < {row["status"] for row in alone}
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+
+
+def test_a_block_of_which_every_run_ends_early_has_all_its_rows():
+    together = runs("ukf_mfac", lossy(0.99, 3))
+    alone = one_by_one(together)
+    assert {row["status"] for row in alone} == {"feature_lost"}
+    np.testing.assert_equal(rows(carry_out_together(together)), alone)
+
+
+def test_times_of_runs_side_by_side_are_unknown():
+    row = carry_out_together(runs("ukf_mfac", ROUGH))[0].row
+    assert np.isnan([row[name] for name in row if "_time_" in name and "settling" not in name]).all()
+
+
+@NEEDS_BULLET
+def test_plug_ins_and_rendered_plants_go_alone():
+    assert side_by_side_key(runs("nmpc_calibrated", {})[0]) is None
+    assert side_by_side_key(runs("ukf_mfac", {}, plant="bullet")[0]) is None
