@@ -14,11 +14,11 @@ run: $(VENV)/ready
 
 # For every save: half a minute.
 check: lint
-	$(BIN)/python -m pytest -n auto $(UNIT)
+	$(BIN)/python -m pytest -n auto --dist loadgroup $(UNIT)
 
 # For every change: the unit folders, statistics over runs (closed_loop), processes, compilers and browsers (end_to_end).
 test: lint
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 # Renew every measured table and picture of the pages: a night. The same call goes on after an interruption;
 # ONLY=held_out,rates renews these, RUNS is the folder of the runs. docs/experiments.md lists the studies.
@@ -31,6 +31,7 @@ results: $(VENV)/ready
 # in benchmarks/night.
 nightly: $(VENV)/ready
 	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest tests/end_to_end/test_first_hour.py
+	PYTHONPATH=tests:benchmarks $(BIN)/python -m pytest -p conftest benchmarks/night
 	$(NIGHT).fuzzing --inputs 1000000
 	$(NIGHT).random_calls --calls 10000000
 	$(NIGHT).system_loops

@@ -17,6 +17,8 @@ from kit.command import finish, judged, part_count, servobench, start, wait_for
 from night import hostile_controllers
 from servobench.harness.batch import results
 
+pytestmark = pytest.mark.xdist_group("isolation")  # one process makes what these tests share
+
 HOSTILE = Path(hostile_controllers.__file__)
 MARK = "SERVOBENCH_TEST_MARK"  # an environment variable that all processes of a command inherit
 SOON = 5.0  # [s] until nothing is left of a command that was ended

@@ -17,6 +17,8 @@ from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 
+pytestmark = pytest.mark.xdist_group("sweep")  # one process makes what these tests share
+
 SWEEP = (
     "sweep", "--controllers", "constant,broyden", "--vary", "camera_rotation=0:40:20deg", "--noise", "1,2",
     "--seeds", "4", "--workers", "2", "--set", "random.duration=2",
