@@ -17,15 +17,13 @@ from measuring import milliseconds, print_periods
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray, whole_steps
 from servobench.plant.contract.signals import Command
+from servobench.plant.rendered.detection import Window, whole, window_around
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
-from servobench.plant.rendered.mujoco.engine import mujoco
-from servobench.plant.rendered.mujoco.mujoco_plant import build_mujoco
-from servobench.plant.rendered.mujoco.scene import MujocoScene
-from servobench.plant.rendered.mujoco.simulation import MujocoSimulation
+from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation, mujoco
+from servobench.plant.rendered.plants import build_mujoco
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.rendered.window import Window, whole, window_around
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.catalogue import find_robot
@@ -52,7 +50,7 @@ class BareCalls:
         arm, stops = self._model.arm, np.full(6, config.joint_range)
         machine = Machine(arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
         self._simulation = MujocoSimulation(machine)
-        self._scene = MujocoScene(Room(arm, config.scenery))
+        self._scene = MujocoScene(Room(arm, config.scenery, find_robot("ur5")))
         self._simulation.start(HOME)
         self._scene.place(HOME)
 
@@ -90,7 +88,7 @@ def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
     plants = [build_mujoco(config, setup)]
     if find_spec("pybullet") is not None:
-        from servobench.plant.rendered.bullet.bullet_plant import build_bullet
+        from servobench.plant.rendered.plants import build_bullet
 
         plants.append(build_bullet(config, setup))
     for plant in plants:

@@ -18,9 +18,10 @@ from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.cameras.registry import Sensing
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import UR5
 
 MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
 CORE = "kinematics"

@@ -18,10 +18,11 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
-from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.fmu.world import build_fmu
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import UR5
 
 
 @settings

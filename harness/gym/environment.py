@@ -24,8 +24,7 @@ from servobench.plant.contract.faults import FeatureLost, RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.rendered.overview import Overview
-from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none

@@ -23,7 +23,7 @@ from servobench.harness.run.resolved import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
-from servobench.plant.cameras.draws import CameraDraws
+from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault

@@ -24,8 +24,8 @@ from servobench.harness.run.result import COMPLETED, CRASHED, NUMERICAL_ERROR, O
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.sensing import SensingConfig
-from servobench.plant.fmu.fmu_plant import FmuConfig
 from servobench.plant.fmu.mapping import FmuMapping
+from servobench.plant.fmu.world import FmuConfig
 from servobench.plant.robot.mismatch import AXES, PROFILES, Mismatch
 
 pytestmark = pytest.mark.xdist_group("docs_tables")  # one process makes what these tests share

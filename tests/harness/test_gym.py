@@ -17,7 +17,7 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym import ENVIRONMENT
 from servobench.harness.gym.environment import MARK, ServoEnv
 from servobench.harness.gym.vector import ServoVectorEnv
-from servobench.plant.rendered.overview import Overview
+from servobench.plant.rendered.room import Overview
 
 RENDERS = default_plant()[0] in RENDERED
 
