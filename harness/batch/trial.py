@@ -35,7 +35,7 @@ from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import Ending
-from servobench.harness.run.tasks import TASKS
+from servobench.harness.run.tasks import task_names
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.contract.faults import RunFault
 
@@ -88,12 +88,12 @@ class _Kind:
         """Return what can be said of one; built for a robot if there is one."""
         try:
             entry = self.find(name)
-            if robot is not None and name not in TASKS:
+            if robot is not None and name not in task_names():
                 with contextlib.suppress(RunFault, _Trains):  # of a fault the run's row will tell
                     self.build(name, robot)
         except ConfigurationError as error:
             return Tried(name, fault=str(error))
-        if name in TASKS:
+        if name in task_names():
             return Tried(name, fault=f"a task is called {name!r}, too; give the {self.word} another name")
         return Tried(name, str(entry.summary))
 
