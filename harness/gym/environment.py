@@ -36,7 +36,7 @@ MARK: Final = (40, 40, 40)  # red, green, blue
 def resolve_environment(
     plant: str, task: str, mismatch: str, robot: str, sensing: str, settings: Mapping[str, Mapping[str, Any]] | None
 ) -> ResolvedRun:
-    """Return what the runs of an environment have in common, with seed 0; arguments as in `ServoEnv`.
+    """Return the resolved run of an environment, with seed 0; arguments as in `ServoEnv`.
 
     Raises:
         ConfigurationError: a name, setting or mismatch that cannot be used.
@@ -62,8 +62,8 @@ def with_seed(resolved: ResolvedRun, seed: int) -> ResolvedRun:
 class ServoEnv(gymnasium.Env[Floats32, Floats32]):
     """One run of a task, of which each episode draws a new robot, target and noise.
 
-    An action is a joint velocity as a share of the joints' limits, held for a control period; `View` says what the
-    policy sees. The reward of a period is
+    An action is a joint velocity as a share of the joints' limits, held for a control period; `View` makes the
+    observation. The reward of a period is
 
         r = −‖y* − y‖ T
 
@@ -74,7 +74,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
 
     Attributes:
         natural_size: of a feature, in its unit.
-        resolved: what all runs have in common.
+        resolved: the settings that all runs share.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 - Gymnasium's
@@ -130,7 +130,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             options: there are none.
 
         Returns:
-            What the policy sees; `seed`, `robot` (the drawn values) and, of a run that failed already, `reason`.
+            The observation of the policy; `seed`, `robot` (the drawn values) and, if the run failed already, `reason`.
 
         Raises:
             ConfigurationError: options are given.
@@ -163,8 +163,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             action: (n,), share of the joints' speed limits; clipped to it.
 
         Returns:
-            What the policy sees, the reward, whether the run failed, whether the task is over, and `time` [s], `error`
-            (true, in natural sizes) and, of a run that failed, `reason`.
+            The observation of the policy, the reward, whether the run failed, whether the task is over, and `time` [s],
+            `error` (true, in natural sizes) and, of a run that failed, `reason`.
 
         Raises:
             gymnasium.error.ResetNeeded: `reset` has not been called, or the episode is over.
@@ -195,7 +195,7 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         return self._view.see(rollout.observation, rollout.reference, self._action)
 
     def render(self) -> ByteArray | None:
-        """Return the present picture, (h, w, 3): what the plant's camera sees, or the arm from outside.
+        """Return the present picture, (h, w, 3): that of the plant's camera, or the arm from outside.
 
         The camera's picture has the detected ball or discs marked, that from outside the target of the ball.
 

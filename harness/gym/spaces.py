@@ -18,7 +18,7 @@ FEATURE_BOUND: Final = 10.0  # natural sizes, beyond which features and errors a
 
 @final
 class View:
-    """The observation of a policy: what every controller gets, and its own last action, as one vector.
+    """The observation of a policy: that of every controller, and its own last action, as one vector.
 
     | part | size | unit |
     |---|---|---|

@@ -40,7 +40,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
 
         Args:
             num_envs: number of lanes.
-            choice: what the runs have in common, by the arguments of `ServoEnv`.
+            choice: arguments of `ServoEnv`, which all runs share.
 
         Raises:
             ConfigurationError: a number, name, setting or mismatch that cannot be used, or a plant that carries out
@@ -74,7 +74,7 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             options: there are none.
 
         Returns:
-            What the policies see, (num_envs, k), and `seed`, (num_envs,).
+            The observations of the policies, (num_envs, k), and `seed`, (num_envs,).
 
         Raises:
             ConfigurationError: options are given, or a seed above 2⁶³ − num_envs.

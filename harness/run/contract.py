@@ -1,7 +1,7 @@
-"""Controllers and plants of third parties, held to their contracts: what a method returns is looked at first.
+"""Controllers and plants of third parties, held to their contracts: each answer of a method is checked first.
 
 Without this a step that returns an array ends in an attribute error of the loop, far from the line that is wrong. The
-controllers and plants that this package composes itself are not looked at, so that they cost nothing.
+controllers and plants that this package composes itself are not checked, so that they cost nothing.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Contr
 
 @final
 class _HeldController(Controller):
-    """A controller whose answers are looked at."""
+    """A controller whose answers are checked."""
 
     def __init__(self, controller: Controller, spec: PlantSpec) -> None:
         self._controller, self._spec = controller, spec
@@ -82,7 +82,7 @@ class _HeldController(Controller):
 
 @final
 class _HeldPlant(Plant):
-    """A plant whose answers are looked at."""
+    """A plant whose answers are checked."""
 
     def __init__(self, plant: Plant) -> None:
         self._plant, self.spec = plant, plant.spec
@@ -127,8 +127,8 @@ class _HeldPlant(Plant):
         return seen
 
 
-def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - what it returns
-    """Call a method; where it does not take these arguments, raise what its signature must be."""
+def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - any answer
+    """Call a method; if it does not take these arguments, the error names the signature that it needs."""
     try:
         return method(*arguments)
     except TypeError as error:
@@ -144,7 +144,7 @@ def _is_number(value: object) -> bool:
 
 
 def _kind(value: object) -> str:
-    """Return what a value is, in a few words."""
+    """Return the kind of a value, in a few words."""
     if isinstance(value, np.ndarray):
         return f"ndarray of shape {value.shape}"
     if isinstance(value, type):

@@ -36,7 +36,7 @@ from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mis
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What is drawn for one run."""
+    """The values drawn for one run."""
 
     scenario: Scenario
     true: SensedArm | None = None  # the true robot and its cameras; None for a plant that brings its own
@@ -137,7 +137,7 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
     """Make a run ready.
 
     Args:
-        resolved: what to run.
+        resolved: the run.
         keep: results folder in which trained networks are kept beside the runs.
         progress: called with the share of a training of networks that is done.
 
@@ -190,9 +190,9 @@ def assemble(
 
 
 def build_once(run: ResolvedRun, progress: Progress | None = None) -> None:
-    """Build a run and throw it away: this refuses what is configured wrongly, and trains networks.
+    """Build a run and discard it, which refuses a wrong configuration and trains networks.
 
-    Whatever else fails is left to the run, whose row says so. Arguments and errors are those of `build`.
+    Other errors are left to the run, whose row names them. Arguments and errors are those of `build`.
     """
     try:
         experiment = build(run, progress=progress)

@@ -42,7 +42,7 @@ class Ends:
 
     Attributes:
         running: indices of the runs that are under way, ascending.
-        faults: what ended a run, by its index.
+        faults: the error that ended a run, by its index.
         rows: rows of the log that such a run has.
     """
 
@@ -205,10 +205,10 @@ class ManyServos(Controller):
 def failing_lanes(
     servo: Servo, state: ServoState, given: tuple[Any, ...], lanes: LaneIndex
 ) -> list[tuple[int, Exception]]:
-    """Return the lanes in which a step fails, and what each raises as a single run, by halving."""
+    """Return the lanes in which a step fails, each with its error as a single run, by halving."""
     try:
         servo.step(take(state, lanes), *take(given, lanes))
-    except Exception as error:  # noqa: BLE001 - whatever a part raises
+    except Exception as error:  # noqa: BLE001 - a part may raise anything
         if len(lanes) == 1:
             return [(int(lanes[0]), _as_single_run(servo, state, given, int(lanes[0]), error))]
         half = len(lanes) // 2
@@ -257,7 +257,7 @@ class Together:
 
 
 def side_by_side_key(run: ResolvedRun) -> Hashable | None:
-    """Return what runs of one campaign must share to advance together; None for a run that goes alone."""
+    """Return the key that runs of one campaign must share to advance together; None for a run that goes alone."""
     request = run.request
     if not (find_plant(request.plant).side_by_side and find_controller(request.controller).side_by_side):
         return None
@@ -270,7 +270,7 @@ def build_together(runs: Sequence[ResolvedRun], keep: Path | None = None) -> Tog
     """Make runs of one `side_by_side_key` ready.
 
     Raises:
-        Exception: whatever a run alone would raise, or runs that cannot advance together.
+        Exception: any error of a run alone, or runs that cannot advance together.
     """
     first, drawn = runs[0], tuple(draw(run) for run in runs)
     moved = [each.moved.camera for each in drawn if each.moved is not None]

@@ -1,7 +1,7 @@
 """Settings that are valid one by one and make no run together: times longer than the run, targets out of reach.
 
-A target that a task gives as a feature is held against the nominal arm, with room for what the mismatch may add to its
-reach: a run is refused only where no true robot of that mismatch could do it.
+A target that a task gives as a feature is compared with the reach of the nominal arm, plus a margin for the mismatch: a
+run is refused only where no true robot of that mismatch could do it.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from servobench.plant.robot.inverse import closest_distance
 from servobench.plant.robot.mismatch import Mismatch
 from servobench.plant.robot.robot import Robot
 
-ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be whatever the mismatch
-POINTS: Final = 12  # of a curve that are looked at
+ROOM: Final = 0.1  # [m] beyond the nominal reach that a target may be under any mismatch
+POINTS: Final = 12  # of a curve that are checked
 
 
 def check_times(resolved: ResolvedRun, duration: float) -> None:
-    """Refuse times that are longer than the run of `duration` [s], so that what they delay never happens.
+    """Refuse times that are longer than the run of `duration` [s], so that they never end in it.
 
     Raises:
-        ConfigurationError: names the setting, the length of the run and what came.
+        ConfigurationError: names the setting, the length of the run and the given value.
     """
     plant, sensing = resolved.request.plant, getattr(resolved.plant, "sensing", None)
     times = {f"{plant}.command_delay": getattr(resolved.plant, "command_delay", 0.0)}

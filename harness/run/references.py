@@ -56,7 +56,7 @@ class FixedPoint(Reference):
     target: FloatArray
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
-        """Return the target, whatever the time."""
+        """Return the target, the same at all times."""
         times = np.asarray(time, dtype=np.float64)
         return np.broadcast_to(self.target, (*times.shape, len(self.target))).copy()
 
@@ -195,5 +195,5 @@ class FollowedCurve(View):
 
 
 def in_space(curve: Reference, model: object, robot: Robot | None) -> Reference:
-    """Return what the features should be for a ball on a curve: the curve itself where they are places."""
+    """Return the desired features of a ball on a curve: the curve itself where features are places."""
     return FollowedCurve(model, curve, robot) if isinstance(model, EyeModel) and robot is not None else curve

@@ -42,7 +42,7 @@ class WrongAnswer(TypeError):
     """A method of a controller or a plant returned something else than its contract says, or cannot be called by it."""
 
     def __init__(self, text: str, method: Callable[..., Any]) -> None:
-        """Say what is wrong with what a method returned, and which one it is."""
+        """Take the message and the method that gave the wrong answer."""
         super().__init__(text)
         self.method = method
 
@@ -99,7 +99,7 @@ def describe_error(error: BaseException) -> str:
 
 
 def is_defect(error: BaseException) -> bool:
-    """Return whether an error is a defect of somebody's code, and no fault that a run may end with."""
+    """Return whether an error is a defect of code, and no fault that a run may end with."""
     return not isinstance(error, RunFault)
 
 
@@ -109,7 +109,7 @@ def ends_batch(error: BaseException) -> bool:
 
 
 def log_entry(row: Mapping[str, Any], trace: str) -> str:
-    """Return what the log of failures says about a run; nothing about one that completed.
+    """Return the entry of a run in the log of failures; empty for one that completed.
 
     Args:
         row: its row in the table of runs.
@@ -181,7 +181,7 @@ def _plugin_packages() -> frozenset[str]:
 
 @cache
 def _libraries() -> tuple[str, ...]:
-    """Return the folders of the standard library and of what is installed."""
+    """Return the folders of the standard library and of installed packages."""
     paths = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
     return *paths, *site.getsitepackages(), site.getusersitepackages()
 

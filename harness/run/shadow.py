@@ -1,7 +1,7 @@
-"""A controller beside a logged run: what it would have commanded at each instant, given what was seen there.
+"""A controller beside a logged run: its commands for the observations of each instant.
 
-The loop is open. Joint positions and features are those of the log whatever the controller commands, so nothing here
-says how a run under its commands would have gone; what is compared is its answer to the same observations.
+The loop is open. Joint positions and features are those of the log, independent of the commands, so nothing here
+predicts a run under these commands; only the answers to the same observations are compared.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
 COMMAND: Final = "joint_velocity_command"
-LOGGED: Final = "logged_"  # before the name of a column with what was commanded when the log was made
+LOGGED: Final = "logged_"  # before the name of a column of commands in the log
 TIME_TOLERANCE: Final = 1e-6  # [s] by which a logged instant may be off
 
 
 @final
 class LoggedPlant(Plant):
-    """A logged run as a plant that shows what was seen, row by row, and does not answer to commands.
+    """A logged run as a plant that returns the logged observations, row by row, and ignores commands.
 
-    After the last row it shows that row again.
+    After the last row it returns that row again.
     """
 
     def __init__(self, spec: PlantSpec, table: pd.DataFrame) -> None:
@@ -69,7 +69,7 @@ class LoggedPlant(Plant):
         return self._row()
 
     def step(self, command: Command) -> Observation:
-        """Show the next row, whatever the command. See `Plant.step`."""
+        """Return the next row; the command is ignored. See `Plant.step`."""
         self._k = min(self._k + 1, len(self._time) - 1)
         return self._row()
 
@@ -154,7 +154,7 @@ def feature_columns(spec: PlantSpec, kind: str) -> list[str]:
 
 
 def joint_columns(spec: PlantSpec, kind: str, unit: str) -> list[str]:
-    """Return the names of the columns with what a kind has for each joint."""
+    """Return the names of the columns of a kind, one for each joint."""
     return [column_name(kind, name, unit) for name in spec.joint_names]
 
 

@@ -54,12 +54,12 @@ def closed_loop(plant: StateSpace, controller: StateSpace, gain: float = 1.0) ->
     """Return the loop of a strictly proper plant with a controller whose command is multiplied by `gain`.
 
     Args:
-        plant: from the command u to what the controller measures, D = 0.
+        plant: from the command u to the measured signals, D = 0.
         controller: from measurements and then references to u.
         gain: factor on u between controller and plant.
 
     Returns:
-        From the references to what the controller measures; the states are those of the plant, then the controller's.
+        From the references to the measured signals; the states are those of the plant, then the controller's.
     """
     seen = len(plant.C)
     B, D = controller.B, controller.D
