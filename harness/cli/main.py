@@ -43,9 +43,9 @@ app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
 
 
 def _print_version(wanted: bool) -> None:
-    from servobench.harness.config.installation import version_line
-
     if wanted:
+        from servobench.harness.config.installation import version_line
+
         typer.echo(version_line())
         raise typer.Exit
 
