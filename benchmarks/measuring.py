@@ -44,7 +44,7 @@ def resolved_runs(plant: str, method: str, count: int, duration: float | None = 
     from servobench.harness.config.registry import controller_names
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
-    from servobench.harness.run.resolved import resolve
+    from servobench.harness.run.resolution import resolve
 
     method = name_in(controller_names(), method)
     settings, mismatch = Settings({"random": {"duration": duration}} if duration else {}), cast(Any, "moderate")
