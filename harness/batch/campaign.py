@@ -126,11 +126,10 @@ def _carry_out_at(
     manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
-    resume = how.resume and not is_unused(folder)
-    with locked(folder, new=not resume) as lock:
+    with locked(folder, new=not how.resume) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
-        if resume:
+        if how.resume and not is_unused(folder):  # under the lock: another process may have begun in the meantime
             prepare_folder(folder, manifest, how.observer)
         else:
             results.create_folder(folder, manifest)

@@ -13,9 +13,11 @@ import pandas as pd
 import psutil
 import pytest
 
-from kit import hostile_controllers
 from kit.command import finish, judged, part_count, servobench, start, wait_for
+from night import hostile_controllers
 from servobench.harness.batch import results
+
+pytestmark = pytest.mark.xdist_group("isolation")  # one process makes what these tests share
 
 HOSTILE = Path(hostile_controllers.__file__)
 MARK = "SERVOBENCH_TEST_MARK"  # an environment variable that all processes of a command inherit

@@ -22,6 +22,8 @@ from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import ConfigurationError, Settings
 
+pytestmark = pytest.mark.xdist_group("integrity")  # one process makes what these tests share
+
 RUNS = 24
 
 
