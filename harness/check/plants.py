@@ -24,7 +24,7 @@ STEPS: Final = 6
 SHARE: Final = 0.5  # of the joint-speed limits, within which commands are drawn
 JACOBIAN_STEPS: Final = 4  # of a slow motion that the true Jacobian has to predict
 JACOBIAN_TOLERANCE: Final = 0.05  # of the motion of the feature
-MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which nothing can be told of the Jacobian
+MIN_MOTION: Final = 1e-3  # [natural size of the feature], below which the Jacobian cannot be judged
 
 
 def check_plant(

@@ -20,7 +20,7 @@ from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
-PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second look
+PLAIN: Final = (float, int, np.float64)  # kinds of numbers in diagnostics that need no second check
 
 
 def held_to_contract(plant: Plant, controller: Controller) -> tuple[Plant, Controller]:
@@ -116,15 +116,15 @@ class _HeldPlant(Plant):
         self._plant.close()
 
     def _observation(self, method: Callable[..., Any], signature: str, argument: object) -> Observation:
-        seen, name = _call(method, signature, argument), method.__name__
-        if not isinstance(seen, Observation):
-            text = f"{name} of the plant must return an Observation, got {_kind(seen)}"
+        observation, name = _call(method, signature, argument), method.__name__
+        if not isinstance(observation, Observation):
+            text = f"{name} of the plant must return an Observation, got {_kind(observation)}"
             raise WrongAnswer(f"{text}; write `return Observation(time, joint_position, feature)`", method)
         for what, size in (("joint_position", self.spec.n), ("feature", self.spec.m)):
-            shape = getattr(seen, what).shape
+            shape = getattr(observation, what).shape
             if shape != (size,):
                 raise WrongAnswer(f"{name} of the plant: {what} must have shape ({size},), got {shape}", method)
-        return seen
+        return observation
 
 
 def _call(method: Callable[..., Any], signature: str, *arguments: object) -> Any:  # noqa: ANN401 - any answer

@@ -148,7 +148,7 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
         raise ValueError(f"waypoint file {path}: {error}") from error
 
 
-class View(Reference):
+class ImageReference(Reference):
     """A desired place of the target over time, and its image."""
 
     model: EyeModel
@@ -165,7 +165,7 @@ class View(Reference):
 
 @final
 @dataclass(frozen=True, eq=False)
-class TaughtView(View):
+class TaughtImage(ImageReference):
     """The target where it is with the arm at given joint positions."""
 
     model: EyeModel
@@ -179,7 +179,7 @@ class TaughtView(View):
 
 @final
 @dataclass(frozen=True, eq=False)
-class FollowedCurve(View):
+class FollowedCurve(ImageReference):
     """The target on a curve in space, as above."""
 
     model: EyeModel

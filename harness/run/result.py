@@ -53,7 +53,7 @@ class Ending:
 
     status: str = COMPLETED
     reason: str = ""  # one line with the place; empty for a run that completed
-    trace: str = ""  # lines; empty where there is nothing to look for
+    trace: str = ""  # lines; empty where there is no defect
 
     @classmethod
     def of(cls, error: BaseException) -> Ending:
@@ -139,7 +139,7 @@ def _behind(error: BaseException) -> BaseException:
 
 
 def _place(error: BaseException) -> _Place | None:
-    """Return the line to look at; None for a fault that this package raised."""
+    """Return the place of the defect; None for a fault that this package raised."""
     if isinstance(error, WrongAnswer):
         return _beginning(error.method)
     frames = list(traceback.walk_tb(error.__traceback__))

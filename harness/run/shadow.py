@@ -116,19 +116,19 @@ def shadow(resolved: ResolvedRun, table: pd.DataFrame) -> pd.DataFrame:
         raise ConfigurationError(f"controller {request.controller} fails in row {row} of the log: {fault}") from fault
     finally:
         experiment.plant.close()
-    seen = log.steps().table(request.run_id)
+    steps = log.steps().table(request.run_id)
     names = command_columns(spec)
     if set(names) <= set(table):
-        seen[[LOGGED + name for name in names]] = _columns(table, names)
-    return seen
+        steps[[LOGGED + name for name in names]] = _columns(table, names)
+    return steps
 
 
-def has_commands(seen: pd.DataFrame) -> bool:
+def has_commands(steps: pd.DataFrame) -> bool:
     """Return whether a table of `shadow` has the commands of its log."""
-    return any(str(name).startswith(LOGGED) for name in seen)
+    return any(str(name).startswith(LOGGED) for name in steps)
 
 
-def differences(seen: pd.DataFrame) -> pd.DataFrame:
+def differences(steps: pd.DataFrame) -> pd.DataFrame:
     """Return how far the commands of a table of `shadow` are from those of its log.
 
     Returns:
@@ -137,11 +137,11 @@ def differences(seen: pd.DataFrame) -> pd.DataFrame:
     Raises:
         ConfigurationError: the log had no commands.
     """
-    logged = [name for name in map(str, seen) if name.startswith(LOGGED)]
+    logged = [name for name in map(str, steps) if name.startswith(LOGGED)]
     if not logged:
         raise ConfigurationError(f"the log has no commands to compare with, columns {COMMAND}_…")
     names = [name.removeprefix(LOGGED) for name in logged]
-    was, apart = seen[logged].to_numpy(), seen[names].to_numpy() - seen[logged].to_numpy()
+    was, apart = steps[logged].to_numpy(), steps[names].to_numpy() - steps[logged].to_numpy()
     rms = (np.sqrt(np.mean(each**2, axis=0)) for each in (was, apart))
     joints = [name.removeprefix(f"{COMMAND}_") for name in names]
     columns = ("command", "logged, RMS", "difference, RMS", "difference, largest")

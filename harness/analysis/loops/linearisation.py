@@ -117,8 +117,8 @@ def linearise(servo: Servo, state: ServoState, rest: Rest) -> StateSpace:
     m, n = len(rest.feature), len(rest.joint_position)
 
     def stepped(x: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-        seen = rest.observation(rest.feature + w[:, :m], rest.joint_position + w[:, m : m + n])
-        new, u = servo.step(packing.unpack(x), seen, rest.reference(rest.feature + w[:, m + n :]))
+        measured = rest.observation(rest.feature + w[:, :m], rest.joint_position + w[:, m : m + n])
+        new, u = servo.step(packing.unpack(x), measured, rest.reference(rest.feature + w[:, m + n :]))
         return packing.pack(new, len(x)), u
 
     def differences(dx: FloatArray, dw: FloatArray) -> tuple[FloatArray, FloatArray]:
