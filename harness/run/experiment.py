@@ -1,6 +1,6 @@
 """A run made ready: from names, a mismatch and a seed to the true robot, the task on it, plant and controller.
 
-Settings that are valid one by one and make no run together are refused: times longer than the run, targets out of reach.
+Settings that are valid one by one and make no run together are refused, such as a time longer than the run.
 A target that a task gives as a feature is compared with the reach of the nominal arm, plus a margin for the mismatch: a
 run is refused only where no true robot of that mismatch could do it.
 """
