@@ -5,6 +5,7 @@
 A generated part of a page is everything between two comments, of which the first says what belongs there:
 
     <!-- settings: controllers/laws/mfac.py:MfacConfig -->
+    <!-- metrics: table -->
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
     <!-- stored: dynamics -->
@@ -37,11 +38,13 @@ from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
 from servobench.harness.cli.main import command_line
 from servobench.harness.config.description import describe_settings, toml
+from servobench.harness.run.metrics import METRICS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
 PART = re.compile(
-    r"(<!-- (settings|variables|table|stored|studies|methods|options): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL
+    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options): (\S+) -->\n)(.*?)(<!-- end -->)",
+    re.DOTALL,
 )
 
 
@@ -55,6 +58,7 @@ def renewed(page: Path) -> str:
     """Return the text of a page with its generated parts made anew from the code and the stored tables."""
     make = {
         "settings": lambda part: settings_table(find(part[3])),
+        "metrics": lambda _: metrics_table(),
         "variables": lambda _: variables_table(),
         "studies": lambda _: studies_table(),
         "methods": lambda part: named_methods(part[3]),
@@ -158,6 +162,15 @@ def classes_with_tables() -> frozenset[type[Any]]:
     """Return the classes of settings that have a table on some page."""
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     return frozenset(find(place) for _, kind, place, *_ in PART.findall(text) if kind == "settings")
+
+
+def metrics_table() -> str:
+    """Return the table of the metrics of a run."""
+    rows = [
+        (f"`{metric.column}`", metric.unit or "that of the feature", metric.better or "–", metric.meaning)
+        for metric in METRICS.values()
+    ]
+    return table(("column", "unit", "better", "definition"), rows)
 
 
 def variables_table() -> str:

@@ -20,13 +20,14 @@ from servobench.harness.analysis.comparison import (
     column_of,
     outcomes,
     settling_times,
+    shown_unit,
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.measures import MEASURES
 from servobench.harness.analysis.statistics import Estimate, holm, median_with_interval, signed_rank_p_value
 from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
@@ -42,11 +43,11 @@ Place = tuple[str, pd.DataFrame]  # words, runs
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader should know first. Names of controllers stand between backticks.
+    """The result of a results folder, for its first line. Names of controllers stand between backticks.
 
     Attributes:
         result: one sentence.
-        cautions: what the runs do not show, a sentence each.
+        cautions: limits of the evidence, a sentence each.
     """
 
     result: str
@@ -89,7 +90,7 @@ def knows_truth(name: str) -> bool:
 
 
 def asked_of(runs: pd.DataFrame) -> str:
-    """Return what runs should have done, in the past tense."""
+    """Return the goal of these runs as a verb in the past tense."""
     moves, curves = (len(part) for part in split_tasks(runs))
     return {(True, False): "settled", (False, True): "followed the curve"}.get(
         (moves > 0, curves > 0), "settled or followed the curve"
@@ -99,8 +100,8 @@ def asked_of(runs: pd.DataFrame) -> str:
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
     """Return who came first in each plant, task and condition, and how sure that is; empty without a competition.
 
-    First is who did what was asked most often, then who has the smallest median settling time, on a curve the
-    smallest median error.
+    First is the controller with the highest success rate, then the one that has the smallest median settling time, on
+    a curve the smallest median error.
     """
     places = split_conditions(runs[runs["controller"].isin(ranked_controllers(runs))])
     if len(places) > MOST_PLACES:
@@ -116,16 +117,16 @@ def seeds_needed(controllers: int) -> int:
 
 
 def scores(place: pd.DataFrame) -> tuple[pd.DataFrame, str, int]:
-    """Return what is compared in a place, seeds × controllers, with its unit and digits; infinite where a run failed.
+    """Return the scores of a place, seeds × controllers, with their unit and digits; infinite where a run failed.
 
     That is the settling time of a move, and the error of the judged part of a curve.
     """
     if len(split_tasks(place)[1]):
-        unit, factor = MEASURES["rms_error_evaluated"].scale(place)
+        unit, factor = shown_unit("rms_error_evaluated", place)
         values = factor * column_of(place, "rms_error_evaluated").where(place["status"] == COMPLETED)
-        digits = MEASURES["rms_error_evaluated"].digits
+        digits = METRICS["rms_error_evaluated"].digits
     else:
-        values, unit, digits = settling_times(place), "s", MEASURES["settling_time_s"].digits
+        values, unit, digits = settling_times(place), "s", METRICS["settling_time_s"].digits
     table = place.assign(score=values.fillna(np.inf))
     return table.pivot_table(index="seed", columns="controller", values="score", sort=False), unit, digits
 
@@ -153,7 +154,7 @@ def _of_one_run(runs: pd.DataFrame) -> str:
     name, place = row["controller"], f"{row['task']} on {row['plant']}"
     if row["status"] != COMPLETED:
         return f"`{name}` ended {place} early: {row['status']}."
-    unit, factor = MEASURES["rms_error_evaluated"].scale(runs)
+    unit, factor = shown_unit("rms_error_evaluated", runs)
     if len(split_tasks(runs)[1]):
         verb = "followed" if row["outcome"] in ACHIEVED else f"did not follow ({row['outcome']})"
         return f"`{name}` {verb} {place} with an RMS error of {factor * row['rms_error_evaluated']:.1f} {unit}."

@@ -18,9 +18,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.comparison import settled_share, settling_band, settling_times
 from servobench.harness.analysis.loops.loop_analysis import latency_border
-from servobench.harness.analysis.measures import settling_band
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
@@ -102,7 +101,7 @@ def find_lines(axes: Sequence[str]) -> tuple[Line, ...]:
 
 
 class Scale(NamedTuple):
-    """What a picture of the map shows."""
+    """The quantity that a picture of the map shows."""
 
     measure: Callable[[pd.DataFrame], Estimate]  # of the runs at a place
     label: str
@@ -146,7 +145,7 @@ def make_map(
         The files of the pictures.
 
     Raises:
-        ConfigurationError: a plant with a robot of its own, or what `carry_out` refuses.
+        ConfigurationError: a plant with a robot of its own, or runs that `carry_out` refuses.
     """
     if find_plant(plant).own_robot:
         raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from kit.documents import blocks
 from kit.plants import plant_parameters
@@ -22,14 +20,6 @@ from servobench.harness.gym.vector import ServoVectorEnv
 from servobench.plant.rendered.room import Overview
 
 RENDERS = default_plant()[0] in RENDERED
-
-
-def test_gymnasium_finds_nothing_to_warn_of():
-    env = gymnasium.make(ENVIRONMENT)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped, skip_render_check=not RENDERS)
-    env.close()
 
 
 @pytest.mark.parametrize("sensing", ["position", "pixel:hand"])
