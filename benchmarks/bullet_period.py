@@ -26,7 +26,6 @@ from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.ur5 import nominal_ur5
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]
@@ -68,7 +67,7 @@ class PlainEnvironment:
 
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
-    model = nominal_ur5()
+    model = find_robot("ur5").nominal
     plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
     scenes = [BulletScene(Room(model.arm, config.scenery, find_robot("ur5"))) for _ in range(2)]
     payloads = {"payload": config.drives.payload, "assumed_payload": config.drives.assumed_payload}

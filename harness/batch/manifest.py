@@ -102,7 +102,7 @@ def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
 
 def describe_sensing(word: str) -> dict[str, Any]:
     """Return what a manifest says about a sensing set-up: its features."""
-    eye = find_sensing(word).eye
+    eye = find_sensing(word).setup
     return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras}
 
 

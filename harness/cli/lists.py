@@ -80,9 +80,9 @@ def tasks(
 
 def sensing(as_json: JsonOption = False) -> None:
     """List the sensing set-ups: features that cameras measure."""
-    from servobench.plant.cameras.registry import EYES
+    from servobench.plant.cameras.registry import SETUPS
 
-    _show_names([_described(name, entry.summary) for name, entry in EYES.items()], as_json=as_json)
+    _show_names([_described(name, entry.summary) for name, entry in SETUPS.items()], as_json=as_json)
     if not as_json:
         console.print("\nEach with fixed cameras or with cameras on the hand, as pixel:hand; or a file of your own.")
 

@@ -18,7 +18,7 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, enlarged, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
@@ -56,7 +56,7 @@ class PointTask(Task):
         """See `Task.scenario`."""
         start, target = (as_vector(name, getattr(self, name), setting.n) for name in ("start", "target"))
         robot, true = setting.taught_on()
-        if self.into_view and isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+        if self.into_view and isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
             start, target = drawn_together(start, target, robot, setting.nominal, true)
         return setting.move(start, setting.taught(target), self.duration)
 
@@ -119,7 +119,7 @@ class RandomTask(Task):
         if not (lower < upper).all():
             raise ValueError("lower must be below upper for every joint")
         generator = named_generator(setting.seed, "start_and_target")
-        if isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+        if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
             box = Box(lower, upper, self.shortest, self.lowest)
             start, target = draw_in_view(box, robot, setting.nominal, true, generator)
             return setting.move(start, setting.taught(target), self.duration)
