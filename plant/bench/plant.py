@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
-from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -191,13 +191,6 @@ class PlantSetup:
         if self.model is None or self.start is None:
             raise ValueError("model and start must be given for this plant, got None")
         return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
-
-    def ball_robot(self) -> tuple[HandEyeModel, FloatArray]:
-        """Return model and start for a plant that sees the ball in 3-D by a fixed camera only; errors as in `robot`."""
-        model, start = self.robot()
-        if not isinstance(model, HandEyeModel):
-            raise ValueError("model must be of a ball that is seen in 3-D by a fixed camera for this plant")  # noqa: TRY004
-        return model, start
 
 
 @dataclass(frozen=True)

@@ -56,13 +56,8 @@ class Sensor:
         """
         self._config, self.jitters = config, config.jitter > 0.0
         self._scale = config.noise_factor * config.feature_noise
-        offset = config.noise_offset / config.feature_noise if config.feature_noise > 0.0 else 0.0
-        family = family_of(
-            config.noise, share=config.noise_share, offset=offset, spread=config.noise_spread,
-            stability=config.stability, skewness=config.skewness,
-        )  # fmt: skip
         stream: Callable[..., Stream] = partial(Stream, seed)
-        self._noise = stream("feature_noise", family, (m,), self._scale)
+        self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
         self._losses, self._lateness = stream("dropped_frames", "random"), stream("late_frames", "random")
         self._outlier_begins, self._occlusion_begins = stream("outliers", "random"), stream("occlusions", "random")
         self._outlier_values = stream("outlier_values", directions, (m,), config.outlier_size)

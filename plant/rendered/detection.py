@@ -317,6 +317,14 @@ def whole(camera: PinholeCamera) -> Window:
 def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
     """Return the window outside of which no pixel shows a ball, with a margin for noise; None where none does.
 
+    A sphere of radius R about (x, y, z) in the camera frame appears between the columns and rows at which the planes
+    through the lens that contain one axis of the image touch it:
+
+        (x z ± R √(x² + z² − R²)) / (z² − R²)        of x/z, and likewise of y/z
+
+    Nothing else in a rendered room has the ball's colour, so an image that is cut to this window gives the same
+    detection as all of it.
+
     Args:
         centre: (3,) [m], of the ball in the camera frame.
         radius: [m].

@@ -32,10 +32,8 @@ from servobench.plant.robot.robot import Robot
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
-POSITION_SHARE, INTEGRAL_SHARE = (
-    0.25,
-    0.1,
-)  # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
+# [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
+POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
 RATED_PAYLOAD = 5.0  # [kg] of a UR5
 MAX_FOLLOWING_ERROR = 0.1  # [rad] the reference waits for a joint that falls behind further

@@ -8,18 +8,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.detection import ByteArray, Window
+from servobench.plant.rendered.drives import DriveConfig
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from servobench.plant.rendered.detection import ByteArray, Window
-    from servobench.plant.rendered.drives import DriveConfig
-    from servobench.plant.rendered.room import Room
 
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import mujoco
@@ -27,17 +27,13 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.detection import Window, whole
+from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
 from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
 from servobench.plant.robot.robot import GRAVITY
-
-if TYPE_CHECKING:
-    from servobench.plant.contract.checks import FloatArray
-    from servobench.plant.rendered.detection import ByteArray
-    from servobench.plant.rendered.room import Room
 
 if mujoco.get_mju_user_warning() is None:
     # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; a wrong motion shows in the joints.
@@ -268,7 +264,16 @@ class MujocoState(NamedTuple):
 
 
 class MujocoSimulation(Simulation):
-    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next."""
+    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next.
+
+    A physics step is MuJoCo's own, with the implicit integrator `implicitfast`:
+
+        M(θ) ω̇ = T − b(θ, ω) − B ω + τ,        τ: of dry friction and of the stops, solved as constraints
+
+    T is the torque of `servobench.plant.rendered.drives`, M includes the rotors and b the true load. The gravity torque
+    by which the drives compensate is MuJoCo's, too, as if the load were the assumed one. Contact is only detected:
+    bodies do not push each other.
+    """
 
     def __init__(self, machine: Machine) -> None:
         """Load the arm.
