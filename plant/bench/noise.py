@@ -55,7 +55,7 @@ def mixture(
 
 
 def bimodal(generator: np.random.Generator, shape: Shape, *, share: float, offset: float) -> FloatArray:
-    """Return normal numbers of deviation 1, of which two equal shares are displaced to either side.
+    """Return normal numbers of deviation 1, with equal shares displaced to either side.
 
     Args:
         generator: of the random numbers.
@@ -105,7 +105,7 @@ def uniform(generator: np.random.Generator, shape: Shape) -> FloatArray:
 
 
 def family_of(config: SensingConfig) -> Draw:
-    """Return the noise of a sensor with settings `config`, in multiples of its deviation σ; a family is a row here."""
+    """Return the noise of a sensor with settings `config`, in multiples of its deviation σ; a row for each family."""
     share, offset = config.noise_share, 0.0
     if config.feature_noise > 0.0:
         offset = config.noise_offset / config.feature_noise

@@ -36,7 +36,7 @@ CONTACT_DISTANCE = 8  # place of the distance in a contact point of PyBullet; ne
 
 @contextlib.contextmanager
 def without_banner(descriptor: int = STANDARD_ERROR) -> Iterator[None]:
-    """Let nothing reach a file descriptor within the context, and afterwards all that came but the banner."""
+    """Hold back the output to a file descriptor within the context, and write it afterwards without the banner."""
     try:
         kept = os.dup(descriptor)
     except OSError:  # it is closed, so nothing can be printed
@@ -60,7 +60,7 @@ with without_banner():
 
 
 def describe_renderer() -> str:
-    """Return which engine renders images, its version, and how they arrive from it."""
+    """Return the engine that renders images, its version, and a note if its images arrive slowly."""
     images = "" if pybullet.isNumpyEnabled() else ", built without numpy: images arrive as tuples, which is slower"
     return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
 

@@ -62,7 +62,7 @@ class Patch:
     columns: IntArray
 
     def shifted(self, rows: int, columns: int) -> Patch:
-        """Return the patch so many pixels further down and to the right."""
+        """Return the patch shifted by numbers of pixels down and to the right."""
         return Patch(self.rows + rows, self.columns + columns)
 
 
@@ -200,7 +200,7 @@ def find_ball(
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
-    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    """Return the area, px², of the ellipse of a sphere at `centre` (3,) m, which is stretched off the optical axis."""
     nearest2 = centre[2] ** 2 - radius**2
     return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
 

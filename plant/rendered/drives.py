@@ -127,7 +127,7 @@ class RigidBody(NamedTuple):
 
 
 class InPlace:
-    """A function of CasADi on arrays, which it reads and writes where they are."""
+    """A function of CasADi that reads its arguments and writes its results in place."""
 
     def __init__(
         self, function: casadi.Function, arguments: Sequence[FloatArray], results: Sequence[FloatArray]
@@ -207,7 +207,7 @@ class Drives:
         return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity)
 
     def take(self, state: DriveState, command: FloatArray) -> None:
-        """Go on from a state of joints and loops under a command (n,) [rad/s]."""
+        """Set the state of joints and loops, and the command (n,) [rad/s]."""
         self.command[:], self.angle[:], self.speed[:] = command, state.angle, state.speed
         self._loops[:] = state[2:]
 
@@ -243,7 +243,7 @@ class Drives:
         self.speed[:] = np.where(self.angle == moved, speed, 0.0)
 
     def _reference_law(self, n: int) -> casadi.Function:
-        """Return (blend, u, loops) -> loops with the reference one physics step further."""
+        """Return (blend, u, loops) -> loops with the reference one physics step later."""
         arguments = blend, u, loops = _symbols(blend=1, u=n, loops=3 * n)
         r, c, z = casadi.vertsplit(loops, n)
         return casadi.Function("reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)])
@@ -264,7 +264,7 @@ class Drives:
         return casadi.Function("step", arguments, [after, torque, self._drag(omega)])
 
     def _followed(self, blend: SX, u: SX, r: SX, c: SX) -> tuple[SX, SX]:
-        """Return the reference r and its speed c one physics step further; it stops at the stops.
+        """Return the reference r and its speed c one physics step later, limited to the stops.
 
         `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would then simplify the sum.
         """

@@ -44,7 +44,7 @@ class Scene(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the engine's world; calling it twice is allowed."""
+        """Close the engine's world; calling it twice is allowed."""
 
 
 class OpenScene(Protocol):
@@ -106,11 +106,11 @@ class Overlap(NamedTuple):
 
 
 class Simulation(ABC):
-    """An arm with mass and drives among obstacles; its state is a value that goes in and comes out."""
+    """An arm with mass and drives among obstacles; methods take its state and return a new one."""
 
     @abstractmethod
     def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - `Joints` of its own, as below
-        """Return joints at rest at `angle` (n,) [rad] whose drives carry the arm's weight."""
+        """Return joints at rest at `angle` (n,) [rad] with drives that carry the arm's weight."""
 
     @abstractmethod
     def advance(self, joints: Any, speed: FloatArray, steps: int) -> Any:  # noqa: ANN401
@@ -132,7 +132,7 @@ class Simulation(ABC):
 
 
 class Engine(NamedTuple):
-    """A physics engine: how its scenes and simulations are opened.
+    """A physics engine, by the constructors of its scenes and simulations.
 
     Attributes:
         scene: for the camera.

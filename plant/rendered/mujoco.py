@@ -93,7 +93,7 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
 
 @contextmanager
 def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
-    """Let OpenGL fill no pixel of the current context outside of a rectangle, counted from the lower left corner."""
+    """Restrict OpenGL in the current context to a rectangle of pixels, counted from the lower left corner."""
     from OpenGL import GL  # noqa: PLC0415 - chooses the platform that `open_context` has loaded
 
     GL.glEnable(GL.GL_SCISSOR_TEST)
@@ -215,7 +215,7 @@ class MujocoScene(Scene):
 
 
 def _compile(room: Room) -> Any:  # noqa: ANN401
-    """Return the model of all that is drawn, an `MjModel`."""
+    """Return the model of all drawn bodies, an `MjModel`."""
     files = room.files()
     (_, spec), *around = [(name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")]
     for name, body in around:
@@ -372,7 +372,7 @@ def _assumed_inertia(machine: Machine) -> FloatArray:
 
 
 def _solid(machine: Machine) -> tuple[Any, dict[int, str]]:
-    """Return the model of all that can be met, an `MjModel`, and the names of its boxes by number."""
+    """Return the model of all collision shapes, an `MjModel`, and the names of its boxes by number."""
     spec = read_urdf(arm_mechanics(machine.arm, 0.0, shapes=True, robot=machine.robot))
     boxes = (*room_boxes(machine.robot.workspace.scale), *machine.boxes)
     for box in boxes:
