@@ -30,7 +30,7 @@ from servobench.plant.cameras.symbolic import (
     feature_and_jacobian,
     features,
     points_in_cameras,
-    seen_features,
+    valid_features,
 )
 from servobench.plant.contract.checks import FloatArray
 
@@ -151,7 +151,7 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
     geometry = _view(part, arm, view)
     points = points_in_cameras(q, geometry, view.mount)
     feature = features(points, geometry.optics, view.setup)
-    seen = seen_features(points, geometry.optics, view.setup)
+    seen = valid_features(points, geometry.optics, view.setup)
     return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
 
 
