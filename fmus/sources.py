@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,7 @@ def _initialiser(name: str, values: list[str]) -> str:
     return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"
 
 
+@cache
 def kinematics_source(layout: ArmLayout) -> str:
     """Return the C source of the kinematic core for the arm that `layout` describes."""
     return generated_source("kinematics", _core_functions(layout))
