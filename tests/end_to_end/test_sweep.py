@@ -12,7 +12,7 @@ import pytest
 from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import CHUNK
-from servobench.harness.batch.plan import Batch, SweepPlan, parse_variation
+from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 
@@ -116,11 +116,22 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
         (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens': did you mean 'links'? valid: "),
         (("--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
         (("--vary", f"links={'9' * 320}:30:10%"), "of links is empty"),
-        (("--noise", "loud"), "--noise must be comma-separated numbers, got 'loud'"),
-        (("--noise", "-1"), "--noise must be numbers from 0 on, got '-1'"),
-        (("--latency", "1,2"), "--latency is in seconds, below 1, such as 0.05 for a period of 20 Hz; got '1,2'"),
-        (("--period", "fast"), "--period must be comma-separated numbers, got 'fast'"),
-        (("--period", "0"), "run: period must be above 0, got 0.0"),
+        (("--noise", "loud"), "kinematic.sensing.noise_factor must be a number, got 'loud'"),
+        (("--noise", "-1"), "kinematic.sensing.noise_factor must be at least 0, got -1"),
+        (("--period", "fast"), "run.period must be a number, got 'fast'"),
+        (("--period", "0"), "run.period must be above 0, got 0"),
+        (("--vary", "run.period=0:0.2:0.05"), "run.period must be above 0, got 0"),
+        (("--vary", "run.perod=0.1"), "run has no setting 'perod': did you mean 'period'?"),
+        (("--vary", "plant.lag=1:0:0.5"), "--vary: the range '1:0:0.5' of plant.lag is empty"),
+        (("--vary", "plant.lag="), "--vary plant.lag needs values, such as run.period=0.02,0.05"),
+        (("--vary", "plant.lag=0,0"), "--vary plant.lag names 0 twice"),
+        (("--vary", "latency=0,0.1", "--latency", "0"), "--vary gives latency twice"),
+        (("--vary", "latency=0,0.1", "--vary", "plant.sensing.latency=0"), "a setting is varied twice in latency"),
+        (("--vary", "bullet.lag=0.1"), "the setting bullet.lag cannot be varied in runs of rbfnn_mfac on kinematic"),
+        (
+            ("--vary", "plant.sensing.jitter=0.1", "--mismatch", "jitter=50ms"),
+            "is varied, and the mismatch jitter=50ms",
+        ),
         (("--period", "0.0333"), "period must be a whole number of milliseconds"),
         (("--scheduler", "nowhere"), "--scheduler needs an address such as tcp://127.0.0.1:8786, got 'nowhere'"),
         (("--mismatch", "moderate,moderate"), "--mismatch names moderate twice"),
@@ -148,11 +159,11 @@ def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(undisturbed
 
 def test_variations_are_put_on_top_of_the_mismatch_one_by_one():
     batch = Batch(("kinematic",), ("constant",), ("random",), ("none", "moderate"), (0, 1))
-    plan = SweepPlan(batch, (parse_variation("links=10/20%"), parse_variation("tool=5mm")), (1.0,), (None, 2))
+    plan = SweepPlan.parse(batch, ("links=10/20%", "tool=5mm", "latency=0,2"))
     cells = plan.cells()
     assert len(cells) == 3 * 2 * 2 * 2
     assert {str(cell.request.mismatch) for cell in cells} == {
         "links=10%", "moderate+links=10%", "links=20%", "moderate+links=20%", "tool=5mm", "moderate+tool=5mm",
     }  # fmt: skip
     with pytest.raises(ConfigurationError, match="--vary: unknown mismatch axis"):
-        parse_variation("zoom=1:2:1")
+        SweepPlan.parse(batch, ["zoom=1:2:1"])

@@ -14,7 +14,10 @@ from servobench.plant.robot.mismatch import Mismatch
 
 @pytest.mark.parametrize("controller", [*controller_names(), "mfac+rls"])
 def test_a_resolved_run_can_be_sent_to_another_process(controller):
-    run = resolve(RunRequest("kinematic", controller, "circle", Mismatch("moderate"), 3, 2.0, 0.05), Settings())
+    run = resolve(
+        RunRequest("kinematic", controller, "circle", Mismatch("moderate"), 3, {"noise": 2.0, "latency": 0.05}),
+        Settings(),
+    )
     again = pickle.loads(pickle.dumps(run))
     assert (again.request, again.run, again.plant, again.task) == (run.request, run.run, run.plant, run.task)
     assert repr(again.controller) == repr(run.controller)
@@ -23,7 +26,9 @@ def test_a_resolved_run_can_be_sent_to_another_process(controller):
 def test_a_resolved_run_holds_what_the_user_set_and_what_the_request_varies():
     law = {"law": {"gain": 4.0}}
     settings = Settings({"run": {"preview_time": 0.15}, "circle": {"laps": 1}, "ukf_mfac": law})
-    run = resolve(RunRequest("kinematic", "ukf_mfac", "circle", Mismatch(), 0, latency=0.1, period=0.02), settings)
+    run = resolve(
+        RunRequest("kinematic", "ukf_mfac", "circle", Mismatch(), 0, {"latency": 0.1, "period": 0.02}), settings
+    )
     assert run.run == RunSettings(0.02, 0.15)
     assert run.task.laps == 1
     assert run.controller.law.gain == 4.0
