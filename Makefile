@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UNIT := tests/plant tests/controllers tests/fmus tests/harness
 RUNS ?= results/pages
+NIGHT := PYTHONPATH=tests:benchmarks $(BIN)/python -m night
 
 .PHONY: run check test results nightly golden lint format tables docs release benchmark lock clean
 
@@ -13,11 +14,11 @@ run: $(VENV)/ready
 
 # For every save: half a minute.
 check: lint
-	$(BIN)/python -m pytest -n auto $(UNIT)
+	$(BIN)/python -m pytest -n auto --dist loadgroup $(UNIT)
 
 # For every change: the unit folders, statistics over runs (closed_loop), processes, compilers and browsers (end_to_end).
 test: lint
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 # Renew every measured table and picture of the pages: a night. The same call goes on after an interruption;
 # ONLY=held_out,rates renews these, RUNS is the folder of the runs. docs/experiments.md lists the studies.
@@ -26,19 +27,21 @@ results: $(VENV)/ready
 
 # Too long for every change: whether each block of the first pages runs, whether the stored figures of these studies come out again,
 # whether FMPy runs exported loops as the harness does, whether a sweep with hostile controllers loses no run, and whether the unit
-# tests notice small faults in the code; writes nothing into the pages. What the tests did not notice is listed in results/mutation.
+# tests notice small faults in the code; writes nothing into the pages. Unnoticed faults are listed in results/mutation. The tools are
+# in benchmarks/night.
 nightly: $(VENV)/ready
 	SERVOBENCH_NIGHTLY=1 $(BIN)/python -m pytest tests/end_to_end/test_first_hour.py
-	$(BIN)/python tests/fuzz/campaign.py --inputs 1000000
-	PYTHONPATH=tests $(BIN)/python -m kit.random_calls --calls 10000000
-	PYTHONPATH=tests $(BIN)/python -m kit.system_loops
-	PYTHONPATH=tests $(BIN)/python -m kit.breaking
-	PYTHONPATH=tests $(BIN)/python -m kit.breaking --steps --runs 12
-	PYTHONPATH=tests $(BIN)/python -m kit.breaking --caches
+	PYTHONPATH=tests:benchmarks $(BIN)/python -m pytest -p conftest benchmarks/night
+	$(NIGHT).fuzzing --inputs 1000000
+	$(NIGHT).random_calls --calls 10000000
+	$(NIGHT).system_loops
+	$(NIGHT).file_faults
+	$(NIGHT).file_faults --steps --runs 12
+	$(NIGHT).file_faults --caches
 	$(BIN)/servobench tune --check --out results/nightly_tuning
 	$(BIN)/python docs/renewal.py pairs,worlds,claims --check --runs results/nightly
-	$(BIN)/python benchmarks/hard_night.py --runs 10000
-	$(BIN)/python tests/kit/mutation.py
+	$(NIGHT).hostile_sweep --runs 10000
+	$(NIGHT).mutation
 
 # Make the golden runs anew (tests/closed_loop/golden_runs.csv), and how far rounding moves them; prints a line for CHANGELOG.md.
 golden: $(VENV)/ready

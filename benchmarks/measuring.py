@@ -1,11 +1,11 @@
-"""What several benchmarks share: the methods, processor time, tables in Markdown, fitted exponents and pictures."""
+"""Shared parts of the benchmarks: the methods, processor time, tables in Markdown, fitted exponents and pictures."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import time
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -19,14 +19,6 @@ if TYPE_CHECKING:
     MeasurePeriods: TypeAlias = Callable[[RenderedConfig, int], FloatArray]
 
 METHODS = ("ukf_mfac:published", "ukf_mpc:published", "rbf_pid:published", "rbfnn_mfac:published", "map_mfac")
-EARLIER = {"map_mfac": "rbfnn_mfac_plus"}  # in checkouts before the aids, where the others had no divisions
-
-
-def name_in(known: Container[str], method: str) -> str:
-    """Return what a checkout that knows these controllers calls a method."""
-    return method if method in known else EARLIER.get(method, method.partition(":")[0])
-
-
 PERIODS = 200  # of a run of the task random
 FIRST_SEED = 40_000
 WIDTH, DOTS_PER_INCH = 7.5, 110
@@ -41,12 +33,10 @@ def asked_to_be_quick(description: str | None) -> bool:
 
 def resolved_runs(plant: str, method: str, count: int, duration: float | None = None) -> list[Any]:
     """Return runs with moderate mismatch, and with another duration [s] if one is given."""
-    from servobench.harness.config.registry import controller_names
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
     from servobench.harness.run.resolution import resolve
 
-    method = name_in(controller_names(), method)
     settings, mismatch = Settings({"random": {"duration": duration}} if duration else {}), cast(Any, "moderate")
     return [resolve(RunRequest(plant, method, "random", mismatch, FIRST_SEED + i), settings) for i in range(count)]
 

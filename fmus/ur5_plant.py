@@ -56,7 +56,7 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
     Args:
         fmi_version: 2 or 3.
         robot: None for the UR5.
-        sensing: what its cameras see; None for the ball in 3-D by a fixed one.
+        sensing: set-up of cameras; None for the ball in 3-D by a fixed one.
 
     Raises:
         CompilerMissing: it has to be built and there is no compiler.

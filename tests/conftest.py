@@ -1,9 +1,10 @@
-"""Numpy errors raise in tests, examples stay the same and have no deadline, and the user's cache is not touched."""
+"""Numpy errors raise in tests, examples stay the same, the user's cache is not touched, and interrupts arrive."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import signal
 import tempfile
 
 import numpy as np
@@ -22,6 +23,14 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.mkdtemp(prefix="servobench-tests-")
     config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     os.environ["XDG_CACHE_HOME"] = folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _interrupts_arrive():
+    """Handle SIGINT, which `nohup`, a shell's `&` and some programs leave ignored for all processes below them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(autouse=True)

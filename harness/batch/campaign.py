@@ -23,7 +23,8 @@ from servobench.harness.batch.integrity import check_resumable, mend, restore_ma
 from servobench.harness.batch.lock import Lock, check_empty, is_unused, locked
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
-from servobench.harness.batch.workers import Bounds, Workers, open_workers
+from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.workers import Workers, open_workers
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Assignment, ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once
@@ -126,11 +127,10 @@ def _carry_out_at(
     manifest = describe_batch(runs, sections, side_by_side, own, steps=campaign.steps)
     for name, engine in manifest["engines"].items():
         how.observer.note(f"{name}: {engine}")
-    resume = how.resume and not is_unused(folder)
-    with locked(folder, new=not resume) as lock:
+    with locked(folder, new=not how.resume) as lock:
         if lock.stale is not None:
             how.observer.note(f"note: {folder} was left by {lock.stale}; its lock is free")
-        if resume:
+        if how.resume and not is_unused(folder):  # under the lock: another process may have begun in the meantime
             prepare_folder(folder, manifest, how.observer)
         else:
             results.create_folder(folder, manifest)

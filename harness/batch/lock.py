@@ -253,5 +253,10 @@ def is_unused(folder: Path) -> bool:
     """Return whether a folder is empty, or holds only what a batch leaves that ended before its first run."""
     if not folder.is_dir():
         return False
-    inside = (path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name))
-    return all(path.name == PARTS and path.is_dir() and not any(path.iterdir()) for path in inside)
+    try:
+        inside = (
+            path for path in folder.iterdir() if path.name not in (LOCK, SUMS) and not PARTIAL.fullmatch(path.name)
+        )
+        return all(path.name == PARTS and path.is_dir() and not any(path.iterdir()) for path in inside)
+    except FileNotFoundError:  # another process has just put its parts together
+        return False

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.run.log import Steps
-from servobench.harness.run.tasks import Scenario
+from servobench.harness.run.scenario import Scenario
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.inverse import closest_distance

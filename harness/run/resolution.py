@@ -18,7 +18,8 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings, nest
 from servobench.harness.run.request import RunRequest, RunSettings, Varied
-from servobench.harness.run.tasks import TASKS, find_task, taught
+from servobench.harness.run.scenario import Task
+from servobench.harness.run.tasks import TASKS, find_task, fitted
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.settings import override
 from servobench.plant.robot.robot import Robot
@@ -56,7 +57,7 @@ class ResolvedRun:
     run: RunSettings
     plant: Any
     controller: Any
-    task: Any
+    task: Task
 
 
 def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
@@ -96,7 +97,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
         name: default_config(find_controller(name), model_known=robot.known)
         for name in dict.fromkeys(each.controller for each in requests)
     }
-    defaults |= {name: taught(find_task(name), robot) for name in dict.fromkeys(each.task for each in requests)}
+    defaults |= {name: fitted(name, robot) for name in dict.fromkeys(each.task for each in requests)}
     return Sections({name: settings.resolve(name, default) for name, default in defaults.items()})
 
 

@@ -18,9 +18,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.comparison import settled_share, settling_band, settling_times
 from servobench.harness.analysis.loops.loop_analysis import latency_border
-from servobench.harness.analysis.measures import settling_band
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -147,14 +146,6 @@ def test_every_run_has_a_robot_of_its_own_and_every_condition_plain_and_turned_c
     assert twice[0].seed == twice[14].seed
 
 
-def test_conditions_cover_latencies_up_to_150_ms_noise_and_curves_and_moves_weigh_like_curves():
-    assert {condition.latency for condition in CONDITIONS if condition.task == MOVE} == {0.0, 0.05, 0.1, 0.15}
-    assert {condition.noise_factor for condition in CONDITIONS} == {1.0, 4.0}
-    assert {condition.task for condition in CONDITIONS} == {MOVE, "circle", "lemniscate"}
-    weights = [sum(each.weight for each in CONDITIONS if (each.task == MOVE) == moves) for moves in (True, False)]
-    assert weights == pytest.approx([0.5 * len(CONDITIONS)] * 2)
-
-
 def test_on_one_circle_commands_take_effect_at_once_and_on_the_others_with_the_delay_of_the_plant():
     entry = find_tunable("constant")
     circles = [run for run in SMALL.runs() if run.task == "circle"]
@@ -201,15 +192,6 @@ def test_a_better_tuned_controller_has_the_better_score():
     for trial, run, cost in evaluate(trials, runs, Workers()):
         costs[trial, run] = cost
     assert (costs[0] < 0.5 * costs[1]).all()
-
-
-def test_the_delay_of_the_set_reaches_the_plant():
-    entry = find_tunable("calibrated")
-    without = {"law": {"proportional_gain": 6.0}, "aids": {"delay": "ignored", "response": "ignored"}}
-    trial = Trial("calibrated", apply_settings(entry, without))
-    prompt, late = SMALL.runs()[0], replace(SMALL.runs()[0], varied=SMALL.runs()[2].varied)
-    costs = {run: cost for _, run, cost in evaluate([trial], [prompt, late], Workers())}
-    assert costs[0] < costs[1]
 
 
 def checked_score(tuned, settings):
@@ -261,17 +243,3 @@ def test_a_change_that_gains_little_is_no_improvement():
     little, much = (Change("rls", "law.damping", 1.0, 1.2, 1.0, after) for after in (0.975, 0.965))
     assert improvements([little, much]) == [much]
     assert much.gain == pytest.approx(0.035)
-
-
-@pytest.mark.parametrize(
-    ("name", "keys", "count"),
-    [
-        ("calibrated", ("law.damping", "law.integral_gain"), 5),
-        ("map_mfac", ("aids.delay", "aids.filter", "aids.feedforward", "aids.limit"), 6),
-    ],
-)
-def test_a_sample_of_the_whole_check_no_other_value_helps(name, keys, count, tmp_path):
-    """The whole check, of every value of every method, is part of `make nightly`."""
-    check = Check(tmp_path, (name,), TuningSet().second(), keys)
-    assert len(list(check.carry_out(Workers()))) == len(check) == count
-    assert improvements(check.changes()) == []

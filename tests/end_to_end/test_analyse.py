@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from kit.command import servobench
 
@@ -31,20 +30,6 @@ def test_every_loop_can_be_identified(monkeypatch, capsys, tmp_path):
     assert "identified in small motions" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "analyse.csv")
     assert table["model"].tolist() == ["identified"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("pdi+true",), "law must be one of"),
-        (("pid+true", "--jacobian", "exact"), "--jacobian must be one of true, nominal, estimated, got 'exact'"),
-        (("pid+true", "--seed", "-1"), "seed must be a non-negative integer, got -1"),
-        (("pid+true", "--set", "pid.law.gain=1"), "unknown section 'pid'"),
-    ],
-)
-def test_what_cannot_be_analysed_is_one_line(monkeypatch, capsys, tmp_path, arguments, message):
-    assert servobench(monkeypatch, "analyse", *arguments, "--out", str(tmp_path)) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_the_loop_of_another_arm_is_analysed(monkeypatch, tmp_path):

@@ -234,21 +234,3 @@ def test_the_command_answers_from_real_runs_and_says_the_same_again(monkeypatch,
     wanted.write_text(wanted.read_text().replace("faster in", "faster by far in"))
     assert servobench(monkeypatch, *again) == 1
     assert "claim 1 on kinematic, best equipped: now" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--seeds", "3"), "--seeds must be at least 6"),
-        (("--check", "nowhere.csv"), "nowhere.csv is not a table of answers"),
-        (("--division", "none"), "--division must be one of both, equipped, published, got 'none'"),
-        (("--plants", "moon"), "unknown plant 'moon'"),
-        (("--resume", "--scheduler", "nowhere"), "--scheduler needs an address"),
-    ],
-)
-def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, arguments, message):
-    assert servobench(monkeypatch, "claims", "--out", str(tmp_path / "out"), *arguments) == 2
-    errors = capsys.readouterr().err
-    assert message in errors
-    assert errors.count("\n") == 1
-    assert not (tmp_path / "out").exists()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from kit.command import finish, judged, part_count, servobench, start, wait_for
+from kit.command import judged, servobench
 from kit.plants import NEEDS_BULLET
-from servobench.harness.batch import results
 
 
 @pytest.mark.parametrize(
@@ -72,55 +73,13 @@ def test_the_same_seeds_give_the_same_tables_bit_for_bit_in_one_process_and_in_t
         pd.testing.assert_frame_equal(single, double, check_exact=True)
 
 
-@NEEDS_BULLET
-@pytest.mark.parametrize(
-    ("assignment", "message"),
-    [
-        ("run.period=0.0333", "period must be a whole number of milliseconds, because latency is no multiple of the"),
-        ("bullet.sensing.feature_noise=-1", "bullet.sensing.feature_noise must be"),
-    ],
-)
-def test_bad_settings_of_the_rendered_plant_are_one_line_and_nothing_is_written(
-    monkeypatch, capsys, tmp_path, assignment, message
-):
-    monkeypatch.chdir(tmp_path)
-    assert servobench(monkeypatch, "run", "--plant", "bullet", "--set", assignment) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.startswith("servobench: ")
-    assert error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-BATCH = ("compare", "--seeds", "100", "--controllers", "constant", "--tasks", "exp2", "--workers", "2")
-
-
-def test_ctrl_c_keeps_what_is_finished(tmp_path):
-    out = tmp_path / "out"
-    process = start(*BATCH, "--out", str(out))
-    wait_for(lambda: part_count(out) >= 3)
-    os.killpg(process.pid, signal.SIGINT)
-    code, output = finish(process)
-    assert code == 130, output
-    assert "Traceback" not in output
-    assert "--resume" in output
-    assert 3 <= len(results.load_runs(out)) < 100
-
-
-def test_a_killed_batch_keeps_every_finished_run_and_can_be_resumed(monkeypatch, capsys, tmp_path):
-    out = tmp_path / "out"
-    process = start(*BATCH, "--out", str(out))
-    wait_for(lambda: part_count(out) >= 3)
-    assert servobench(monkeypatch, *BATCH, "--out", str(out), "--resume") == 2
-    assert "is being written by process" in capsys.readouterr().err
-    os.killpg(process.pid, signal.SIGKILL)
-    finish(process)
-    finished = results.load_runs(out)
-    assert servobench(monkeypatch, "collect", str(out)) == 0
-    assert len(pd.read_parquet(out / "runs.parquet")) == len(finished)
-    assert servobench(monkeypatch, *BATCH, "--out", str(out), "--resume", "--no-report") == 0
-    runs = pd.read_parquet(out / "runs.parquet")
-    assert 3 <= len(finished) < len(runs) == 100
-    kept = runs[runs["run_id"].isin(finished["run_id"])].reset_index(drop=True)
-    pd.testing.assert_frame_equal(kept, finished)  # with the times: these runs were not carried out again
-    assert set(pd.read_parquet(out / "steps.parquet")["run_id"]) == set(runs["run_id"])
+def test_tests_that_are_started_with_interrupts_ignored_can_interrupt_nevertheless(tmp_path):
+    (tmp_path / "test_handler.py").write_text(
+        "import signal\n\n\ndef test_it():\n    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
+    )
+    tests = [sys.executable, "-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "test_handler.py"]
+    done = subprocess.run(
+        ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *tests], cwd=tmp_path, check=False, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout

@@ -87,7 +87,6 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
         (2, {"folder": "riscv64-plan9"}, "", "has no library for this machine; wanted "),
         (3, {"description": SCHEDULED_ONLY}, "", "offers scheduled execution only; wanted co-simulation or model"),
         (2, {}, "[parameters]\nquirk = 2\n", "crane.fmu returned something that is not finite for place.luff"),
-        (2, {}, "[parameters]\nquirk = 5\n", "fmi2EnterInitializationMode returned error"),
         (
             3,
             {"description": describe_with(3, 'start="2"', 'start="3"')},
@@ -95,13 +94,6 @@ def test_a_file_that_is_no_usable_fmu_is_one_line_from_every_command(case, monke
             "reading wheel[1], wheel[2], wheel[3], … returned",
         ),
         (3, {"description": describe_with(3, 'start="2"', 'start="two"')}, "", "a broken modelDescription.xml: "),
-        (
-            3,
-            {},
-            "[truth]\njacobian = 'wheel'\n",
-            "truth.jacobian must name 4 numbers for 2 inputs and 2 features, got 2",
-        ),
-        (3, {}, "[parameters]\narm = [1.0, 2.0, 3.0]\n", "parameter 'arm' must have 2 values, got 3"),
     ],
 )
 def test_an_fmu_that_does_not_fit_is_one_line(
@@ -120,9 +112,6 @@ def test_an_fmu_that_does_not_fit_is_one_line(
     ("version", "quirk", "message"),
     [
         (2, 1, "fmi2DoStep returned error; the FMU said: load 900 kg is too heavy at noon"),
-        (3, 1, "fmi3DoStep returned error; the FMU said: load 900 kg is too heavy at noon"),
-        (2, 4, "fmi2DoStep returned discard"),
-        (2, 7, "crane.fmu returned something that is not finite for place.luff"),
         (3, 7, "crane.fmu returned something that is not finite for place[2]"),
     ],
 )

@@ -5,13 +5,12 @@ from __future__ import annotations
 import zipfile
 
 import numpy as np
-import pytest
 from typer.testing import CliRunner
 
 from servobench.fmus.inspection import read_information
 from servobench.fmus.ur5_plant import cached_fmu
 from servobench.harness.cli.fmu import fmu_app
-from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build_experiment
 from servobench.harness.run.request import RunRequest
 
@@ -41,25 +40,6 @@ def test_an_exported_robot_is_that_of_the_run_with_the_same_mismatch_and_seed(tm
     run = build_experiment(RunRequest("kinematic", "constant", "exp2", "severe", 3), Settings())
     exported = np.array(start["joint_offset"].split(), dtype=float)
     np.testing.assert_allclose(exported, run.drawn.sample.joint_offset, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("export", "-o", "ur5.fmu", "--fmi", "1"), "fmi_version must be 2 or 3"),
-        (("export", "-o", "ur5.fmu", "--mismatch", "sever"), "sever"),
-        (("export", "-o", "ur5.fmu", "--platforms", "amiga"), "platforms holds 'amiga'"),
-        (("export", "-o", "missing/ur5.fmu"), "does not exist"),
-        (("validate", "missing.fmu"), "does not exist"),
-        (("info", "missing.fmu"), "does not exist"),
-    ],
-)
-def test_bad_input_is_one_configuration_error(tmp_path, monkeypatch, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    result = invoke(*arguments)
-    assert isinstance(result.exception, ConfigurationError)
-    assert message in str(result.exception)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_validation_of_a_bad_fmu_ends_with_exit_code_1(tmp_path):

@@ -1,6 +1,6 @@
 """Other tools run the exported UR5 and agree with the kinematic plant, or find nothing to say about it.
 
-They are fmpy, fmusim, libcosimpy, CasADi's integrator and the FMU compliance checker. fmusim is the C program of the
+They are fmpy, fmusim, libcosimpy and the FMU compliance checker. fmusim is the C program of the
 Reference FMUs (folder `fmusim` up to v0.0.39), the checker that of modelica-tools with FMI Library 2.0.3. Both are
 built from source; their tests are skipped where neither the path nor FMUSIM or FMUCHECK in the environment has them.
 """
@@ -15,7 +15,6 @@ import subprocess
 import sys
 from functools import cache
 
-import casadi
 import numpy as np
 import pandas as pd
 import pytest
@@ -27,7 +26,6 @@ from servobench.fmus.ur5_plant import cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.signals import Command
-from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.ur5 import HOME
 
@@ -50,7 +48,7 @@ def simulated(mismatch: str, commands) -> np.ndarray:
 
 @cache
 def oracle(mismatch: str) -> np.ndarray:
-    """Return what `simulated` gives for `COMMANDS`."""
+    """Return the result of `simulated` for `COMMANDS`."""
     return simulated(mismatch, COMMANDS)
 
 
@@ -208,26 +206,3 @@ def test_libcosimpy_runs_it_and_agrees_over_a_thousand_random_steps(mismatch, tm
     )
     assert done.returncode == 0, done.stderr
     np.testing.assert_allclose(json.loads(result.read_text()), oracle(mismatch), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("mismatch", MISMATCHES)
-def test_casadi_integrates_the_model_exchange_side_and_agrees_over_a_thousand_random_steps(mismatch):
-    folder = extract_fmu(cached_fmu(2))
-    builder = casadi.DaeBuilder("ur5", str(folder / "."))
-    x, u = casadi.MX.sym("x", 12), casadi.MX.sym("u", 6)
-    values = scalars(mismatch)
-    p = casadi.DM([values[name] for name in builder.p()])
-    model = builder.create("model", ["x", "u", "p"], ["ode", "y"])
-    order = {name: i for i, name in enumerate(builder.x())}
-    positions = [order[f"joint_position[{i + 1}]"] for i in range(6)]
-    balls = [list(builder.y()).index(f"ball_position[{i + 1}]") for i in range(3)]
-    equations = {"x": x, "u": u, "ode": model(x, u, p)[0]}
-    step = casadi.integrator("step", "cvodes", equations, 0.0, PERIOD, {"abstol": 1e-14, "reltol": 1e-14})
-    state = np.zeros(12)
-    state[positions] = HOME
-    came = []
-    for command in COMMANDS:
-        state = np.asarray(step(x0=state, u=command)["xf"])[:, 0]
-        output = np.asarray(model(state, command, p)[1])[:, 0]
-        came.append(np.r_[state[positions], output[balls]])
-    np.testing.assert_allclose(came, oracle(mismatch), rtol=0, atol=1e-9)

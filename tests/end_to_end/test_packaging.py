@@ -14,22 +14,21 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / ".ci"))
 import release  # noqa: E402 - a script beside the package
 
+pytestmark = pytest.mark.xdist_group("packaging")  # one process makes what these tests share
+
 FOLDERS = ("plant", "controllers", "fmus", "harness")
 CODE = (".py", ".toml", ".c", ".h", ".j2", ".urdf", ".yaml")
 
 
-def build(source: Path, target: str, folder: Path) -> Path:
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)],
-        cwd=source, check=True, capture_output=True,
-    )  # fmt: skip
-    (made,) = [path for path in folder.iterdir() if path.is_file()]
-    return made
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Wheel and source distribution."""
+    return release.build(tmp_path_factory.mktemp("dist"))
 
 
 @pytest.fixture(scope="module")
-def wheel_names(tmp_path_factory):
-    with zipfile.ZipFile(build(ROOT, "wheel", tmp_path_factory.mktemp("wheel"))) as wheel:
+def wheel_names(files):
+    with zipfile.ZipFile(files[0]) as wheel:
         return set(wheel.namelist())
 
 
@@ -52,17 +51,14 @@ def test_the_wheel_holds_every_file_that_the_package_reads(wheel_names):
     assert "servobench/harness/notebooks/analysis.ipynb" in wheel_names
 
 
-def test_the_source_distribution_makes_the_same_wheel(wheel_names, tmp_path):
-    with tarfile.open(build(ROOT, "sdist", tmp_path / "sdist")) as archive:
+def test_the_source_distribution_makes_the_same_wheel(files, wheel_names, tmp_path):
+    with tarfile.open(files[1]) as archive:
         archive.extractall(tmp_path / "source", filter="data")
     (source,) = (tmp_path / "source").iterdir()
-    with zipfile.ZipFile(build(source, "wheel", tmp_path / "again")) as wheel:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         assert set(wheel.namelist()) == wheel_names
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    return release.build(tmp_path_factory.mktemp("dist"))
 
 
 def test_the_files_of_a_release_have_no_faults(files):

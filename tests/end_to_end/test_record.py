@@ -28,7 +28,7 @@ from servobench.harness.pictures.style import method_styles
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest
 
-pytestmark = NEEDS_BULLET  # it renders what is shown
+pytestmark = [NEEDS_BULLET, pytest.mark.xdist_group("record")]  # it renders what is shown
 REQUEST = RunRequest("kinematic", "calibrated", "circle", "moderate", 3)
 
 
@@ -229,28 +229,6 @@ def test_a_new_run_is_recorded_below_the_results_without_ffmpeg(monkeypatch, cap
     name = "kinematic-constant-exp2-moderate-0_snapshots"
     assert {path.name for path in (tmp_path / "results" / "recordings").iterdir()} == {f"{name}.png", f"{name}.pdf"}
     assert f"{name}.png" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--run", "a"), "--run names a run of a results folder, and no folder is given"),
-        (("FOLDER", "--controller", "rls"), "--controller belongs to a new run"),
-        (("FOLDER", "--run", "nobody"), "has no run 'nobody'"),
-        (("FOLDER", "--kinds", "mp4,avi"), "--kinds: unknown 'avi'"),
-        (("FOLDER", "--kinds", ","), "--kinds is empty; valid: mp4"),
-        (("NONE",), "is not a results folder"),
-        (("--seed", "-1"), "seed must be a non-negative integer, got -1"),
-        (("--task", "exp9"), "unknown task 'exp9'"),
-        (("--set", "circel.laps=1"), "unknown section 'circel'"),
-    ],
-)
-def test_bad_input_is_one_line(monkeypatch, capsys, tmp_path, folder, arguments, message):
-    places = {"FOLDER": str(folder), "NONE": str(tmp_path / "none")}
-    assert servobench(monkeypatch, "record", *(places.get(word, word) for word in arguments)) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1
 
 
 def test_a_folder_with_several_runs_wants_a_name(monkeypatch, capsys, tmp_path, result):

@@ -17,6 +17,8 @@ from servobench.harness.batch.checksums import SUMS, write_vouched
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures import report
 
+pytestmark = pytest.mark.xdist_group("report")  # one process makes what these tests share
+
 needs_browser = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
 
 

@@ -15,7 +15,10 @@ from servobench.harness.batch import results
 from servobench.harness.pictures import report
 from servobench.harness.pictures.style import NARROW, TEXT, WIDE, method_styles
 
-pytestmark = pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser")
+pytestmark = [
+    pytest.mark.skipif(find_browser() is None, reason="no Chromium: the report is not opened in a browser"),
+    pytest.mark.xdist_group("report_page"),
+]
 
 WIDTHS = (390, 1024, 1600)
 SMALLEST_TYPE = TEXT - 2.0  # [pt]
@@ -108,26 +111,15 @@ def show(browser, path, width=1024, scheme="light"):
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", FOLDERS)
-def test_nothing_is_cut_or_wider_than_the_window(browser, pages, name, width):
+def test_nothing_is_cut_or_broken_or_wider_than_the_window(browser, pages, name, width):
     show(browser, pages[name], width)
     assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert browser.evaluate(TOO_WIDE) == []
+    assert browser.evaluate(BROKEN_WORDS) == []
+    assert width != WIDTHS[0] or browser.evaluate(UNLEVEL) == []  # the values of a card stand on one line
     assert browser.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)")
     assert browser.complaints() == []
     assert browser.requests() == []
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", FOLDERS)
-def test_no_short_word_of_a_table_is_broken(browser, pages, name, width):
-    show(browser, pages[name], width)
-    assert browser.evaluate(BROKEN_WORDS) == []
-
-
-@pytest.mark.parametrize("name", FOLDERS)
-def test_values_beside_each_other_in_a_card_stand_on_one_line(browser, pages, name):
-    show(browser, pages[name], 390)
-    assert browser.evaluate(UNLEVEL) == []
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -164,17 +156,13 @@ def test_the_smallest_type_of_every_figure_can_be_read(browser, pages, name, wid
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_no_word_of_a_programming_language_stands_in_a_page(browser, pages, name):
+def test_no_word_of_a_programming_language_stands_in_a_page_and_every_link_leads_somewhere(browser, pages, name):
     show(browser, pages[name])
     assert FOREIGN_WORDS.findall(browser.evaluate(SHOWN_TEXT)) == []
     data = re.search(r'<script type="application/json" id="data">(.*?)</script>', pages[name].read_text())
     assert "NaN" not in data[1]
     assert "Infinity" not in data[1]
 
-
-@pytest.mark.parametrize("name", FOLDERS)
-def test_every_link_leads_to_a_place_in_the_page(browser, pages, name):
-    show(browser, pages[name])
     dead = "Array.from(document.querySelectorAll('a')).filter(a => !document.getElementById(a.hash.slice(1))).length"
     assert browser.evaluate("document.querySelectorAll('nav a').length") >= 5
     assert browser.evaluate(dead) == 0

@@ -1,6 +1,6 @@
 """The system of plant, controller and connections, run by FMPy, goes the way of the harness.
 
-All methods and more arms: PYTHONPATH=tests python -m kit.system_loops, a part of `make nightly`.
+All methods and more arms: PYTHONPATH=benchmarks python -m night.system_loops, a part of `make nightly`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fmpy.ssp.ssd import read_ssd
 
-from kit.system_loops import Loop, agree, both, write
+from night.system_loops import Loop, agree, both, write
 
 LOOPS = [Loop("ukf_mfac:published"), Loop("map_mfac", "ur10e"), Loop("ukf_mfac:published", sensing="pixel")]
 

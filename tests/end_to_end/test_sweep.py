@@ -16,6 +16,8 @@ from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 
+pytestmark = pytest.mark.xdist_group("sweep")  # one process makes what these tests share
+
 SWEEP = (
     "sweep", "--controllers", "constant,broyden", "--vary", "camera_rotation=0:40:20deg", "--noise", "1,2",
     "--seeds", "4", "--workers", "2", "--set", "random.duration=2",
@@ -108,44 +110,6 @@ def test_ctrl_c_keeps_what_is_finished(tmp_path):
     assert "Traceback" not in output
     assert "--resume" in output
     assert len(results.load_runs(out)) >= 4
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--vary", "lens=0:1:1"), "--vary: unknown mismatch axis 'lens': did you mean 'links'? valid: "),
-        (("--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
-        (("--vary", f"links={'9' * 320}:30:10%"), "of links is empty"),
-        (("--noise", "loud"), "kinematic.sensing.noise_factor must be a number, got 'loud'"),
-        (("--noise", "-1"), "kinematic.sensing.noise_factor must be at least 0, got -1"),
-        (("--period", "fast"), "run.period must be a number, got 'fast'"),
-        (("--period", "0"), "run.period must be above 0, got 0"),
-        (("--vary", "run.period=0:0.2:0.05"), "run.period must be above 0, got 0"),
-        (("--vary", "run.perod=0.1"), "run has no setting 'perod': did you mean 'period'?"),
-        (("--vary", "plant.lag=1:0:0.5"), "--vary: the range '1:0:0.5' of plant.lag is empty"),
-        (("--vary", "plant.lag="), "--vary plant.lag needs values, such as run.period=0.02,0.05"),
-        (("--vary", "plant.lag=0,0"), "--vary plant.lag names 0 twice"),
-        (("--vary", "latency=0,0.1", "--latency", "0"), "--vary gives latency twice"),
-        (("--vary", "latency=0,0.1", "--vary", "plant.sensing.latency=0"), "a setting is varied twice in latency"),
-        (("--vary", "bullet.lag=0.1"), "the setting bullet.lag cannot be varied in runs of rbfnn_mfac on kinematic"),
-        (
-            ("--vary", "plant.sensing.jitter=0.1", "--mismatch", "jitter=50ms"),
-            "is varied, and the mismatch jitter=50ms",
-        ),
-        (("--period", "0.0333"), "period must be a whole number of milliseconds"),
-        (("--scheduler", "nowhere"), "--scheduler needs an address such as tcp://127.0.0.1:8786, got 'nowhere'"),
-        (("--mismatch", "moderate,moderate"), "--mismatch names moderate twice"),
-        (("--controllers", "ukf_mfca"), "did you mean 'ukf_mfac'"),
-        (("--resume",), "is not a results folder"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing_behind(monkeypatch, capsys, tmp_path, arguments, message):
-    out = tmp_path / "out"
-    assert servobench(monkeypatch, "sweep", "--seeds", "1", "--out", str(out), *arguments) == 2
-    errors = capsys.readouterr().err
-    assert message in errors
-    assert errors.count("\n") == 1
-    assert not out.exists()
 
 
 def test_a_folder_that_exists_or_belongs_to_another_sweep_is_refused(undisturbed, monkeypatch, capsys):

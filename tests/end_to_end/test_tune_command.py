@@ -42,35 +42,6 @@ def test_the_check_says_which_changes_improve_the_score_and_its_exit_code_whethe
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["constant.second.jsonl"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--controllers", "rsl"), "unknown controller 'rsl': did you mean 'rls'?"),
-        (("--controllers", "mfac+rls"), "controller mfac+rls has no search space"),
-        (("--controllers", ","), "--controllers is empty"),
-        (("--trials", "0"), "trials must be at least 1, got 0"),
-        (("--studies", "0"), "studies must be at least 1, got 0"),
-        (("--search", "-1"), "search must be at least 0, got -1"),
-        (("--robots", "0"), "robots must be 2, 4, 6"),
-        (("--robots", "3"), "robots must be 2, 4, 6"),
-        (("--robots", "8000"), "56000 seeds from 10000 on leave the tuning range 10000:20000"),
-        (("--offset", "9999"), "28 seeds from 19999 on leave the tuning range 10000:20000"),
-        (("--offset", "-1"), "offset must be at least 0, got -1"),
-        (("--study-seed", "-1"), "study_seed must be at least 0, got -1"),
-        (("--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
-        (("--plants", ""), "--plants is empty; valid: kinematic, bullet, mujoco, fmu"),
-    ],
-)
-def test_bad_input_is_one_line_exit_code_2_and_nothing_written(monkeypatch, capsys, tmp_path, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    assert servobench(monkeypatch, "tune", *arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.startswith("servobench: ")
-    assert error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_folder_with_other_things_and_one_of_another_study_are_left_alone(monkeypatch, capsys, tmp_path):
     note = tmp_path / "note.txt"
     note.write_text("mine")

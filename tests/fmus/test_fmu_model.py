@@ -6,17 +6,14 @@ import os
 import pickle
 import subprocess
 import sys
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fmpy import simulate_fmu
 
 from kit.plants import configure, mismatched, setup
 from servobench.fmus.export import default_actuation
-from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE, read_table
 from servobench.fmus.ur5_plant import ENTRY, Ur5FmuConfig, cached_fmu
 from servobench.fmus.variables import parameters_of
 from servobench.plant.contract.faults import FmuError
@@ -164,21 +161,6 @@ def test_many_small_steps_end_where_one_large_step_ends(version):
         )
 
 
-def test_fmpy_integrates_the_model_exchange_side_to_the_reference():
-    with zipfile.ZipFile(cached_fmu(2)) as archive:
-        header, commands = read_table(archive.read(INPUT_FILE).decode())
-        _, wanted = read_table(archive.read(OUTPUT_FILE).decode())
-    held = np.repeat(commands, 2, axis=0)[1:]  # a held command is a step at the end of its period
-    held[:, 1:] = np.repeat(commands[:, 1:], 2, axis=0)[:-1]
-    inputs = np.array([tuple(row) for row in held], dtype=[(name, float) for name in header])
-    outputs = [f"joint_position[{i + 1}]" for i in range(6)] + [f"ball_position[{i + 1}]" for i in range(3)]
-    times = {"stop_time": float(commands[40, 0]), "output_interval": 0.05, "step_size": 0.05}
-    solver = {"fmi_type": "ModelExchange", "relative_tolerance": 1e-9}
-    result = simulate_fmu(str(cached_fmu(2)), input=inputs, output=outputs, **times, **solver)
-    came = np.array([result[name][-1] for name in outputs])
-    np.testing.assert_allclose(came, np.r_[wanted[40, 1:7], wanted[40, 13:16]], rtol=0, atol=1e-5)
-
-
 @pytest.mark.parametrize("version", VERSIONS)
 def test_directional_derivatives_equal_the_numpy_jacobian_and_differences(version):
     model, actuation = mismatched("severe"), default_actuation()
@@ -319,7 +301,7 @@ def resident() -> int:
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux's memory accounting")
 @pytest.mark.parametrize("version", VERSIONS)
-def test_memory_stays_flat_over_two_thousand_instances(version):
+def test_memory_stays_flat_over_a_thousand_instances(version):
     """Load, instantiate, run, save, restore, serialise, free and unload; whole plants live in test_fmu_plant."""
     with Opened(version) as opened:
         files = len(list(Path("/proc/self/fd").iterdir()))
@@ -335,8 +317,8 @@ def test_memory_stays_flat_over_two_thousand_instances(version):
                 instance.states.restore_bytes(state)
                 instance.close()
 
-        live(1000)  # until the allocator has what it needs
+        live(500)  # until the allocator has what it needs
         before = resident()
-        live(2000)
-        assert resident() - before < 1e6  # one lost state an instance would be 2.5e6
+        live(1000)
+        assert resident() - before < 0.6e6  # one lost state an instance would be 1.2e6
         assert len(list(Path("/proc/self/fd").iterdir())) == files

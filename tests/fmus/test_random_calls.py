@@ -1,13 +1,13 @@
 """Exported FMUs under the sanitizers: whatever is called in whatever order, no memory but their own is touched.
 
-Ten million calls are made by `make nightly`: tests/kit/random_calls.
+Ten million calls are made by `make nightly`: benchmarks/night/random_calls.
 """
 
 from __future__ import annotations
 
 import pytest
 
-from kit.random_calls import arm, build, can_sanitize, controller, run
+from night.random_calls import arm, build, can_sanitize, controller, run
 
 CALLS = 100_000
 

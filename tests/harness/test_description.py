@@ -83,20 +83,6 @@ def test_a_dash_prints_the_file(monkeypatch, capsys, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (("--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
-        (("--set", "kinematic.lagg=1"), "kinematic has no setting 'lagg': did you mean 'lag'?"),
-    ],
-)
-def test_a_wrong_name_is_one_line_and_writes_nothing(monkeypatch, capsys, tmp_path, arguments, line):
-    monkeypatch.chdir(tmp_path)
-    assert servobench(monkeypatch, "init", *arguments) == 2
-    assert line in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_settings_of_a_plant_that_cannot_run_here_can_be_written(monkeypatch):
     missing = replace(registry.find_plant("bullet"), needs=("a_package_that_is_not_there",))
     monkeypatch.setattr(resolved, "find_plant", lambda _: missing)

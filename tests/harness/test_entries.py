@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import sys
 
 import pytest
 
 import servobench
-from kit.command import PACKAGE
 from kit.command import servobench as command
-from kit.own import CONFIGURED, WHOLE, install, write
-from servobench.harness.batch import apart
+from kit.own import CONFIGURED, WHOLE, write
+from servobench.harness.batch import trials
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offered, offering
 from servobench.harness.config.settings import ConfigurationError
@@ -228,53 +225,6 @@ def test_a_place_without_a_controller_is_refused_with_the_nearest_one(tmp_path, 
         choose_controller(place)
 
 
-POINTS = """[servobench.controllers]
-whole = some_law:Mine
-gone = some_law:Nothing
-half = some_law:Half
-crash = some_crash:ENTRY
-unsettled = some_law:UNSETTLED
-number = some_law:NUMBER
-"""
-LAWS = CONFIGURED + (
-    "\n\nclass Half(servobench.Controller):\n    pass\n\n\nNUMBER = 3\n"
-    "UNSETTLED = servobench.ControllerEntry('unsettled', '', lambda: {}, Mine)\n"
-)
-LISTED = {
-    "whole": "Does not move.",
-    "gone": "cannot be loaded: AttributeError: module 'some_law' has no attribute 'Nothing'",
-    "half": "class Half lacks",
-    "crash": "some_crash.py:1: ZeroDivisionError",
-    "unsettled": "the settings config are no dataclass; return a dataclass",
-    "number": "is of type int, wanted a subclass of",
-}
-
-
-def test_broken_entry_points_are_marked_and_spoil_neither_the_list_nor_all(tmp_path):
-    site = install(tmp_path / "site", "some_law", LAWS, POINTS)
-    write(site, "1 / 0\n", "some_crash.py")
-    script = (
-        "import sys\n"
-        "from servobench.harness.cli.main import main\n"
-        "sys.argv = ['servobench', 'controllers']\n"
-        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
-        "from servobench.harness.cli.selection import split_controllers\n"
-        "print('all:', split_controllers('all'))\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=120,
-        env={**os.environ, "PYTHONPATH": f"{PACKAGE}{os.pathsep}{site}", "COLUMNS": "400"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    for name, words in LISTED.items():
-        assert re.search(rf"{name} .*{re.escape(words)}", done.stdout), done.stdout
-    every = done.stdout.rpartition("all:")[2]
-    assert "'whole'" in every
-    assert "'ukf_mfac'" in every
-    assert not [name for name in set(LISTED) - {"whole"} if f"'{name}'" in every]
-    assert done.stderr.count("servobench: left out: controller ") == len(LISTED) - 1
-
-
 def test_two_files_beside_two_controllers_that_have_one_name_are_refused(tmp_path):
     for folder in "ab":
         write(tmp_path, f"GAIN = {folder!r}\n", f"{folder}/own_helper_of_a_user.py")
@@ -317,7 +267,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize(("line", "why"), HARMFUL.items())
 def test_an_import_that_ends_or_hangs_its_process_is_one_line(tmp_path, monkeypatch, capfd, line, why):
-    monkeypatch.setattr(apart, "IMPORT_LIMIT", 2.0)
+    monkeypatch.setattr(trials, "IMPORT_LIMIT", 2.0)
     write(tmp_path, f"import ctypes, os, signal, time\nprint('a banner')\n\n{line}\n{WHOLE}")
     assert command(monkeypatch, *COMMANDS["run"]) == 2
     out, errors = capfd.readouterr()

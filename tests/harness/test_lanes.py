@@ -8,7 +8,6 @@ from servobench.controllers.laws.mfac import MfacLaw
 from servobench.controllers.methods import METHODS
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out, carry_out_together
-from servobench.harness.run.experiment import build
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
@@ -103,27 +102,3 @@ def test_times_of_runs_side_by_side_are_unknown():
 def test_plug_ins_and_rendered_plants_go_alone():
     assert side_by_side_key(runs("nmpc_calibrated", {})[0]) is None
     assert side_by_side_key(runs("ukf_mfac", {}, plant="bullet")[0]) is None
-
-
-@pytest.mark.parametrize("plant", ["kinematic", "fmu"])
-@pytest.mark.parametrize("controller", ["map_mfac", "rbfnn_mfac", "ukf_mpc", "nmpc_calibrated"])
-def test_a_run_branches_into_futures_that_continue_with_the_same_bits(plant, controller):
-    experiment = build(runs(controller, {}, plant=plant)[0])
-    world, method, run = experiment.plant, experiment.controller, experiment.run
-    desired = experiment.scenario.reference.sampled(run.period, 40 + run.preview_rows)
-    seen = world.reset(1)
-    method.reset(seen, 1)
-
-    def advance(observation, first, last):
-        for k in range(first, last):
-            observation = world.step(method.step(observation, desired[k : k + 1 + run.preview_rows]))
-        return observation
-
-    at = advance(seen, 0, 15)
-    saved = world.save(), method.save()
-    wanted = advance(at, 15, 40).feature
-    for _ in range(2):
-        world.restore(saved[0])
-        method.restore(saved[1])
-        np.testing.assert_equal(advance(at, 15, 40).feature, wanted)
-    world.close()

@@ -166,7 +166,17 @@ def test_runs_of_a_plant_are_where_they_are(name):
     assert machine.seen
 
 
-@pytest.mark.parametrize(("plant", "controller"), [("kinematic", "ukf_mfac"), ("fmu", "rls"), ("kinematic", "ukf_mpc")])
+@pytest.mark.parametrize(
+    ("plant", "controller"),
+    [
+        ("kinematic", "ukf_mfac"),
+        ("fmu", "rls"),
+        ("kinematic", "ukf_mpc"),
+        ("fmu", "map_mfac"),
+        ("kinematic", "rbfnn_mfac"),
+        ("kinematic", "nmpc_calibrated"),
+    ],
+)
 def test_a_closed_loop_is_where_it_is(plant, controller):
     machine = type("LoopLifeOf" + plant, (LoopLife,), {"plant": plant, "controller": controller, "seen": {}})
     run_state_machine_as_test(machine, settings=FEW)

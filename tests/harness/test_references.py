@@ -63,26 +63,6 @@ def test_the_columns_of_a_waypoint_file_have_the_unit_of_the_feature(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "must have a header and rows with the columns time_s, x_m, y_m, z_m"),
-        ("time_s,x_m,y_m\n0,0,0\n", "must have a header and rows with the columns"),
-        ("time_s,x_m,y_m,z_m\n0,0,zero,1\n", "row 1: y_m is not a number: 'zero'"),
-        ("time_s,x_m,y_m,z_m\n0,0,0\n", "row 1: z_m is not a number: None"),
-        ("time_s,x_m,y_m,z_m\n0,0,nan,1\n", "not finite"),
-        ("time_s,x_m,y_m,z_m\n1,0,0,1\n1,0,0,1\n", "times must ascend"),
-        (None, "points.csv cannot be read"),
-    ],
-)
-def test_a_missing_or_malformed_waypoint_file_is_refused(tmp_path, text, message):
-    file = tmp_path / "points.csv"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_waypoints(file, FEATURE)
-
-
-@pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [
         (Laps, (CENTRE, 0.0, 1.0), "radius must be above 0"),

@@ -13,11 +13,11 @@ from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import statistics_rows, summary_legend, summary_tables
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.batch import parquet, results
+from servobench.harness.batch import results
+from servobench.harness.batch import tables as parquet
 from servobench.harness.batch.checksums import SUMS
-from servobench.harness.batch.columns import NEEDED
 from servobench.harness.batch.integrity import examine
-from servobench.harness.batch.lock import LOCK, locked
+from servobench.harness.batch.tables import NEEDED
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import error_curves, path_views
@@ -177,16 +177,6 @@ def test_a_part_of_several_runs_says_which_runs_are_there(folder):
     results.write_part(folder, 8, [RunResult(made_up_row(f"run{index}"), None) for index in (8, 9, 10)])
     add_part(folder, 2)
     assert results.finished_runs(folder) == [range(2, 3), range(8, 11)]
-
-
-def test_a_lock_leaves_nothing_behind_and_that_of_a_dead_process_does_not_count(tmp_path):
-    out = tmp_path / "out"
-    with locked(out):
-        assert (out / LOCK).is_file()
-    assert list(out.iterdir()) == []
-    (out / LOCK).touch()  # what a process that was killed leaves behind
-    with locked(out, new=True):
-        results.create_folder(out, {})
 
 
 def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path):

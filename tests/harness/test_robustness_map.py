@@ -11,7 +11,6 @@ import pytest
 from kit.command import servobench
 from kit.plants import NEEDS_MUJOCO
 from servobench.harness.analysis.comparison import settled_share
-from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.studies import robustness
 from servobench.harness.studies import robustness as map_lines
@@ -55,18 +54,6 @@ def test_a_map_along_axes_of_the_sensor_has_their_words_and_no_moved_camera():
     assert {*SENSOR_AXES} <= {*KNOWN_LINES}
     with pytest.raises(ConfigurationError, match="the map has no axis 'outlier': did you mean 'outliers'"):
         find_lines(["outlier"])
-
-
-def test_a_map_of_one_axis_is_carried_out_and_drawn(monkeypatch, tmp_path, capsys):
-    place = Line("jitter", "frames late by up to [ms]", (Magnitude(0.0, "ms"), Magnitude(200.0, "ms")))
-    monkeypatch.setattr(robustness, "KNOWN_LINES", {"jitter": place})
-    monkeypatch.setattr(map_lines, "KNOWN_LINES", {"jitter": place})
-    words = ("--axes", "jitter", "--plant", "kinematic", "--controllers", "constant", "--seeds", "1", "--workers", "1")
-    out = tmp_path / "map"
-    assert servobench(monkeypatch, "robustness", *words, "--set", "random.duration=1", "--out", str(out)) == 0
-    assert (out / "figures" / "robustness.png").stat().st_size > 5000
-    assert [path.name for path in out.iterdir() if path.is_dir()] in (["usual", "figures"], ["figures", "usual"])
-    assert {"jitter=0ms", "jitter=200ms"} == {text.partition("+")[2] for text in results.load_runs(out)["mismatch"]}
 
 
 def test_a_run_whose_camera_moves_is_longer_unless_the_user_says_how_long():

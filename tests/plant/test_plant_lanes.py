@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from itertools import product
 
 import numpy as np
@@ -106,21 +105,6 @@ def test_a_lane_has_the_same_bits_alone_in_another_order_and_after_others_were_d
     np.testing.assert_array_equal(first.feature[1], build(0).reset(SEEDS[0]).feature)
 
 
-@pytest.mark.parametrize("chosen", [1, np.arange(3)])
-def test_a_state_of_any_period_has_many_futures(build, chosen):
-    plant = build(chosen)
-    walk(plant, chosen, range(30))
-    state = plant.save()
-    first = walk(plant, chosen, range(30, PERIODS))
-    other = build(chosen)
-    for each, saved in ((plant, state), (plant, pickle.loads(pickle.dumps(state))), (other, state), (plant, state)):
-        each.restore(saved)
-        for again, before in zip(walk(each, chosen, range(30, PERIODS)), first, strict=True):
-            np.testing.assert_array_equal(again, before)
-    with pytest.raises(ValueError, match="state must be of runs of shape"):
-        build(np.array([0, 2])).restore(state)
-
-
 def test_what_does_not_fit_the_number_of_runs_is_refused(build):
     with pytest.raises(ValueError, match="one run only"):
         build(0).keep(np.array([0]))
@@ -130,6 +114,8 @@ def test_what_does_not_fit_the_number_of_runs_is_refused(build):
         build(np.arange(3)).move_camera(MOVED[:2])
     with pytest.raises(ValueError, match=r"joint_velocity must have shape \(3, 6\), got \(6,\)"):
         build(np.arange(3)).step(Command(np.zeros(6)))
+    with pytest.raises(ValueError, match="state must be of runs of shape"):
+        build(np.array([0, 2])).restore(build(np.arange(3)).save())
 
 
 @pytest.mark.parametrize("lane", [None, 1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 
 import numpy as np
@@ -113,20 +112,6 @@ def test_lost_frames_are_frames_of_the_camera():
     seen = run(find_plant("kinematic").build(config, setup(period=0.02)), 50)
     assert not any(o.feature_valid for k, o in enumerate(seen) if k % 5)
     assert 1 < sum(o.feature_valid for o in seen) < 10
-
-
-def test_a_saved_state_continues_with_the_same_bits_in_a_finer_world(build):
-    settings = {"command_delay": 0.05, "latency": 0.033, "frame_period": 0.025, "drop_probability": 0.3}
-    plant = build(50, **settings)
-    run(plant, 50)
-    state = plant.save()
-    walks = []
-    for saved in (state, pickle.loads(pickle.dumps(state))):
-        plant.restore(saved)
-        walks.append([plant.step(Command(wanted(COMMON * k))) for k in range(20)])
-    for one, other in zip(*walks, strict=True):
-        for name in ("time", "joint_position", "feature", "feature_valid"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 def test_no_frame_is_taken_that_is_not_exposed(monkeypatch):

@@ -3,7 +3,7 @@
 On its way it is killed twice, meets a full disk once and a second process once; each time it goes on with --resume. At
 the end every run is a row, and those that nothing was done to equal those of a quiet sweep bit for bit.
 
-    python benchmarks/hard_night.py --runs 10000
+    PYTHONPATH=benchmarks python -m night.hostile_sweep --runs 10000
 
 A quarter of the runs each: the controller `Sometimes`, of which every fourth run does harm, `Falsifies`, which leaves a
 false numpy and a false clock behind, `Quiet`, and `constant` of this package.
@@ -26,16 +26,13 @@ from typing import Final
 import pandas as pd
 import psutil
 
-ROOT: Final = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / ".package")]
+from night import hostile_controllers
+from servobench.plant.contract.seeds import named_seed
 
-from kit.hostile_controllers import harm_of  # noqa: E402
-from servobench.plant.contract.seeds import named_seed  # noqa: E402
-
-HOSTILE: Final = ROOT / "tests" / "kit" / "hostile_controllers.py"
+HOSTILE: Final = Path(hostile_controllers.__file__)
 CONTROLLERS: Final = (*(f"{HOSTILE}:{name}" for name in ("Falsifies", "Sometimes", "Quiet")), "constant")
 FIRST_SEED: Final = 100_000
-MARK: Final = "SERVOBENCH_HARD_NIGHT"  # an environment variable that everything started here inherits
+MARK: Final = "SERVOBENCH_HOSTILE_SWEEP"  # an environment variable that everything started here inherits
 SOON: Final = 5.0  # [s] until nothing is left of a command that was killed
 SMALL_FILE: Final = 4000  # [bytes] less than a part of the results: a disk that is full
 HARMLESS: Final = ("Forks", "LeavesChildren", "Prints")  # runs that complete all the same
@@ -148,7 +145,7 @@ def judge(night: Night) -> pd.DataFrame:
 def _harm(controller: str, seed: int) -> str:
     if controller == "Falsifies":
         return "Lies"
-    found = harm_of(named_seed(seed, "controller")) if controller == "Sometimes" else None
+    found = hostile_controllers.harm_of(named_seed(seed, "controller")) if controller == "Sometimes" else None
     return "" if found is None else found.__name__
 
 

@@ -1,9 +1,9 @@
-"""Mutation testing: whether the unit tests of a module notice small faults in it; `python tests/kit/mutation.py`.
+"""Mutation testing: whether the unit tests of a module notice small faults in it; `python -m night.mutation`.
 
-A seeded sample of the mutants of each group of modules (`kit.mutants`) meets the group's unit tests; the score is the
+A seeded sample of the mutants of each group of modules (`night.mutants`) meets the group's unit tests; the score is the
 share that fails them. What survives is listed, with its line.
 
-Nothing on disk is changed. The tests are collected once, and run once to know which lines each reaches (`kit.reach`).
+Nothing on disk is changed. The tests are collected once, and run once to know which lines each reaches (`night.reach`).
 Each mutant is a forked process in which the functions of the module get the changed code; the tests that reach its line
 follow, the quickest first, until one fails. Where the fault is outside of functions, everything is imported anew from
 the changed tree, and all tests follow. That is why no tool of the trade is used here: cosmic-ray writes the mutants
@@ -27,11 +27,10 @@ from pathlib import Path
 import pytest
 from hypothesis import Phase, settings
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tests"))
+from night.mutants import ANEW, Changed, Imported, Mutant, mutants
+from night.reach import Reach, Tracer
 
-from kit.mutants import ANEW, Changed, Imported, Mutant, mutants  # noqa: E402
-from kit.reach import Reach, Tracer  # noqa: E402
+ROOT = Path(__file__).parents[2]
 
 GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> modules, unit tests
     "kinematics": (
@@ -53,12 +52,12 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
     "statistics": (("harness/analysis/statistics.py",), ("harness/test_statistics.py",)),
     "results": (
-        ("harness/batch/results.py", "harness/batch/columns.py"),
+        ("harness/batch/results.py", "harness/batch/tables.py"),
         ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
     ),
     "folders": (
-        ("harness/batch/parquet.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
-         "harness/batch/manifest_text.py"),
+        ("harness/batch/tables.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
+         "harness/batch/results.py"),
         ("harness/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
     ),
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""A long campaign: PYTHONPATH=tests python -m kit.random_calls --calls 10000000."""
+"""A long campaign: PYTHONPATH=tests:benchmarks python -m night.random_calls --calls 10000000."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from itertools import product
 from pathlib import Path
 
-from kit.random_calls import arm, build, controller, run
+from night.random_calls import arm, build, controller, run
 
 BATCH = 500_000  # calls of one process
 

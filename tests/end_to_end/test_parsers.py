@@ -1,6 +1,6 @@
 """Whatever stands in a file or behind an option is read, or refused in one line, in little time and memory.
 
-The long campaign is tests/fuzz/campaign.py; what it found stands below in FOUND.
+The long campaign is `python -m night.fuzzing`; FOUND holds its finds.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kit.folder_readers import HOLDER, LEDGER
-from kit.fuzzing import Broken, check, inputs
-from kit.parsers import PARSERS, Parser
+from night.folder_readers import HOLDER, LEDGER
+from night.fuzzing import Broken, check, inputs
+from night.parsers import PARSERS, Parser
 from servobench.harness.config.settings import ConfigurationError
 
 LONG = "9" * 400
@@ -120,7 +120,7 @@ def test_a_broken_promise_is_seen(message, tmp_path):
 
 
 def test_a_parser_that_hangs_is_seen(tmp_path, monkeypatch):
-    monkeypatch.setattr("kit.fuzzing.MAX_SECONDS", 0.1)
+    monkeypatch.setattr("night.fuzzing.MAX_SECONDS", 0.1)
 
     def hang(_text: str, _folder: Path) -> None:
         while True:

@@ -16,7 +16,7 @@ from types import FrameType
 
 import pytest
 
-from kit.mutants import Imported
+from night.mutants import Imported
 
 Line = tuple[str, int]  # file and number
 

@@ -1,4 +1,7 @@
-"""Closed loops as systems (SSP) in FMPy's hands, against the harness: PYTHONPATH=tests python -m kit.system_loops."""
+"""Closed loops as systems (SSP) in FMPy's hands, against the harness.
+
+PYTHONPATH=benchmarks python -m night.system_loops
+"""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from kit.controller_fmus import experiment, inputs_of, periods, recorded
-from kit.other_machines import drive, machines, unpack
+from night.other_machines import drive, machines, unpack
 from servobench.fmus.compile import this_platform
 from servobench.fmus.export import ExportOptions, product
 

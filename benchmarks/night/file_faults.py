@@ -1,11 +1,11 @@
 """Breaks every file operation of a batch, or of caches, one after the other and in every way, and goes on each time.
 
-To be run by `start`, which builds the library of `break_files.c` and preloads it; the command does so for each way, on
+To be run by `start`, which builds the library of `file_faults.c` and preloads it; the command does so for each way, on
 all processors. Each point is a child of a process that has all modules in memory, so that it takes a fraction of a
 second. The child is killed, or its operation fails; what was finished must still be readable; a second child resumes,
 and its tables must be those of an undisturbed batch, wall-clock columns aside, bit for bit.
 
-`python -m kit.breaking`, with the tests and the package on the path, breaks all operations: a part of `make nightly`.
+`python -m night.file_faults`, with `tests` and `benchmarks` on the path, breaks all operations, as `make nightly` does.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from servobench.harness.batch.checksums import UnwritableFolder
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import is_unused
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.workers import Bounds
+from servobench.harness.batch.sandbox import Bounds
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import knowledge as network_cache
 from servobench.harness.run.knowledge import NETWORKS, network_source
 from servobench.plant.contract import cache
 from servobench.plant.fmu.archive import extract_fmu
 
-SOURCE = Path(__file__).with_name("break_files.c")
+SOURCE = Path(__file__).with_name("file_faults.c")
 MODES = {"KILL": 1, "TORN": 2, "POWER": 3, "EIO": 4, "ENOSPC": 5}
 SETTINGS = {
     "random": {"duration": 0.2},
@@ -65,7 +65,7 @@ SMALL = TrainingConfig(
 
 def build(folder: Path) -> Path:
     """Compile the library and return its path."""
-    library = folder / "break_files.so"
+    library = folder / "file_faults.so"
     command = ["gcc", "-O1", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-ldl"]
     subprocess.run(command, check=True, timeout=60)
     return library
@@ -79,9 +79,11 @@ def start(folder: Path, *arguments: str, timeout: float | None = None) -> dict[s
         "LD_PRELOAD": str(library),
         "BREAK_LIBRARY": str(library),
         "BREAK_BELOW": str(folder / "point"),
-        "PYTHONPATH": os.pathsep.join([str(PACKAGE), str(Path(__file__).parents[1])]),
+        "PYTHONPATH": os.pathsep.join(
+            [str(PACKAGE), str(PACKAGE.parent / "tests"), str(PACKAGE.parent / "benchmarks")]
+        ),
     }
-    command = [sys.executable, "-m", "kit.breaking", *arguments]
+    command = [sys.executable, "-m", "night.file_faults", *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     figures = dict(json.loads(done.stdout.splitlines()[-1]))

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kit.folder_readers import HOLDER, LEDGER, SEAL, files, journal, lock, of_runs, other_table, part_name, seal
 from kit.foreign_fmu import describe, describe_exchange, packed
 from kit.robots import FOUR_JOINTS, calibration_text, odd_urdf
 from kit.toy import plant_spec
+from night.folder_readers import HOLDER, LEDGER, SEAL, files, journal, lock, of_runs, other_table, part_name, seal
 from servobench.controllers.networks.config import ControllerTraining, JacobianTraining, TrainingConfig
 from servobench.controllers.networks.file import load_networks, save_networks
 from servobench.controllers.networks.fit import train
