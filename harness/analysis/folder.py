@@ -1,4 +1,4 @@
-"""What a results folder holds, in words, and the tables that it has beside its runs and steps."""
+"""Describes a results folder in words, and reads its tables beside the runs and steps."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pyarrow import ArrowException
 
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
 
 DESCRIBED: Final = {
@@ -22,12 +23,12 @@ DESCRIBED: Final = {
     "noise_factor": "noise factor",
     "latency_s": "latency [s]",
     "period_s": "period [s]",
-}  # column -> heading
+}  # column -> heading; settings that are varied, too, have their key
 MAX_LISTED: Final = 15  # values of a column
 
 
 def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
-    """Return what was run and with what, as names and texts.
+    """Return the facts of a folder: runs, controllers, plants, tasks, seeds and versions, as names and texts.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -35,7 +36,8 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
-    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in DESCRIBED.items() if name in runs}
+    described = DESCRIBED | {name: name for name in runs.columns if name.startswith(SECTIONS)}
+    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in described.items() if name in runs}
     packages = manifest.get("packages") or {}
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
     commit = manifest.get("git_commit")
@@ -81,7 +83,7 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         yield path.stem, table
 
 
-def _setting(value: Any) -> str:  # noqa: ANN401 - whatever JSON holds
+def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON
     if isinstance(value, list):
         return ", ".join(map(_setting, value))
     if isinstance(value, bool):

@@ -36,18 +36,11 @@ from servobench.harness.run.outcome import (
     OUTCOMES,
     TARGET_UNREACHABLE,
 )
+from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 
 WHICH: Final = ""  # the group of columns that say which runs a row is about
-CONDITIONS: Final = {
-    "plant": ("plant", 1.0),
-    "robot": ("robot", 1.0),
-    "sensing": ("sensing", 1.0),
-    "mismatch": ("mismatch", 1.0),
-    "noise_factor": ("noise factor", 1.0),
-    "latency_s": ("latency [ms]", 1e3),
-    "period_s": ("period [ms]", 1e3),
-}  # column -> heading and factor
+CONDITIONS: Final = ("plant", "robot", "sensing", "mismatch")  # with the settings that are varied
 GROUPS: Final = {
     "moves": ("Time", "Error", "Motion"),
     "curves": ("RMS error", "Motion"),
@@ -66,7 +59,7 @@ Row = dict[tuple[str, str], Any]
 
 
 def overview(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return how often each controller did what was asked and how well, a group of columns for each place.
+    """Return the success rate and score of each controller, a group of columns for each place.
 
     Where there are many conditions, a group is a task with all its conditions.
     """
@@ -103,7 +96,7 @@ def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each condition, task and controller what came of its runs, in percent, where not all was as asked."""
+    """Return the shares of outcomes [%] of each condition, task and controller of which a run failed."""
     named = runs.assign(outcome=outcomes(runs))
     rows = [(key, own["outcome"].value_counts(), len(own)) for key, own in _rows(named, "task")]
     mixed = [row for row in rows if not set(row[1].index) <= set(ACHIEVED)]
@@ -119,13 +112,13 @@ def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def meanings(table: pd.DataFrame) -> dict[str, str]:
-    """Return what the outcomes mean that are columns of an outcome table; the words of faults say it themselves."""
+    """Return the meaning of each outcome in an outcome table; the words of faults explain themselves."""
     shown = {str(name[1]).removesuffix(" [%]") for name in list(table) if isinstance(name, tuple)}
     return {word: meaning for word, meaning in MEANINGS.items() if word in shown}
 
 
 def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each plant and controller what a step costs, as far as known, and how much the joints are used."""
+    """Return computing times, as far as known, and use of the joints for each plant and controller."""
     return _table(runs, "cost", ["plant"] if runs["plant"].nunique() > 1 else [], counted=False)
 
 
@@ -150,12 +143,13 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return every run as a row: which it is, how it ended and what came of it, and its main measures."""
+    """Return one row per run: identity, status, outcome and main metrics."""
     runs = in_handy_units(runs)
     named = runs.assign(outcome=outcomes(runs))
     table: dict[tuple[str, str], list[str]] = {}
+    headings = varied_columns(runs.columns)
     for name in ("controller", "task", *_varied(runs)):
-        heading, factor = CONDITIONS.get(name, (name, 1.0))
+        heading, factor = headings.get(name, (name, 1.0))
         table[WHICH, heading] = [_condition(value, factor) for value in named[name]]
     table[WHICH, "seed"] = named["seed"].astype(str).tolist()
     for name in ("status", "outcome"):
@@ -197,11 +191,11 @@ def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool)
 def _rows(runs: pd.DataFrame, *more: str, keys: Sequence[str] | None = None) -> list[tuple[Row, pd.DataFrame]]:
     names = [*(_varied(runs) if keys is None else keys), *more]
     order = {name: i for i, name in enumerate(ordered(runs["controller"]))}
-    found = []
+    headings, found = varied_columns(runs.columns), []
     for key, own in runs.groupby([*names, "controller"], sort=False, dropna=False):
         row: Row = {(WHICH, "controller"): str(key[-1])}
         for name, value in zip(names, key, strict=False):
-            heading, factor = CONDITIONS.get(name, (name, 1.0))
+            heading, factor = headings.get(name, (name, 1.0))
             row[WHICH, heading] = _condition(value, factor)
         found.append((row, own))
     places = list(dict.fromkeys(tuple(row.values())[1:] for row, _ in found))
@@ -212,7 +206,8 @@ def _rows(runs: pd.DataFrame, *more: str, keys: Sequence[str] | None = None) -> 
 
 def _varied(runs: pd.DataFrame) -> list[str]:
     """Return the columns of conditions that differ between the runs."""
-    return [name for name in CONDITIONS if name in runs and runs[name].nunique(dropna=False) > 1]
+    known = (*CONDITIONS, *varied_columns(runs.columns))
+    return [name for name in known if name in runs and runs[name].nunique(dropna=False) > 1]
 
 
 def _columns(kind: str, runs: pd.DataFrame) -> list[tuple[str, str]]:

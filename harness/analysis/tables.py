@@ -38,17 +38,18 @@ from servobench.harness.analysis.statistics import (
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.metrics import METRICS, Summary
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
+from servobench.harness.run.request import SECTIONS, SHORT_NAMES
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import suggest
 
 Tables = Iterator[tuple[str, pd.DataFrame]]  # title, rows of text
-SWEPT: Final = ("noise_factor", "latency_s", "period_s")  # shown where they vary
-CONDITIONS: Final = ("plant", "mismatch", *SWEPT)
 TAIL: Final = 0.95
 Row: TypeAlias = "dict[str, Cell]"
 BAND: Final = ("settling_band", "feature_unit")
 SWEEP_COLUMNS: Final = (
-    *CONDITIONS,
+    "plant",
+    "mismatch",
+    *(short.column for short in SHORT_NAMES.values()),
     "sensing",
     "task",
     "controller",
@@ -58,7 +59,7 @@ SWEEP_COLUMNS: Final = (
     "task_kind",
     "rms_error_evaluated",
     *BAND,
-)  # what `sweep_tables` and `outcome_legend` read
+)  # columns that `sweep_tables` and `outcome_legend` read
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
@@ -170,7 +171,7 @@ def _median(values: pd.Series[float]) -> Estimate:
 
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return what the good outcomes of runs mean, whose table comes in pieces."""
+    """Return the meaning of the good outcomes; the table of runs comes in pieces."""
     bands = pd.concat([part.reindex(columns=list(BAND)).drop_duplicates() for part in parts])
     return (
         f"{SETTLED}: came within {settling_band(bands)} and stayed; "
@@ -179,19 +180,19 @@ def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
 
 
 def summary_legend(runs: pd.DataFrame) -> str:
-    """Return what the words in `summary_tables` mean."""
+    """Return the meaning of the words in `summary_tables`."""
     late = f"; {LATE} some steps took longer than the period" if _is_late(runs) else ""
     switches = "switches: joint commands that change sign between large values within two periods"
     return f"{outcome_legend([runs])}; over: overshoot; {switches}; numbers are medians over runs{late}"
 
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return what the words in `sweep_tables` mean."""
+    """Return the meaning of the words in `sweep_tables`."""
     return f"{outcome_legend(parts)}; noise: factor; latency, period: ms, – as configured"
 
 
 def summary_tables(runs: pd.DataFrame) -> Tables:
-    """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
+    """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
         kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
         rows = []
@@ -220,7 +221,7 @@ def _shares(runs: pd.DataFrame) -> str:
 
 
 def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
-    """Yield what a sweep ends with, for each plant and task.
+    """Yield the summary of a sweep, for each plant and task.
 
     That is the share of settled runs, or of those that followed their curve, a row for each condition; and where there
     are others, the share of each outcome over all conditions.
@@ -232,10 +233,11 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
     for part in parts:
         counted.append(_count_outcomes(part))
         curves |= set(split_tasks(part)[1]["task"])
-    counts = pd.concat(counted).groupby([*SWEEP_KEYS, "outcome"], sort=False, as_index=False)["runs"].sum()
+    keys = _sweep_keys(counted[0])
+    counts = pd.concat(counted).groupby([*keys, "outcome"], sort=False, as_index=False)["runs"].sum()
     for (plant, task), place in counts.groupby(["plant", "task"], sort=False):
         good = place["runs"].where(place["outcome"].isin(ACHIEVED), 0)
-        sums = place.assign(good=good).groupby(SWEEP_KEYS[2:], sort=False)[["good", "runs"]].sum()
+        sums = place.assign(good=good).groupby(keys[2:], sort=False)[["good", "runs"]].sum()
         table = (100.0 * sums["good"] / sums["runs"]).unstack(sort=False).map(_percent)
         table["runs"] = sums["runs"].unstack(sort=False).max(axis=1).map("{:.0f}".format)
         word = FOLLOWED if task in curves else SETTLED
@@ -246,7 +248,7 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
         if good.sum() < place["runs"].sum():
             kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
             table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(_percent)
-            yield f"{task} on {plant}: what came of the runs, %", table.rename_axis(columns=None).reset_index()
+            yield f"{task} on {plant}: outcomes of the runs, %", table.rename_axis(columns=None).reset_index()
 
 
 def _percent(value: float) -> str:
@@ -260,8 +262,19 @@ def _count_outcomes(runs: pd.DataFrame) -> pd.DataFrame:
         noise=runs["noise_factor"].map("{:g}".format),
         latency=_milliseconds(runs["latency_s"]),
         period=_milliseconds(runs["period_s"]),
+        **{name: runs[name].map(_in_short) for name in runs.columns if name.startswith(SECTIONS)},
     )
-    return runs.groupby([*SWEEP_KEYS, "outcome"], sort=False).size().rename("runs").reset_index()
+    return runs.groupby([*_sweep_keys(runs), "outcome"], sort=False).size().rename("runs").reset_index()
+
+
+def _sweep_keys(runs: pd.DataFrame) -> list[str]:
+    """Return the columns that say which runs are counted together, the controller last."""
+    *keys, controller = SWEEP_KEYS
+    return [*keys, *(name for name in runs.columns if name.startswith(SECTIONS)), controller]
+
+
+def _in_short(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _milliseconds(times: pd.Series[float]) -> list[str]:

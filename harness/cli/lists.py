@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -62,7 +61,9 @@ def controllers(
 
 def tasks(
     name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
-    robot: Annotated[str, replace(options.ROBOT_OPTION, value=replace(options.ROBOT, check=None))] = DEFAULT_ROBOT,
+    robot: Annotated[
+        str, options.option("--robot", options.ROBOT._replace(check=None), options.ROBOT_WORDS)
+    ] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
@@ -184,7 +185,7 @@ def _show_settings(section: str, config: object, *, as_json: bool) -> None:
         )
         return
     if not found:
-        console.print(f"{section} has no settings", markup=False, highlight=False)
+        say(f"{section} has no settings")
     for each in found:
         line = Text(f"{section}.{each.key}", style="bold").append(f" = {toml(each.value) or 'unset'}", style="not bold")
         console.print(line, soft_wrap=True)

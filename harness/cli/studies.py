@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, PLANT, Option
+from servobench.harness.cli.options import CONTROLLER, PLANT, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,15 +31,15 @@ def sweep(
     combinations: options.Combinations = SWEPT,
     vary: Annotated[
         list[str] | None,
-        Option(
+        option(
             "--vary",
             "KEY=VALUES",
             "Axis of the mismatch, camera_rotation=0:180:30deg, or setting, plant.lag=0.02,0.05.",
         ),
     ] = None,
-    noise: Annotated[str, Option("--noise", "NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
-    latency: Annotated[str, Option("--latency", "SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
-    period: Annotated[str, Option("--period", "SECONDS", "Control periods [s]: --vary period=...")] = "",
+    noise: Annotated[str, option("--noise", "NUMBERS", "Factors on the plants' sensor noise: --vary noise=...")] = "",
+    latency: Annotated[str, option("--latency", "SECONDS", "Camera latencies [s]: --vary latency=...")] = "",
+    period: Annotated[str, option("--period", "SECONDS", "Control periods [s]: --vary period=...")] = "",
     running: options.Running,
     overrides: options.Overrides,
     judging: options.Judging,
@@ -53,6 +53,7 @@ def sweep(
     from servobench.harness.batch.campaign import Campaign, carry_out
     from servobench.harness.batch.plan import SweepPlan
     from servobench.harness.cli.progress import watching
+    from servobench.harness.run.request import SECTIONS
 
     short = {"noise": noise, "latency": latency, "period": period}
     variations = [*(vary or []), *(f"{name}={values}" for name, values in short.items() if values)]
@@ -60,23 +61,24 @@ def sweep(
     how = judging.execution(running)
     with watching(console, out, bar=not how.debug) as observer:
         carry_out(campaign, out, replace(how, observer=observer))
-    legend = sweep_legend(results.iterate_runs(out, SWEEP_COLUMNS))
-    print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), legend)
-    console.print(f"table in {out / results.RUNS}", soft_wrap=True)
-    judge(out, strict=judging.strict)
+    columns = (*SWEEP_COLUMNS, *(name for name in campaign.cells[0].request.as_row() if name.startswith(SECTIONS)))
+    legend = sweep_legend(results.iterate_runs(out, columns))
+    print_tables(sweep_tables(results.iterate_runs(out, columns)), legend)
+    say(f"table in {out / results.RUNS}")
+    judge(out, results.iterate_runs(out, ("status",)), strict=judging.strict)
 
 
 def robustness(
     *,
     out: options.FolderOption,
-    plant: Annotated[str, Option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
+    plant: Annotated[str, option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
         str,
-        Option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
+        option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
     ] = "",
     running: options.Running,
     overrides: options.Overrides,
@@ -96,24 +98,24 @@ def robustness(
     with watching(console, out) as observer:
         how = running.execution(observer)
         files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
-    console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
+    say(f"the map is in {files[0]}; its runs are in {out}")
 
 
 def claims(
     *,
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[int, Option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
+    seeds: Annotated[int, option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
         str,
-        Option(
+        option(
             "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
         ),
     ] = "both",
     running: options.Running,
     check: Annotated[
         Path | None,
-        Option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
+        option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
     ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
@@ -141,10 +143,10 @@ def claims(
         verdict = answer.verdict + elsewhere(answer, answers)
         console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
-    console.print(f"answers in {out / ANSWERS}, figures in {out / FIGURES}", soft_wrap=True)
+    say(f"answers in {out / ANSWERS}, figures in {out / FIGURES}")
     if wanted is not None:
         lines = differences(answers, wanted)
-        console.print("\n".join(lines) or f"the same answers as in {check}", soft_wrap=True, markup=False)
+        say("\n".join(lines) or f"the same answers as in {check}")
         if lines:
             sys.exit(FAILED)
 
@@ -153,30 +155,30 @@ def tune(
     *,
     controllers: Annotated[
         str,
-        Option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
+        option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
     ] = "all",
     studies: Annotated[
         int,
-        Option(
+        option(
             "--studies", "COUNT", "Studies of each method; the one that is best on a second set of robots is taken."
         ),
     ] = 3,
-    trials: Annotated[int, Option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
+    trials: Annotated[int, option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
-        int, Option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
+        int, option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, Option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
     offset: Annotated[
-        int, Option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
+        int, option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
     ] = 0,
-    study_seed: Annotated[int, Option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
+    study_seed: Annotated[int, option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
         bool,
-        Option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
+        option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
     ] = False,
-    out: Annotated[Path, Option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
+    out: Annotated[Path, option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
 ) -> None:
@@ -207,13 +209,13 @@ def tune(
     results = write_results(out, methods)
     if results:
         console.print(_tuned_table(results))
-        console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
+        say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
     if interrupted:
         _say_interrupted()
 
 
 def _say_interrupted() -> None:
-    console.print("interrupted; the same call continues where it stopped")
+    say("interrupted; the same call continues where it stopped")
     sys.exit(INTERRUPTED)
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import operator
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, SupportsIndex, TypeAlias
@@ -27,22 +27,24 @@ class ShortName(NamedTuple):
     Attributes:
         key: of the setting, `SECTION.KEY`.
         column: in the table of runs.
+        heading: of this column where it is shown, with the unit.
         usual: in this column for runs that do not vary the setting.
-        scale: from the value to the number in the run's name.
+        scale: from the value to the number that is shown.
         unit: of this number.
     """
 
     key: str
     column: str
+    heading: str
     usual: float | None = None
     scale: float = 1e3
     unit: str = "ms"
 
 
 SHORT_NAMES: Final[Mapping[str, ShortName]] = {
-    "noise": ShortName("plant.sensing.noise_factor", "noise_factor", 1.0, 1.0, ""),
-    "latency": ShortName("plant.sensing.latency", "latency_s"),
-    "period": ShortName("run.period", "period_s"),
+    "noise": ShortName("plant.sensing.noise_factor", "noise_factor", "noise factor", 1.0, 1.0, ""),
+    "latency": ShortName("plant.sensing.latency", "latency_s", "latency [ms]"),
+    "period": ShortName("run.period", "period_s", "period [ms]"),
 }
 ROLES: Final = ("plant", "controller", "task")
 SECTIONS: Final = ("run.", *(f"{role}." for role in ROLES))  # with which the key of a varied setting begins
@@ -186,6 +188,17 @@ def varied_in_row(row: Mapping[str, Any]) -> Varied:
         (columns[name], json.loads(value) if str(value).startswith("[") else value) for name, value in values.items()
     ]
     return tuple((key, value) for key, value in given if not (isinstance(value, float) and math.isnan(value)))
+
+
+def varied_columns(columns: Iterable[str]) -> dict[str, tuple[str, float]]:
+    """Return the columns of settings that a run may vary with their headings and scales, those of short names first.
+
+    Args:
+        columns: of a table of runs.
+    """
+    known = {short.column: (short.heading, short.scale) for short in SHORT_NAMES.values()}
+    known |= {name: (name, 1.0) for name in columns if name.startswith(SECTIONS)}
+    return {name: known[name] for name in known if name in set(columns)}
 
 
 def _in_name(varied: tuple[str, Value]) -> str:

@@ -7,7 +7,7 @@ import pytest
 from kit.plants import NEEDS_BULLET
 from servobench.harness.config.registry import controller_names, engine_of
 from servobench.harness.config.settings import ConfigurationError, Settings
-from servobench.harness.run.request import RunRequest, RunSettings
+from servobench.harness.run.request import RunRequest, RunSettings, varied_in_row
 from servobench.harness.run.resolution import resolve
 from servobench.plant.robot.mismatch import Mismatch
 
@@ -59,3 +59,15 @@ def test_a_row_names_the_engine_that_renders_its_plant(plant, engine):
     told = engine_of(plant)
     assert told.startswith(engine)
     assert bool(told) == bool(engine)
+
+
+def test_varied_settings_are_columns_from_which_they_are_read_again():
+    varied = {"task.radius": 0.1, "mfac.law.gain": 2, "noise": 2, "period": 0.02, "plant.obstacles": [[1.0, 2.0]]}
+    request = RunRequest("bullet", "mfac", "circle", "none", 0, varied)
+    row = request.as_row()
+    assert (row["noise_factor"], row["latency_s"], row["period_s"]) == (2.0, None, 0.02)
+    assert (row["task.radius"], row["controller.law.gain"]) == (0.1, 2)
+    assert row["run_id"].startswith("bullet-mfac-circle-none-noise2-period20ms-controller.law.gain=2-")
+    again = RunRequest("bullet", "mfac", "circle", "none", 0, varied_in_row(row))
+    assert again == request
+    assert hash(again) == hash(request)
