@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,12 @@ from servobench.plant.cameras.optics import Optics
 from servobench.plant.cameras.symbolic import (
     SX,
     ArmGeometry,
-    EyeGeometry,
     HandEyeGeometry,
+    SetupGeometry,
     feature_and_jacobian,
     features,
     points_in_cameras,
-    seen_features,
+    valid_features,
 )
 from servobench.plant.contract.checks import FloatArray
 
@@ -102,6 +103,7 @@ def _initialiser(name: str, values: list[str]) -> str:
     return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"
 
 
+@cache
 def kinematics_source(layout: ArmLayout) -> str:
     """Return the C source of the kinematic core for the arm that `layout` describes."""
     return generated_source("kinematics", _core_functions(layout))
@@ -148,8 +150,8 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
         return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), jacobian
     geometry = _view(part, arm, view)
     points = points_in_cameras(q, geometry, view.mount)
-    feature = features(points, geometry.optics, view.eye)
-    seen = seen_features(points, geometry.optics, view.eye)
+    feature = features(points, geometry.optics, view.setup)
+    seen = valid_features(points, geometry.optics, view.setup)
     return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
 
 
@@ -164,8 +166,8 @@ def _arm(part: Mapping[str, SX]) -> ArmGeometry:
     )
 
 
-def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> EyeGeometry:
-    c = view.eye.cameras
+def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry:
+    c = view.setup.cameras
     optics = Optics(
         _objects(part["focal_length"], (c,)),
         _objects(part["principal_point"], (c, 2)),
@@ -174,7 +176,7 @@ def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> EyeGeometry:
     )
     positions, angles = (casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy"))
     poses = [(_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]
-    return EyeGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
+    return SetupGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
 
 
 def _objects(values: SX, shape: tuple[int, ...]) -> npt.NDArray[Any]:

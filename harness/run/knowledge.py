@@ -15,10 +15,10 @@ from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.controllers.units import in_natural_units
 from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunSettings
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.signals import PlantSpec
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 NETWORKS = "networks"
@@ -27,8 +27,8 @@ NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes t
 _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
 
 
-def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
-    """Return what every controller may know."""
+def nominal_knowledge(robot: Robot, nominal: RobotModel, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
+    """Return the knowledge that every controller gets."""
     if not robot.known:
         return RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
     return RobotKnowledge(
@@ -40,18 +40,18 @@ def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: Ru
     )
 
 
-def _cameras(nominal: SensedArm) -> CameraModel | None:
+def _cameras(nominal: RobotModel) -> CameraModel | None:
     """Return how the cameras of a nominal model see points, where its features are those of single points."""
-    if not (isinstance(nominal, EyeModel) and nominal.eye.single and nominal.eye.locate):
+    if not (isinstance(nominal, SetupModel) and nominal.setup.single and nominal.setup.locate):
         return None
-    return CameraModel(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
+    return CameraModel(nominal.setup.cameras, len(nominal.setup.target), nominal.point_motions, nominal.interaction)
 
 
-def in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:
-    """Return what networks are trained on: a Jacobian that says nothing about what the cameras do not see."""
+def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> RobotKnowledge:
+    """Return the knowledge for training networks: its Jacobian covers postures with the target in view only."""
     if nominal is robot.nominal:
         return knowledge
-    return replace(knowledge, nominal_jacobian=lambda q: nominal.jacobian_in_view(q, robot.workspace.home))
+    return replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
 
 
 def trained_on(
@@ -93,9 +93,7 @@ def network_source(
         if keep is not None:
             path = keep / NETWORKS / f"networks-{networks.digest[:16]}.npz"
             if not path.exists():
-                with contextlib.suppress(
-                    OSError
-                ):  # a folder that takes no more files is told of where rows are written
+                with contextlib.suppress(OSError):  # a full folder is reported where rows are written
                     save_networks(networks, path)
         return networks
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.harness.run.log import column_unit
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.files import reason
 from servobench.plant.contract.signals import Channel
@@ -56,7 +56,7 @@ class FixedPoint(Reference):
     target: FloatArray
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
-        """Return the target, whatever the time."""
+        """Return the target, the same at all times."""
         times = np.asarray(time, dtype=np.float64)
         return np.broadcast_to(self.target, (*times.shape, len(self.target))).copy()
 
@@ -148,10 +148,10 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
         raise ValueError(f"waypoint file {path}: {error}") from error
 
 
-class View(Reference):
+class ImageReference(Reference):
     """A desired place of the target over time, and its image."""
 
-    model: EyeModel
+    model: SetupModel
     """The true arm and its cameras."""
 
     @abstractmethod
@@ -160,15 +160,15 @@ class View(Reference):
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
         """Return its image, (..., m)."""
-        return self.model.seen(self.points(time))
+        return self.model.feature_at(self.points(time))
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class TaughtView(View):
+class TaughtImage(ImageReference):
     """The target where it is with the arm at given joint positions."""
 
-    model: EyeModel
+    model: SetupModel
     joint_position: FloatArray  # (n,) [rad]
 
     def points(self, time: npt.ArrayLike) -> FloatArray:
@@ -179,10 +179,10 @@ class TaughtView(View):
 
 @final
 @dataclass(frozen=True, eq=False)
-class FollowedCurve(View):
+class FollowedCurve(ImageReference):
     """The target on a curve in space, as above."""
 
-    model: EyeModel
+    model: SetupModel
     curve: Reference  # of a ball in the frame of a fixed camera, (3,) [m]
     robot: Robot  # whose home gives the orientation, and whose workspace the curve is in
 
@@ -195,5 +195,5 @@ class FollowedCurve(View):
 
 
 def in_space(curve: Reference, model: object, robot: Robot | None) -> Reference:
-    """Return what the features should be for a ball on a curve: the curve itself where they are places."""
-    return FollowedCurve(model, curve, robot) if isinstance(model, EyeModel) and robot is not None else curve
+    """Return the desired features of a ball on a curve: the curve itself where features are places."""
+    return FollowedCurve(model, curve, robot) if isinstance(model, SetupModel) and robot is not None else curve
