@@ -165,18 +165,7 @@ def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Ite
 
 def _options(kind: str, rate: float) -> list[str]:
     if kind == MP4:
-        return [
-            "-c:v",
-            "libx264",
-            "-pix_fmt",
-            "yuv420p",
-            "-crf",
-            QUALITY,
-            "-preset",
-            "medium",
-            "-movflags",
-            "+faststart",
-        ]
+        return f"-c:v libx264 -pix_fmt yuv420p -crf {QUALITY} -preset medium -movflags +faststart".split()
     # One palette for the whole film, no dithering, and only the rectangle that changed: a still background is free.
     chain = (
         f"fps={min(float(GIF_RATE), rate):g},scale={GIF_WIDTH}:-1:flags=area,split[a][b];"

@@ -129,12 +129,14 @@ class Group:
     Attributes:
         plant: its name.
         mismatch: as it was given.
-        seed: of these runs.
+        runs: all runs of this plant and mismatch.
+        seed: of the runs in `tasks`.
         tasks: task -> controller -> track; tasks without any step are left out.
     """
 
     plant: str
     mismatch: str
+    runs: pd.DataFrame
     seed: int
     tasks: dict[str, Tracks]
 
@@ -169,7 +171,7 @@ def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
             if row["run_id"] in tables:
                 table = tables[row["run_id"]].dropna(axis=1, how="all").reset_index(drop=True)
                 tasks.setdefault(row["task"], {})[row["controller"]] = Track({str(k): row[k] for k in row}, table)
-        yield Group(str(plant), str(mismatch), int(chosen["seed"].iloc[0]), tasks)
+        yield Group(str(plant), str(mismatch), group, int(chosen["seed"].iloc[0]), tasks)
 
 
 def each(kind: Callable[[Track], Track], tracks: Tracks) -> Tracks:
