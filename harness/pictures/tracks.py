@@ -78,7 +78,7 @@ class Track:
 
     @property
     def settling_band(self) -> float:
-        """The error within which the run counts as settled [`error_unit`]; NaN if the table does not tell it."""
+        """The error within which the run counts as settled [`error_unit`]; NaN if the table has none."""
         return self.error_unit[1] * float(self.row.get("settling_band", np.nan))
 
     @property
@@ -228,7 +228,7 @@ class Ensemble:
 
     @property
     def settling_band(self) -> float:
-        """The error within which a run counts as settled [`error_unit`]; NaN if the table does not tell it."""
+        """The error within which a run counts as settled [`error_unit`]; NaN if the table has none."""
         return self.error_unit[1] * float(self.runs.reindex(columns=["settling_band"])["settling_band"].iloc[0])
 
     @property
