@@ -26,10 +26,10 @@ from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
 from servobench.harness.run.references import Reference, View
 from servobench.harness.run.scenario import Scenario
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.inverse import closest_distance
 
 SETTLED, NOT_SETTLED = "settled", "not_settled"
@@ -44,7 +44,7 @@ CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
 
 
 def find_outcome(
-    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: SensedArm | None
+    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: RobotModel | None
 ) -> str:
     """Return the outcome of a run that completed.
 
@@ -84,12 +84,12 @@ def _is_out_of_reach(steps: Steps, robot: HandEyeModel, evaluate_from: float, ba
     return bool((closest_distance(robot.arm, robot.to_base(points), spec.joint_lower, spec.joint_upper) > band).any())
 
 
-def pose_errors(robot: SensedArm | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:
+def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:
     """Return distance (k,) [mm] and angle (k,) [deg] of the target from its reference pose; None where not judged.
 
     Where the camera is moved during the run, the target is still judged by its taught pose.
     """
-    if not (isinstance(robot, EyeModel) and robot.eye.judges_pose and isinstance(reference, View)):
+    if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, View)):
         return None
     distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
     return 1e3 * distance, np.degrees(angle)
