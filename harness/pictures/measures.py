@@ -111,20 +111,15 @@ def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, la
     """Draw metrics of one task in rows of as many panels as the layout has columns."""
     names = runs["controller"].unique().tolist()
     rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
-    columns = min(layout.columns, len(rows))
-    lines = -(-len(rows) // columns)
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
-    letters = round((layout.width - beside) / columns / LETTER)
+    letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
     words = [textwrap.fill(row.label, letters) for row in rows]
     height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
-    figure = Figure(figsize=(layout.width, 0.35 + lines * height), layout="constrained")
-    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
-    for axes, row, label in zip(panels, rows, words, strict=False):
+    figure, panels = panel_grid(len(rows), height, layout, head=0.35)
+    for axes, row, label in zip(panels, rows, words, strict=True):
         _draw_dots(axes, runs, names, styles, row)
         _name_rows(axes, names, layout)
         axes.set_xlabel(label)
-    for axes in panels[len(rows) :]:
-        axes.set_visible(False)
     return figure
 
 

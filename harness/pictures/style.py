@@ -197,17 +197,18 @@ def figure_style(size: float = FILM_TEXT) -> AbstractContextManager[None]:
     )
 
 
-def panel_grid(count: int, height: float, layout: Layout = WIDE) -> tuple[Figure, list[Axes]]:
+def panel_grid(count: int, height: float, layout: Layout = WIDE, head: float = 1.0) -> tuple[Figure, list[Axes]]:
     """Return a figure of panels with a common ordinate, and its `count` panels.
 
     Args:
         count: how many panels, at least one.
-        height: of a row, inches.
+        height: of a row [in].
         layout: of the figure.
+        head: height of the title and the legend [in].
     """
     columns = min(layout.columns, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(layout.width, 1.0 + height * rows), layout="constrained")
+    figure = Figure(figsize=(layout.width, head + height * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel().tolist()
     for axes in panels[count:]:
         axes.set_visible(False)
