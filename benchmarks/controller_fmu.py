@@ -19,7 +19,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.mismatch import Mismatch
 

@@ -16,13 +16,11 @@ import numpy as np
 
 from measuring import asked_to_be_quick, table
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.bullet.scene import BulletScene
-from servobench.plant.rendered.bullet.simulation import BulletSimulation
+from servobench.plant.rendered.bullet import BulletScene, BulletSimulation
 from servobench.plant.rendered.detection import find_ball
 from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.engine import Machine
-from servobench.plant.rendered.mujoco.scene import MujocoScene
-from servobench.plant.rendered.mujoco.simulation import MujocoSimulation
+from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
@@ -64,7 +62,7 @@ def swings(drives: DriveConfig, robots: int) -> tuple[FloatArray, FloatArray]:
 def detections(poses: int) -> FloatArray:
     """Return how far detected balls are from the true ones on both engines, and from each other, (k, 3) m."""
     model, camera, rng = nominal_ur5(), RenderedConfig().camera(), np.random.default_rng(FIRST_SEED)
-    scenes = [kind(Room(model.arm, scenery=False)) for kind in (BulletScene, MujocoScene)]
+    scenes = [kind(Room(model.arm, False, find_robot("ur5"))) for kind in (BulletScene, MujocoScene)]
     rows = []
     for _ in range(poses):
         theta = np.array(HOME) + rng.uniform(-0.6, 0.6, 6)

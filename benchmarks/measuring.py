@@ -29,7 +29,7 @@ def resolved_runs(plant: str, method: str, count: int, duration: float | None = 
     """Return runs with moderate mismatch, and with another duration [s] if one is given."""
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest
-    from servobench.harness.run.resolved import resolve
+    from servobench.harness.run.resolution import resolve
 
     settings, mismatch = Settings({"random": {"duration": duration}} if duration else {}), cast(Any, "moderate")
     return [resolve(RunRequest(plant, method, "random", mismatch, FIRST_SEED + i), settings) for i in range(count)]

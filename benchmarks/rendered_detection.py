@@ -19,10 +19,9 @@ from servobench.plant.cameras.model import EyeModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
-from servobench.plant.rendered.bullet.scene import BulletScene
-from servobench.plant.rendered.mark_sight import open_sight
-from servobench.plant.rendered.rig import Rig
-from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.bullet import BulletScene
+from servobench.plant.rendered.detectors import open_sight
+from servobench.plant.rendered.room import Rig, Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch

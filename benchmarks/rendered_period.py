@@ -19,17 +19,18 @@ from measuring import asked_to_be_quick, milliseconds, table
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray, whole_steps
 from servobench.plant.contract.signals import Command
+from servobench.plant.rendered.detection import Window, whole, window_around
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Machine
+from servobench.plant.rendered.plants import build_bullet, build_mujoco
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.rendered.window import Window, whole, window_around
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.catalogue import find_robot
 
-HOME, MODEL = np.array(ur5.HOME), ur5.nominal_ur5()
+HOME, MODEL, ROBOT = np.array(ur5.HOME), ur5.nominal_ur5(), find_robot("ur5")
 PERIOD = 0.05  # [s]
 STEPS = whole_steps(PERIOD, PHYSICS_STEP)
 Calls = dict[str, Callable[[FloatArray], object]]  # of joint velocities [rad/s], by name; the bare calls first
@@ -39,14 +40,12 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     """Return the calls of PyBullet, of the plant and of a loop in the manner of Gymnasium."""
     import pybullet
 
-    from servobench.plant.rendered.bullet.bullet_plant import build_bullet
-    from servobench.plant.rendered.bullet.mechanics import Mechanics
-    from servobench.plant.rendered.bullet.scene import BulletScene
+    from servobench.plant.rendered.bullet import BulletScene, Mechanics
 
     plant = opened.enter_context(closing(build_bullet(config, PlantSetup(MODEL, HOME, PERIOD))))
-    scenes = [opened.enter_context(closing(BulletScene(Room(MODEL.arm, config.scenery)))) for _ in range(2)]
+    scenes = [opened.enter_context(closing(BulletScene(Room(MODEL.arm, config.scenery, ROBOT)))) for _ in range(2)]
     loads = {"payload": config.drives.payload, "assumed_payload": config.drives.assumed_payload}
-    mechanics = opened.enter_context(closing(Mechanics(MODEL.arm, **loads)))
+    mechanics = opened.enter_context(closing(Mechanics(MODEL.arm, robot=ROBOT, **loads)))
     camera = config.camera()
     plant.reset(0)
     for scene in scenes:
@@ -92,17 +91,14 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
 
 def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     """Return the calls of MuJoCo, with the whole image and with the ball's window, and those of the plant."""
-    from servobench.plant.rendered.mujoco.engine import mujoco
-    from servobench.plant.rendered.mujoco.mujoco_plant import build_mujoco
-    from servobench.plant.rendered.mujoco.scene import MujocoScene
-    from servobench.plant.rendered.mujoco.simulation import MujocoSimulation
+    from servobench.plant.rendered.mujoco import MujocoScene, MujocoSimulation, mujoco
 
     plant = opened.enter_context(closing(build_mujoco(config, PlantSetup(MODEL, HOME, PERIOD))))
     plant.reset(0)
     stops = np.full(6, config.joint_range)
-    machine = Machine(MODEL.arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
+    machine = Machine(MODEL.arm, ROBOT, (), config.drives, config.lag, HOME, (-stops, stops))
     simulation = opened.enter_context(closing(MujocoSimulation(machine)))
-    scene = opened.enter_context(closing(MujocoScene(Room(MODEL.arm, config.scenery))))
+    scene = opened.enter_context(closing(MujocoScene(Room(MODEL.arm, config.scenery, ROBOT))))
     simulation.start(HOME)
     scene.place(HOME)
     camera, world = config.camera(), plant.world

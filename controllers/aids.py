@@ -55,23 +55,23 @@ class AidsConfig:
     """The aids of a composed controller; by default there are none."""
 
     delay: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
-    """The camera's latency: which joint motion belongs to a feature's motion, and where the feature is by now."""
+    """Compensate the camera's latency: pair motions of the feature with joint motions, and predict the feature."""
     response: Annotated[Known, Switch("identified", tuned=("ignored", "identified"))] = "ignored"
-    """How joints answer to commands: the law acts on where the arm will be when all of them are carried out."""
+    """Smith predictor: the law acts on the state that the arm reaches once all commands sent are carried out."""
     noise: Annotated[Literal["given", "identified"], Switch("identified", tuned=("given", "identified"))] = "given"
     """The standard deviation of the feature, as `feature_noise` or identified."""
     filter: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
-    """Filter the feature with the motion of the joints."""
+    """Kalman filter of the feature, predicted by the motion of the joints."""
     model: Annotated[Literal["own", "nominal", "map"], Switch("map", tuned=("own", "nominal", "map"))] = "own"
-    """The estimator's own Jacobian, its deviation from the nominal one, or from the nominal one seen through a map."""
+    """The estimator's own Jacobian, its deviation from the nominal one, or from the nominal one corrected by a map."""
     feedforward: Annotated[bool, Switch(equipped=True, tuned=(False, True))] = False
-    """Add the reference's own motion; needs a preview."""
+    """Feedforward of the reference's own motion; needs a preview."""
     posture: Annotated[bool, Switch(equipped=True)] = False
-    """Move towards the middle of the working region in the null space of the Jacobian."""
+    """Null-space centring: move towards the middle of the working region in the null space of the Jacobian."""
     limit: Annotated[
         Literal["scale", "clip", "redistribute"], Switch("redistribute", tuned=("scale", "clip", "redistribute"))
     ] = "scale"
-    """A command beyond the limits is shrunk, cut joint by joint, or taken over by joints with room."""
+    """Saturation: a command beyond the limits is scaled, clipped by joint, or redistributed to joints with room."""
     longest_delay: Annotated[NonNegative, Le(1.0)] = 0.25
     """[s] the longest delay that is considered; for an identified one."""
     latency: NonNegative = 0.0
@@ -100,15 +100,15 @@ class AidsConfig:
     score_memory: Share = 1.0
     """[1] share of a delay's score that is kept from one motion to the next; below 1 for a latency that changes."""
     detect_moves: bool = True
-    """Forget what is known of the map when the camera seems to have been moved."""
+    """Forget the map when the camera seems to have been moved."""
     move_gate: Positive = 12.0
-    """[1] sum of innovations (CUSUM) beyond which it seems so."""
+    """[1] gate of the CUSUM of innovations, beyond which it seems so."""
     filter_error: NonNegative = 0.2
     """[1] error of the Jacobian as a share of its size, as the filter sees it."""
     posture_gain: Annotated[NonNegative, Tuned(0.1, 1.0)] = 0.6
-    """[1/s] gain of the posture."""
+    """[1/s] gain of the null-space centring (`posture`)."""
     damping: Positive = 0.02
-    """[m/rad] of the inverse in feedforward, posture and redistribution."""
+    """[m/rad] damping of the pseudo-inverse in feedforward, null-space centring and redistribution."""
 
     @property
     def needs_past(self) -> bool:

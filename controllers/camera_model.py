@@ -1,6 +1,6 @@
 """The camera model that a controller may know: nominal motions of points, and the interaction matrix.
 
-    J = L(y, z) R G(q)          R the turn of the true camera, z the depth of a point
+    J = L(y, z) R G(q)          R the rotation of the true camera, z the depth of a point
 
 G(q) (3, n) is the motion of a point with the joints in the frame of the nominal camera, L (k, 3) the change of the
 features of the point with its place in the camera, for one block of a point; all of it in the units of the parts.
@@ -55,7 +55,7 @@ class CameraModel:
         return self.interaction(feature, depth.reshape(*depth.shape[:-1], self.cameras, self.points))
 
     def in_unit(self, scale: float) -> CameraModel:
-        """Return what is known with features divided by `scale`."""
+        """Return the camera model with features divided by `scale`."""
 
         def natural(feature: FloatArray, depth: FloatArray) -> FloatArray:
             return np.asarray(self.interaction(scale * feature, depth) / scale)

@@ -1,4 +1,4 @@
-"""The contract of a controller: reset, step, diagnostics, save, restore; and what it may know about the robot.
+"""The contract of a controller: reset, step, diagnostics, save, restore; and its knowledge of the robot.
 
 A controller never sees a plant, a simulator, a file or the truth. One of your own is a subclass of `Controller` in a
 file, constructed as `Mine(knowledge)` or as `Mine(config, knowledge)` with an annotated frozen dataclass of settings.
@@ -44,7 +44,7 @@ class Delays:
 
 @dataclass(frozen=True)
 class RobotKnowledge:
-    """What a controller may know about the robot, through its constructor.
+    """The knowledge of the robot that a controller gets through its constructor.
 
     Attributes:
         spec: sizes, limits and control period of the plant.
@@ -59,9 +59,9 @@ class RobotKnowledge:
             trained there.
         train: runs an offline training for its settings, or returns an earlier result for the same ones; the part that
             needs the training defines both types. None: it is run when the controller is built.
-        unit: what one of the features here is in the unit of the plant's; see `servobench.controllers.units`.
-        nominal_cameras: how the nominal cameras see points, of which the features are made; None where these are not
-            features of single points in images, or no model exists.
+        unit: one unit of the features here in units of the plant's; see `servobench.controllers.units`.
+        nominal_cameras: model of the nominal cameras; None where features are not those of single points in images,
+            or no model exists.
     """
 
     spec: PlantSpec
@@ -76,7 +76,7 @@ class RobotKnowledge:
     nominal_cameras: CameraModel | None = None
 
     def check(self, observation: Observation, reference: FloatArray | None = None) -> None:
-        """Check what a controller is given.
+        """Check the sizes of an observation and a reference.
 
         Raises:
             ValueError: an observation or a reference of the wrong size, or a reference that is not finite.
@@ -104,7 +104,7 @@ class Controller(ABC):
         """Forget everything and prepare for a run that starts with `observation`.
 
         Args:
-            observation: what the first `step` will see.
+            observation: that of the first `step`.
             seed: for controllers that draw random numbers.
         """
 
@@ -113,7 +113,7 @@ class Controller(ABC):
         """Return the command for the period that begins now.
 
         Args:
-            observation: what is seen now.
+            observation: of this instant.
             reference: (1 + preview, m): row 0 is now, the rest are the next control instants.
 
         Returns:
@@ -139,7 +139,7 @@ class Controller(ABC):
         self.__dict__ = self._copy(state)
 
     def _shared(self) -> Iterable[object]:
-        """Return what `save` and `restore` keep instead of copying: models and handles, which never change."""
+        """Return the objects that `save` and `restore` keep uncopied: models and handles, which never change."""
         return ()
 
     def _copy(self, state: dict[str, Any]) -> dict[str, Any]:
@@ -158,7 +158,7 @@ class ControllerEntry:
         name: the word on the command line.
         summary: one line for `servobench controllers`.
         config: returns the default settings, a frozen dataclass; a dataclass with a default for every field does.
-        build: makes the controller from its settings and what it may know.
+        build: makes the controller from its settings and its knowledge of the robot.
         needs_truth: whether it is given the true Jacobian and kinematics: a bound, not a competitor.
         side_by_side: whether `build` returns a `ServoController`, whose parts take many runs at once.
     """

@@ -141,7 +141,7 @@ _ROWS = (
     ),
     Method(
         "map_mfac", "mfac", "constant",
-        "the nominal Jacobian seen through an estimated map of the camera, with model-free adaptive control",
+        "the nominal Jacobian corrected by an estimated map of the camera, with model-free adaptive control",
         {"gain": 27.7, "step_weight": 4e-4}, EQUIPPED,
     ),
     Method(
@@ -200,7 +200,7 @@ def compose(law: str, estimator: str) -> ControllerEntry:
 
 
 def suggest_pair(name: str) -> str:
-    """Return what to say where the name of a law or an estimator is given as that of a controller; else nothing."""
+    """Return the advice for the name of a law or an estimator given as that of a controller; empty for others."""
     if name not in {*LAWS, *ESTIMATORS}:
         return ""
     is_law = name in LAWS

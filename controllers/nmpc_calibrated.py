@@ -62,7 +62,7 @@ class NmpcCalibrated(Controller):
     over speed, acceleration and position limits; e = y_ref(0) − h(q̂) − b, β = exp(−decay Δ). Time τ counts blocks of
     length Δ (`laws.mpc.blocks`) from `delay` ahead; after it the joints are taken as ideal: q̂ = q + the steps sent in
     the last `delay` seconds. b follows the camera, b ← b + γ (y − h(q) − b) with γ = 1 − exp(−disturbance_rate dt);
-    with the default γ = 0 the controller does not look at it and shows what perfect calibration alone is worth. Each
+    with the default γ = 0 the controller ignores the camera and shows the effect of perfect calibration alone. Each
     iteration is a Gauss-Newton step: h is linearised along the present plan, at first the last one shifted by one
     control period, and the program of `laws.mpc.qp` gives the next one. Not in the paper.
 
@@ -70,7 +70,7 @@ class NmpcCalibrated(Controller):
     |---|---|---|---|
     | `plan` | dq_1 … dq_H | (H, n) | rad |
     | `J` | ∂h/∂q along the plan | (H, m, n) | m/rad |
-    | `b` | feature as seen minus that of the model | (m,) | m |
+    | `b` | measured feature minus that of the model | (m,) | m |
     """
 
     def __init__(self, config: NmpcCalibratedConfig, knowledge: RobotKnowledge) -> None:
@@ -134,8 +134,8 @@ class NmpcCalibrated(Controller):
         present = observation.joint_position
         feature, self._jacobian = self._evaluate(present)
         if observation.feature_valid:
-            seen = observation.feature / self._knowledge.unit
-            self._b = self._b + self._disturbance_share * (seen - feature - self._b)
+            measured = observation.feature / self._knowledge.unit
+            self._b = self._b + self._disturbance_share * (measured - feature - self._b)
         start = present + self._to_come @ self._sent
         rows = sampled(reference / self._knowledge.unit, self._places)
         error = rows[0] - self._evaluate(start)[0] - self._b

@@ -20,20 +20,20 @@ def whole_periods(time: float, period: float) -> int:
     return round(time / period)
 
 
-def check_preview(wanted: float, rows: int, period: float, what: str) -> None:
+def check_preview(wanted: float, rows: int, period: float, settings: str) -> None:
     """Refuse a preview that does not reach far enough.
 
     Args:
         wanted: how far the law looks ahead [s].
         rows: of the preview, one for each control period.
         period: of control [s].
-        what: the settings that add up to `wanted`.
+        settings: names of those that add up to `wanted`.
 
     Raises:
         ValueError: it is too short.
     """
     if rows < in_periods(wanted, period):
-        raise ValueError(f"preview must reach {what} = {wanted:g} s, got {rows} rows of {period:g} s")
+        raise ValueError(f"preview must reach {settings} = {wanted:g} s, got {rows} rows of {period:g} s")
 
 
 def sampled(rows: FloatArray, places: FloatArray) -> FloatArray:

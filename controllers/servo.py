@@ -111,7 +111,7 @@ class Servo:
         """Return the new state and the joint velocity (..., n) [rad/s] for the period that begins now.
 
         Raises:
-            ControllerDiverged: the estimate, or what the law asked for, is not finite in at least one lane.
+            ControllerDiverged: the estimate, or the command of the law, is not finite in at least one lane.
             RunFault: a part cannot go on in at least one lane.
         """
         if self._unit != 1.0:
@@ -189,7 +189,7 @@ class Servo:
     ) -> tuple[Any, FloatArray]:
         """Return the law's new state and the joint velocity that it wants, (..., n), rad/s.
 
-        A law that was trained on the nominal model works in its frame: what is seen is turned into it.
+        A law that was trained on the nominal model works in its frame, into which features are rotated.
         """
         J = estimation.jacobian
         if self._turns:
@@ -217,7 +217,7 @@ class ServoController(Controller):
     """A `Servo` as a controller of one run, whose state it holds.
 
     Attributes:
-        servo: what it is composed of.
+        servo: the composition.
         state: the state; None before the first `reset`.
     """
 

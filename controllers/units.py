@@ -34,7 +34,7 @@ class NaturalJacobian:
 
 
 def in_natural_units(knowledge: RobotKnowledge) -> RobotKnowledge:
-    """Return what is known of a robot with its features in natural units; `unit` says what one of them is."""
+    """Return the knowledge of a robot with its features in natural units; its `unit` is one of these in the plant's."""
     feature = knowledge.spec.feature
     scale = feature.scale
     if scale == 1.0:

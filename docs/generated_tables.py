@@ -5,12 +5,14 @@
 A generated part of a page is everything between two comments, of which the first says what belongs there:
 
     <!-- settings: controllers/laws/mfac.py:MfacConfig -->
+    <!-- metrics: table -->
     <!-- variables: ur5_mismatched -->
     <!-- table: worlds -->
     <!-- stored: dynamics -->
     <!-- studies: docs/page_studies -->
     <!-- methods: table -->
     <!-- methods: presets -->
+    <!-- options: shared -->
     <!-- end -->
 
 The meaning of a setting is the string below its field, what is allowed is its type, the default is that of the class.
@@ -34,12 +36,15 @@ import methods_table
 import stored_tables
 from page_studies import STUDIES
 from servobench.fmus.export import arm_layout
+from servobench.harness.cli.main import command_line
 from servobench.harness.config.description import describe_settings, toml
+from servobench.harness.run.metrics import METRICS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "fmus" / "ur5_mismatched" / "readme.md"]
 PART = re.compile(
-    r"(<!-- (settings|variables|table|stored|studies|methods): (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL
+    r"(<!-- (settings|metrics|variables|table|stored|studies|methods|options): (\S+) -->\n)(.*?)(<!-- end -->)",
+    re.DOTALL,
 )
 
 
@@ -53,9 +58,11 @@ def renewed(page: Path) -> str:
     """Return the text of a page with its generated parts made anew from the code and the stored tables."""
     make = {
         "settings": lambda part: settings_table(find(part[3])),
+        "metrics": lambda _: metrics_table(),
         "variables": lambda _: variables_table(),
         "studies": lambda _: studies_table(),
         "methods": lambda part: named_methods(part[3]),
+        "options": lambda _: options_table(),
         "table": lambda part: measured_table(part[3], page.parent) or part[4].strip("\n"),
         "stored": lambda part: stored_table(part[3], page.parent) or part[4].strip("\n"),
     }
@@ -67,6 +74,19 @@ def studies_table() -> str:
     """Return the table of the studies behind the measured tables and pictures."""
     rows = [(f"`{study.name}`", study.purpose, f"{study.minutes:g}") for study in STUDIES.values()]
     return table(("study", "what it measures", "minutes on two processors"), rows)
+
+
+def options_table() -> str:
+    """Return the table of the options that several commands have with one meaning."""
+    commands = command_line().commands
+    owners: dict[tuple[str, str], list[str]] = {}
+    for name, each in [*commands.items(), *((f"fmu {name}", each) for name, each in commands["fmu"].commands.items())]:
+        for option in each.params:
+            if option.param_type_name == "option":
+                words = "`" + " ".join([*option.opts, *option.secondary_opts, option.metavar]).strip() + "`"
+                owners.setdefault((words, option.help.replace("\\[", "[").replace("<", "\\<")), []).append(name)
+    rows = [(words, meaning, ", ".join(names)) for (words, meaning), names in owners.items() if len(names) > 1]
+    return table(("option", "meaning", "commands"), rows)
 
 
 def named_methods(kind: str) -> str:
@@ -142,6 +162,15 @@ def classes_with_tables() -> frozenset[type[Any]]:
     """Return the classes of settings that have a table on some page."""
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     return frozenset(find(place) for _, kind, place, *_ in PART.findall(text) if kind == "settings")
+
+
+def metrics_table() -> str:
+    """Return the table of the metrics of a run."""
+    rows = [
+        (f"`{metric.column}`", metric.unit or "that of the feature", metric.better or "–", metric.meaning)
+        for metric in METRICS.values()
+    ]
+    return table(("column", "unit", "better", "definition"), rows)
 
 
 def variables_table() -> str:

@@ -37,7 +37,7 @@ def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]
     """
     return (
         Group(POSITION, (n,), INPUT, "rad", "Joint position as the encoders report it."),
-        Group(FEATURE, (m,), INPUT, unit, "What is measured; the last valid value of what is not seen."),
+        Group(FEATURE, (m,), INPUT, unit, "Measured feature; where it is missing, the last valid value."),
         Group(SEEN, (m,), INPUT, "1", "1 where the feature was measured for this instant, else 0."),
         Group(REFERENCE, (rows, m), INPUT, unit, "Desired feature now, in row 1, and at the next instants."),
         Group(COMMAND, (n,), SAMPLED, "rad/s", "Joint velocity for the period that begins at this instant."),
@@ -47,7 +47,7 @@ def controller_groups(n: int, m: int, rows: int, unit: str) -> tuple[Group, ...]
 
 @dataclass(frozen=True)
 class ControllerRun:
-    """A run of the original: what it saw and what it answered in each period.
+    """A run of the original controller: its inputs and outputs in each period.
 
     Attributes:
         time: (K,), s.
@@ -76,7 +76,7 @@ class ControllerModel:
         groups: from `controller_groups`.
         period: s.
         run: of the original.
-        settings: what it was built with, for the documentation.
+        settings: of the original, for the documentation.
     """
 
     name: str
@@ -98,11 +98,11 @@ class ControllerModel:
         return generated_source(CORE, (self.recorded.start, self.recorded.step))
 
     def product(self, fmi_version: int, start: Mapping[str, FloatArray] | None = None) -> Product:
-        """Return what goes into the FMU.
+        """Return the content of the FMU.
 
         Args:
             fmi_version: 2 or 3.
-            start: values of inputs by name, (size,), at the start; zeros for others, and ones for what is seen.
+            start: values of inputs by name, (size,), at the start; zeros for others, and ones for `seen`.
         """
         layout = Layout(self.groups)
         starts = {SEEN: np.ones_like(self.run.inputs[SEEN][0]), **(start or {})}

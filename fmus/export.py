@@ -18,11 +18,12 @@ from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.cameras.registry import Sensing
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import SensedArm
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import UR5
 
-MODEL = "ur5_mismatched"  # folder of the model, which is that of any arm
+MODEL = "ur5_mismatched"  # source folder; one C model serves every arm
 CORE = "kinematics"
 PIXELS = "a point p in a camera appears at principal_point + focal_length (1 + distortion r²) (p_x, p_y) / p_z"
 
@@ -62,7 +63,7 @@ class ExportOptions:
 
     @property
     def view(self) -> View | None:
-        """What cameras see; None for the ball in 3-D by a fixed one."""
+        """The sensing set-up; None for the ball in 3-D by a fixed camera."""
         return View.of(self.model) if isinstance(self.model, EyeModel) else None
 
     @property
@@ -86,7 +87,7 @@ class ExportOptions:
 
     @property
     def summary(self) -> str:
-        """What the model is."""
+        """The model in one sentence."""
         title, view = self.robot.title, self.view
         seen = "with a ball on its flange under a fixed camera" if view is None else f"and its cameras: {view.setting}"
         return (
@@ -116,7 +117,7 @@ def fingerprint(options: ExportOptions) -> str:
 
 
 def product(options: ExportOptions, *, documented: bool = True) -> Product:
-    """Return what goes into the FMU; documentation and reference run only where it is to be `documented`."""
+    """Return the content of the FMU; documentation and reference run only where it is to be `documented`."""
     layout, start = options.layout, parameters_of(options.model, options.actuation)
     description = Description(
         model_name=options.title,

@@ -19,8 +19,8 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import FmuDescription, Variable, parse_description, read_description
+from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.port import Port
 
 TOLERANCE = 1e-9  # [1] largest relative difference of a run from the reference
 

@@ -266,7 +266,7 @@ def _describe(root: ET.Element, description: Description) -> None:
 
 def _units(root: ET.Element, used: set[str]) -> None:
     definitions = ET.SubElement(root, "UnitDefinitions")
-    # A pixel, or whatever else a set-up measures in, is a number.
+    # A pixel, or any other unit of a set-up, is a number.
     own = {name: {"rad": "-1"} if name.endswith("/rad") else {} for name in sorted(used - set(UNITS))}
     for name, exponents in (UNITS | own).items():
         unit = ET.SubElement(definitions, "Unit", name=name)

@@ -1,4 +1,4 @@
-"""What goes into an FMU, whatever the model, and how it is written: sources, libraries, description, documentation.
+"""The content of an FMU of any model, and how it is written: sources, libraries, description, documentation.
 
 Equal inputs give equal bytes: no date, no path and no machine name enters the archive.
 """
@@ -36,8 +36,8 @@ HEADERS: Final = {
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
 }
 FMI_SOURCES: Final = {
-    2: ("fmi2.c", "fmi2_exchange.c"),
-    3: ("fmi3.c", "fmi3_exchange.c", "fmi3_derivatives.c", "fmi3_absent.c"),
+    2: ("fmi2.c",),
+    3: ("fmi3.c", "fmi3_derivatives.c", "fmi3_absent.c"),
 }
 INSTANCE_HEADERS: Final = {2: "fmi2_instance.h", 3: "fmi3_instance.h"}
 SHARED_SOURCES: Final = ("model.c", "instance.c")
@@ -51,14 +51,14 @@ RELATED_FILES: Final = (
 
 @dataclass(frozen=True)
 class Product:
-    """What goes into an FMU.
+    """The content of an FMU.
 
     Attributes:
         fmi_version: 2 or 3.
         folder: of the model below `fmus`, with model.c, model.h and license.txt.
         core: name of the generated C file and of its header in that folder.
         source: text of that C file.
-        constants: what the model needs in layout.h beside sizes and offsets of its variables.
+        constants: for layout.h, beside sizes and offsets of the variables.
         description: of the model.
         documentation: HTML.
         reference: text of the reference run's inputs and outputs.
@@ -80,6 +80,7 @@ class Product:
             "model_functions.h",
             "instance.h",
             "instance.c",
+            "shared_functions.h",
             INSTANCE_HEADERS[version_],
             *FMI_SOURCES[version_],
         )

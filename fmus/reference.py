@@ -66,7 +66,7 @@ def reference_run(model: SensedArm, actuation: Actuation) -> ReferenceRun:
 
 
 def _features(model: SensedArm, positions: FloatArray) -> dict[str, FloatArray]:
-    """Return what is seen at joint positions (k, n), (k, size) by name."""
+    """Return the features at joint positions (k, n), (k, size) by name."""
     if not isinstance(model, EyeModel):
         return {"ball_position": model.feature(positions), SEEN: np.ones((len(positions), 3))}
     feature, _, seen = model.look(positions)

@@ -18,10 +18,11 @@ from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
-from servobench.plant.fmu.fmu_plant import build_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.fmu.world import build_fmu
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import UR5
 
 
 @settings
@@ -55,7 +56,7 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
     Args:
         fmi_version: 2 or 3.
         robot: None for the UR5.
-        sensing: what its cameras see; None for the ball in 3-D by a fixed one.
+        sensing: set-up of cameras; None for the ball in 3-D by a fixed one.
 
     Raises:
         CompilerMissing: it has to be built and there is no compiler.

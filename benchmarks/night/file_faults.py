@@ -38,10 +38,9 @@ from servobench.controllers.networks.config import ControllerTraining, JacobianT
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
 from servobench.harness.batch.checksums import UnwritableFolder
-from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import is_unused
-from servobench.harness.batch.sweep import SweepPlan
+from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import knowledge as network_cache

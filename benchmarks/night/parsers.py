@@ -26,15 +26,14 @@ from servobench.controllers.networks.fit import train
 from servobench.fmus.compile import parse_platforms
 from servobench.fmus.inspection import read_information
 from servobench.fmus.reference import read_table
-from servobench.harness.batch.compare import parse_seeds, refuse_tuning_seeds
-from servobench.harness.batch.sweep import parse_variation
+from servobench.harness.batch.plan import parse_seeds, parse_variation, refuse_tuning_seeds
 from servobench.harness.cli.selection import split_controllers, split_plants, split_tasks
 from servobench.harness.cli.studies import _numbers, _times
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, read_settings
 from servobench.harness.run.references import read_waypoints
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolved import check_settings, resolve
+from servobench.harness.run.resolution import check_settings, resolve
 from servobench.plant.fmu import archive
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description, read_exchange

@@ -23,10 +23,9 @@ from kit.command import judged
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.checksums import SUMS
-from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import locked
-from servobench.harness.batch.sweep import SweepPlan
+from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import ConfigurationError, Settings
 

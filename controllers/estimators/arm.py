@@ -12,7 +12,7 @@ B is 1, or where it is known how cameras see points, the change of the features 
 J_n is the nominal motion.
 
 The integral is that of a position, so that it does not depend on the path: Gauss-Legendre quadrature along the straight
-line. Gear ratios and zeros are what a map of the feature cannot repair (`controllers.stages.estimation`).
+line. A map of the feature cannot correct gear ratios and zeros (`controllers.stages.estimation`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The contract of a Jacobian estimator: what it learns from, and the estimate that it returns.
+"""The contract of a Jacobian estimator: the motions that it learns from, and the estimate that it returns.
 
 Estimators are pure: the state goes in and comes out, a tree of arrays with leading axes (`plant.contract.lanes`), and
 no array of it is ever changed. One run has no leading axis; a thousand runs have one.
@@ -14,7 +14,7 @@ from servobench.controllers.controller import Diagnostics
 from servobench.plant.contract.checks import FloatArray
 
 State = TypeVar("State")
-MOTION_TIME: Final = 0.05  # [s] that a motion lasts at least, whatever the control period: what is learned per second
+MOTION_TIME: Final = 0.05  # [s] shortest motion at any control period, so that as much is learned per second
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,7 +52,7 @@ class Estimator(ABC, Generic[State]):
 
     @abstractmethod
     def start(self, jacobian: FloatArray) -> State:
-        """Return the state of one that has seen nothing and starts from Ĵ₀, (..., m, n), m/rad."""
+        """Return the state before any motion, starting from Ĵ₀, (..., m, n), m/rad."""
 
     @abstractmethod
     def update(self, state: State, motion: Motion) -> State:

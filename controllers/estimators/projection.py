@@ -119,7 +119,7 @@ class CfdlEstimator(Estimator[CfdlState]):
 
     Departures: the book's sign is that of a scalar or of each diagonal entry of a square Φ. A turned camera rightly
     changes the sign of single entries, so the sign of the whole is taken: ⟨Φ, Φ₀⟩ = trace(ΦᵀΦ₀) ≤ 0 counts as changed.
-    The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, what was learnt stays.
+    The book's reset at small ‖Δq‖ is the minimum joint step here: such a motion is left out, and Φ stays.
     """
 
     def __init__(self, config: CfdlConfig, knowledge: RobotKnowledge | None = None) -> None:

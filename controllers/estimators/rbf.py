@@ -31,7 +31,7 @@ class RbfConfig:
     """[rad²] ε, joint motion (squared, summed over the window) below which learning fades. It holds at `USUAL_NOISE`;
     where the noise is identified it grows with its variance."""
     leak: NonNegative = 0.0
-    """[1/s] at which what was learned fades (σ-modification); 0 as in the paper."""
+    """[1/s] rate at which the learned weights fade (σ-modification); 0 as in the paper."""
 
 
 def window_step(
@@ -58,7 +58,7 @@ def started_rows(network: JacobianNetwork, jacobian: FloatArray) -> FloatArray:
 
     Args:
         network: the offline network.
-        jacobian: Ĵ₀, (..., m, n); only its shape is looked at. The network is itself the initial Jacobian, for all
+        jacobian: Ĵ₀, (..., m, n); only its shape counts. The network is itself the initial Jacobian, for all
             joint positions; one matrix without its joint position holds less.
 
     Raises:

@@ -16,8 +16,8 @@ Each measurement is weighted by Tukey's bisquare of its own residual, by iterati
 Only differences of the feature are known, which is enough: with `deviation` = measured − estimated feature of the last
 frame, ν = deviation + Δy − ĴΔq. The scale s ≥ 1 follows the median of |ν|: it rises or sinks at a constant rate until
 half of the normalised innovations are above the median of a normal distribution, so that no outlier counts by its
-size. What persists is believed: a feature that is rejected in more than `LOST_SHARE` of the last second is taken from
-where it is seen, with J as it is. So an outlier in the first frame, or a camera that is moved, costs a second or two.
+size. A lasting change is accepted: a feature that is rejected in more than `LOST_SHARE` of the last second is reset to
+its measurement, with J as it is. So an outlier in the first frame, or a camera that is moved, costs a second or two.
 
 M-estimation with re-weighting for the Jacobian: Shademan, Farahmand and Jägersand, "Robust Jacobian Estimation for
 Uncalibrated Visual Servoing", ICRA 2010, there from a memory of motions; of a Kalman filter: Gandhi and Mili, "Robust
@@ -44,7 +44,7 @@ SCALE_RATE: Final = 1.0  # [1/s] at which ln s rises or sinks
 MAX_SCALE: Final = 1e3  # [1]
 REJECTED: Final = 0.01  # [1] a smaller weight is a rejection
 MEMORY: Final = 1.0  # [s] of rejections
-LOST_SHARE: Final = 0.7  # [1] of rejections, above which a feature is taken from where it is seen
+LOST_SHARE: Final = 0.7  # [1] of rejections, above which a feature is reset to its measurement
 
 
 @settings
@@ -105,7 +105,7 @@ class RobustEstimator(Estimator[RobustState]):
         self._noise: FloatArray = np.asarray(config.feature_noise)[()]
 
     def start(self, jacobian: FloatArray) -> RobustState:
-        """Start from Ĵ₀, (..., m, n), m/rad, and the feature as it is seen first."""
+        """Start from Ĵ₀, (..., m, n), m/rad, and the first measurement of the feature."""
         config, (*lead, m, n) = self._config, jacobian.shape
         variances = np.concatenate([[config.feature_noise**2], np.full(n, config.initial_deviation**2)])
         P = np.broadcast_to(np.diag(variances), (*lead, m, n + 1, n + 1))
@@ -163,7 +163,7 @@ class RobustEstimator(Estimator[RobustState]):
 
 
 def _restarted_at_frame(P: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return the covariance of a feature that is where it is seen, which tells nothing about J."""
+    """Return the covariance of a feature that is reset to its measurement, which holds no information about J."""
     taken = P.copy()
     taken[..., 0, :] = taken[..., :, 0] = 0.0
     taken[..., 0, 0] = noise

@@ -120,8 +120,8 @@ def unscented_update(
 def ukf_estimator(config: UkfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the random-walk estimator whose gain is that of the unscented transform.
 
-    The paper does not say how P₀, Q and R are chosen, nor what happens at rest; R is kept honest here (2σ² of the
-    feature's noise), and motions below a minimum ‖Δq‖ are left out.
+    The paper gives neither P₀, Q and R nor a rule for an arm at rest; here R is the variance 2σ² of the feature's
+    noise, and motions below a minimum ‖Δq‖ are left out.
     """
     if config.form == "split":
         return RandomWalkEstimator(config, split_update, "shared")

@@ -20,7 +20,7 @@ State = TypeVar("State")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Estimate:
-    """What the law gets in each period.
+    """The message from the estimator to the law in each period.
 
     Attributes:
         jacobian: Ĵ, (..., m, n), m/rad, at the present joint position.
@@ -54,7 +54,7 @@ class Law(ABC, Generic[State]):
         Args:
             state: after the last command.
             estimate: the Jacobian.
-            observation: what is seen now.
+            observation: of this instant, or predicted.
             reference: (..., 1 + preview, m): row 0 is now, the rest are the next control instants.
 
         Returns:
@@ -70,7 +70,7 @@ class Law(ABC, Generic[State]):
 
         Args:
             state: after the command of this period.
-            joint_velocity: what is sent to the robot, after all stages, (..., n), rad/s.
+            joint_velocity: command sent to the robot, after all stages, (..., n), rad/s.
             limited: (...), whether it had to be limited.
         """
         del joint_velocity, limited

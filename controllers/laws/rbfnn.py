@@ -38,7 +38,7 @@ class RbfnnConfig:
     position: Literal["measured", "commanded"] = "measured"
     """The joint position q in ξ: as the encoders report it, or the sum of all commands as in the paper."""
     row_space_only: bool = True
-    """Keep what is learned out of the null space of Ĵ; false as in the paper."""
+    """Learn outside of the null space of Ĵ only; false as in the paper."""
     anti_windup: bool = True
     """Learn nothing that drives a limited command further; false as in the paper."""
 
@@ -83,7 +83,7 @@ class RbfnnLaw(Law[RbfnnState]):
     - ε, and the joint-speed limit in prediction and command.
     - "q(k−1)" is by default the measured position at instant k, from which the next step starts: the sum of all
       commands drifts away from the arm where a joint saturates or does not reach its commanded speed.
-    - The weights integrate Ĵᵀe. As the arm moves, Ĵ turns, and with n > m a part of what was learned comes to lie in
+    - The weights integrate Ĵᵀe. As the arm moves, Ĵ turns, and with n > m a part of the learned weights comes to lie in
       the null space of Ĵ, where no error can ever unlearn it: it drives the arm into ever new postures. With
       `row_space_only` the learned part W − W(0) is projected on the row space of Ĵ, which leaves Ĵ Δq as it was.
     - Without anti-windup the weights grow as long as a limited command cannot follow.

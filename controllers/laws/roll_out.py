@@ -23,7 +23,7 @@ from servobench.plant.contract.lanes import transposed
 
 
 class RollOut(NamedTuple):
-    """What the predicted loop went through.
+    """The trajectory of the predicted loop.
 
     Attributes:
         errors: e(k+1) … e(k+T), (..., T, m), m.
@@ -85,7 +85,7 @@ def roll_out(
 def _shift(m: int, n: int, error_history: int, position_history: int) -> FloatArray:
     """Return A with ξ(k+t) = A [ξ(k+t−1), Δq, Δy_ref] where Ĵ = 0, (p, p + n + m).
 
-    The newest error is e + Δy_ref and the newest position q + Δq; what is older moves on by one place.
+    The newest error is e + Δy_ref and the newest position q + Δq; older ones move on by one place.
     """
     newest, p = m * error_history, m * error_history + n * position_history
     A = np.zeros((p, p + n + m))

@@ -49,13 +49,13 @@ class ControllerTraining:
     kernel: Kernel = "exponential"
     """Of eq. 16; "gaussian" squares the norm."""
     step: Positive = STEP
-    """[s] s, in which the network thinks, whatever the control period; the paper's is the control period."""
+    """[s] s, step of the network's commands, at any control period; the paper's is the control period."""
     gain: Positive = 3.0
     """[1/s] K_p of the law that is imitated."""
     posture_gain: NonNegative = 0.5
     """[1/s] K_n, towards the region's middle in the null space; 0 as in the paper."""
     fit: Literal["output", "entries"] = "output"
-    """What is fitted: the product ψ ξ, or the entries of ψ as the paper reads."""
+    """Target of the fit: the product ψ ξ, or the entries of ψ as the paper reads."""
     error_range: Positive = 0.5
     """[m] largest error per axis."""
     samples: Samples = 6000

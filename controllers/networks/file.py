@@ -18,7 +18,7 @@ from servobench.plant.contract.files import write_atomically
 FORMAT = "servobench networks"
 FORMAT_VERSION = 2
 MAX_UNPACKED = 256_000_000  # [bytes] of all arrays; trained networks have less than a hundredth of it
-DAMAGES = (  # what numpy's reader raises at what is no .npz, or a damaged one
+DAMAGES = (  # exceptions of numpy's reader for a damaged file, or one that is no .npz
     ArithmeticError,
     AttributeError,
     EOFError,
@@ -69,7 +69,7 @@ def save_networks(networks: TrainedNetworks, path: Path) -> None:
     """Write `networks` to `path`; a reader sees the old file or the whole new one, never a part.
 
     Args:
-        networks: what to store.
+        networks: to be stored.
         path: the .npz file; its folder is made where absent.
     """
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -87,7 +87,7 @@ def joint_samples(unit: FloatArray, lower: FloatArray, upper: FloatArray) -> Flo
 
 @dataclass(frozen=True, eq=False)
 class ControllerSamples:
-    """What the controller network is fitted to.
+    """Samples to which the controller network is fitted.
 
     Attributes:
         xi: ξ, (S, p), m and rad.
@@ -156,7 +156,7 @@ def train(
         config: region, sizes, grids and seed.
         nominal_jacobian: (S, n) rad -> (S, m, n).
         spec: sizes and speed limit.
-        progress: called with the share that is done and what is being done.
+        progress: called with the share that is done and the name of the present task.
 
     Returns:
         The networks with their held-out errors.
@@ -165,7 +165,7 @@ def train(
         ValueError: the region does not fit the plant, or the nominal Jacobian has another shape or is not finite.
     """
     digest = training_digest(config, nominal_jacobian, spec)
-    report = progress or (lambda share, what: None)
+    report = progress or (lambda share, task: None)
     jacobian, jacobian_error = _train_jacobian(config, nominal_jacobian, spec, report)
     controller, controller_error = _train_controller(config, nominal_jacobian, spec, report)
     report(1.0, "done")

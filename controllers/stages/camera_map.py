@@ -1,7 +1,7 @@
-"""The contract of a map: what the pair stage learns about a camera, for each candidate delay.
+"""The contract of a map, by which the pair stage corrects the nominal camera, with a filter for each candidate delay.
 
-Two forms exist: a matrix between features (`feature_map`), and the turn of each camera before its interaction matrix
-(`point_map`). Both hold the map, the noise e of the last frame and their covariance, one of them a candidate delay.
+Two forms exist: a matrix between features (`feature_map`), and the rotation of each camera before its interaction
+matrix (`point_map`). For each candidate delay, both hold the map, the noise e of the last frame and their covariance.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class Step(NamedTuple):
     """A motion as a map is to explain it.
 
     Attributes:
-        x: what the model predicts under each candidate delay, (..., D, columns).
+        x: prediction of the model under each candidate delay, (..., D, columns).
         feature_step: Δy, (..., m).
-        valid: features that were seen at both ends, (..., m).
+        valid: features that were measured at both ends, (..., m).
         rates: L of the interaction matrix under each candidate delay, (..., D, c, p, k, 3); empty without one.
     """
 
@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
 
 class Innovation(NamedTuple):
-    """What one motion said under each candidate delay, (..., D).
+    """The innovation of one motion under each candidate delay, (..., D).
 
     Attributes:
         nis: νᵀS⁻¹ν.
@@ -78,7 +78,7 @@ class CameraMap(ABC, Generic[Bank]):
 
     @abstractmethod
     def lengths(self, step: Step) -> FloatArray:
-        """Return how far features move with x, (..., D), whatever the map."""
+        """Return how far features move with x under any rotation, (..., D)."""
 
     @abstractmethod
     def walked(self, bank: Bank, step: Step, lengths: FloatArray) -> Bank:
@@ -86,7 +86,7 @@ class CameraMap(ABC, Generic[Bank]):
 
     @abstractmethod
     def update(self, bank: Bank, step: Step, lengths: FloatArray, frame: FloatArray) -> tuple[Bank, Innovation]:
-        """Return the bank after a motion, and what it said; σ² is (...)."""
+        """Return the bank after a motion, and its innovation; σ² is (...)."""
 
     @abstractmethod
     def completed(self, bank: Bank, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -5,8 +5,8 @@
     map        Ĵ(q) = M̄ J_n(q) + E             E learns from (Δq, Δy − M̄ x)
     map        Ĵ(q) = M̄ E(q)                   E learns from (Δq, RᵀΔy), where E brings a model itself
 
-Where it is known how cameras see points, with L(y, z) of the features as they are seen and G(q) the nominal motions of
-the points (`point_map`), a map stands between them:
+With a camera model, a map stands between L(y, z), at the measured features, and the nominal motions G(q) of the points
+(`point_map`):
 
     map        Ĵ(q) = L M̄ G(q) + E             E learns from (Δq, Δy − L M̄ x)
     map        Ĵ(q) = L M̄ G(q) + E(q) − E₀(q)  E learns from (Δq, Δy − L M̄ x + E₀ Δq), where E brings a model E₀
@@ -36,7 +36,7 @@ from servobench.plant.contract.signals import BoolArray, Observation
 
 
 class LastFrame(NamedTuple):
-    """What was seen when the last motion ended.
+    """The frame at which the last motion ended.
 
     Attributes:
         time: (...) [s]; NaN before there is a valid feature.
@@ -54,7 +54,7 @@ class LastFrame(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What changes with a motion.
+    """The states that change with a motion.
 
     Attributes:
         estimator: state of the estimator.
@@ -112,7 +112,7 @@ class Estimation:
         self._longest = math.inf if self.pairing is None else (self.pairing.gap + 0.5) * knowledge.spec.period
 
     def start(self, observation: Observation, jacobian: FloatArray) -> EstimationState:
-        """Return the state of one that has seen nothing and starts from Ĵ₀, (..., m, n), at rest."""
+        """Return the state before any motion, starting from Ĵ₀, (..., m, n), at rest."""
         lead, q = observation.feature.shape[:-1], observation.joint_position
         pair, own = None, jacobian
         if self.pairing is not None:
@@ -164,10 +164,9 @@ class Estimation:
         return EstimationState(learned, last, jacobian)
 
     def into_model_frame(self, state: EstimationState, observation: Observation) -> FloatArray:
-        """Return T, (..., m, m), that turns features as they are seen into those of the nominal cameras.
+        """Return T, (..., m, m), that turns measured features into those of the nominal cameras.
 
-        Where it is known how cameras see points, T = L Rᵀ L⁺ of each point, whose motion is taken to be across the
-        sight.
+        With a camera model, T = L Rᵀ L⁺ of each point, whose motion is taken to be across the optical axis.
         """
         rotation: FloatArray = state.learned.pair.rotation
         if self._cameras is None:
@@ -184,7 +183,7 @@ class Estimation:
     def _point_jacobian(
         self, learned: Learned, rates: FloatArray, motions: FloatArray, own: FloatArray, joint_position: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return G by what is known now, and Ĵ."""
+        """Return G by the present estimate of the arm, and Ĵ."""
         base = self.estimator.motions(learned.estimator, joint_position)
         if base is not None:
             return base, feature_jacobian(rates, learned.pair.map, base)

@@ -14,10 +14,10 @@ delay than the true one seems to explain that this noise is gone from the next f
 
 This is a Kalman filter, exact for a given noise; without walk of M it is generalised least squares of Δy on x. Steps
 shorter than the noise do not change M and P_M, but P_M counts in s (a Schmidt–Kalman filter). An arm at rest makes many
-such steps: the posture stage moves the joints, x is how a wrong model thinks that this moves the feature, and the law
-removes the motion that is seen. Learned from, they would teach M that x moves nothing.
+such steps: the posture stage moves the joints, x is the motion of the feature that a wrong model predicts for
+this, and the law removes the measured motion. Learned from, they would teach M that x moves nothing.
 
-The candidates are judged by how well they predict, −2 log of the likelihood of what was seen:
+The candidates are judged by −2 log of the likelihood of the measured motions:
 
     ℓ_d = Σ ‖ν‖² / s + m ln s
 
@@ -61,14 +61,14 @@ def map_update(
     """Learn from one motion under every candidate delay.
 
     Args:
-        bank: each [M e] above its P, (..., D, 2m+1, m+1): what multiplies h in both is one product.
+        bank: each [M e] above its P, (..., D, 2m+1, m+1), so that one product with h serves both.
         x: feature steps that the model predicts, (..., D, m), m.
         feature_step: Δy, (..., m), m.
         frame: σ², (..., 1), m², positive.
         model: c² ‖x_d‖², (..., D), m².
 
     Returns:
-        The new bank; ‖ν‖²/s, (..., D), what was seen against what was expected; and s, (..., D), m².
+        The new bank; ‖ν‖²/s, (..., D), the normalised innovation squared; and s, (..., D), m².
     """
     m = feature_step.shape[-1]
     h = np.concatenate([x, np.full((*x.shape[:-1], 1), -1.0)], axis=-1)
@@ -89,12 +89,12 @@ def map_update(
 def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:
     """Complete a map by the belief that it is nearly a rotation: where P is large, M says little.
 
-    With the belief that an entry of the map is N(R, ς²) what is measured is M ~ N(R, P + ς² I) by rows, so that
+    With the prior belief that an entry of the map is N(R, ς²), the estimate is M ~ N(R, P + ς² I) by rows, so that
 
         R = argmin ‖(M − R) (P + ς² I)^(−½)‖_F, the rotation nearest to M (P + ς² I)⁻¹
         M̄ = R + (M − R) ς² (P + ς² I)⁻¹
 
-    Directions count by what is known of them: two known directions of three give the third.
+    Directions count by their certainty: two known directions of three give the third.
 
     Args:
         M: (..., m, m).

@@ -1,8 +1,8 @@
-"""The last stages: feedforward, posture and limit, between the law and the command.
+"""The last stages, between law and command: feedforward, null-space centring (posture), and saturation (limit).
 
     dq = dq_law + Ĵ⁺ (y_ref(k + lead + 1) − y_ref(k + lead)) + κ (I − Ĵ⁺Ĵ) (q_c − q̂),   κ = 1 − exp(−K_n dt)
 
-within the limits of the joints' speeds (`limit`); Ĵ⁺ is damped.
+within the limits of the joints' speeds (`limit`); Ĵ⁺ is the damped pseudo-inverse.
 """
 
 from __future__ import annotations

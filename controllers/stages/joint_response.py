@@ -11,9 +11,9 @@ The motion that is still to come of the commands so far, and the time that it ta
 
     flight = Σ_i (g_{i+1} + … + g_N) dq(k−i),   lead = Σ_i (g_{i+1} + … + g_N) / Σ_i g_i periods
 
-At fast rates Δq and dq are taken over a window of several periods, about `WINDOW` in all, and each period anew: what a
-joint moves in one period is lost in the steps of its encoder. A response can also be given: a delay and a lag of first
-order.
+At fast rates Δq and dq are taken over a window of several periods, about `WINDOW` in all, and each period anew: the
+motion of a joint in one period is lost in the steps of its encoder. A response can also be given: a delay and a lag of
+first order.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_RESPONSE = 1.5  # [1] of a g_i, which lies between 0 and 1 for a joint that 
 
 
 class JointResponse(NamedTuple):
-    """The response g by regularised least squares over all joints, and what follows from it.
+    """The response g by regularised least squares over all joints, and the quantities derived from it.
 
     Attributes:
         A: (..., N, N), rad², the normal matrix.
@@ -130,7 +130,7 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
 
 
 def with_response(state: JointResponse, response: FloatArray) -> JointResponse:
-    """Return the state with another response g, (..., N), and with what follows from it."""
+    """Return the state with another response g, (..., N), and with the quantities derived from it."""
     length = response.shape[-1]
     ahead = response[..., ::-1].cumsum(axis=-1)[..., ::-1]  # g_i + … + g_N
     left = np.zeros_like(ahead)

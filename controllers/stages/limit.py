@@ -77,7 +77,7 @@ def redistribute(
         jacobian: Ĵ, (..., m, n), m/rad.
         limit: (n,), rad, positive.
         damping: m/rad, positive; the remaining joints make little motion in directions in which they are weaker, and
-            the feature's direction is kept except for what they leave out.
+            the feature's direction is kept except for the part that they leave out.
         further: how far a joint that takes over may go down and up in total, two arrays (..., n), rad, at least 0;
             None: as far as its limit.
 

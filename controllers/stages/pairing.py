@@ -1,11 +1,13 @@
-"""The pair stage: which joint motion belongs to a motion of the feature, and how a model relates to what is seen.
+"""The pair stage: delay of the camera, map from model to camera, and noise, identified by a filter bank.
+
+It pairs each motion of the feature with the joint motion that caused it, and relates a model to the measured features:
 
     x_d = Σ J_b Δq  over the joint motion that ended d periods ago         J_b the base: a model's Jacobian (m, n)
     Δy ≈ M x_d                                                             M a map (m, m), of a turned camera
 
-Where it is known how cameras see points, x_d has the motions of the points, and a map turns those of each camera
-(`point_map`); else a map is a matrix between features (`feature_map`). For each candidate delay d, in periods and not
-always a whole number of them, a filter holds a map; the delay is that of the filter that predicts best:
+With a camera model, x_d has the motions of the points, and a map turns those of each camera (`point_map`); else a
+map is a matrix between features (`feature_map`). For each candidate delay d, in periods and not always a whole number
+of them, a filter holds a map (a filter bank, or multiple-model estimator); the filter that predicts best has the delay:
 
     P ← P + w² ‖x_d‖ I, no larger than P₀;   M, P ← update(x_d, Δy)        for each delay d
     d = argmin ℓ_d, once it is better than the present one by a margin; motions that tell no delays apart are left out
@@ -240,7 +242,7 @@ class Pairing:
             feature_step: Δy, (..., m).
             duration: that it took, (...), s, at most `gap` periods.
             feature: in the middle of it, (..., m).
-            valid: features that were seen at both ends, (..., m).
+            valid: features that were measured at both ends, (..., m).
         """
         n, periods = self._n, np.rint(duration / self._period).astype(np.int_)
         begin, end = self._candidates.begins(state.past, periods), self._candidates.ends(state.past)
@@ -306,8 +308,8 @@ class Pairing:
         """Update map, covariance and score of every delay, and choose among them."""
         aids, noise, candidate, frame = self._aids, state.noise, state.candidate, state.noise.variance
         before = self.maps.walked(state.bank, step, lengths)
-        bank, said = self.maps.update(before, step, lengths, frame)
-        now = of_delay(said, candidate)
+        bank, innovations = self.maps.update(before, step, lengths, frame)
+        now = of_delay(innovations, candidate)
         surprise = now.nis / np.maximum(np.add.reduce(step.valid, axis=-1), 1)
         if aids.noise == "identified":
             noise = noise.learn(surprise * now.variance, now.frames, now.variance - now.frames * noise.variance)
@@ -316,8 +318,8 @@ class Pairing:
             moved = cusum > aids.move_gate
             bank = branch(moved, self._learn_any_map, bank, before, step, lengths, frame)
             cusum, moves = cusum * ~moved, moves + moved
-        told = self._tells_delays_apart(step, lengths, noise)[..., None]
-        scores = aids.score_memory * state.scores + (np.minimum(said.nis, NIS_CAP) + said.spread) * told
+        counts = self._is_informative(step, lengths, noise)[..., None]
+        scores = aids.score_memory * state.scores + (np.minimum(innovations.nis, NIS_CAP) + innovations.spread) * counts
         best = scores.argmin(axis=-1)
         better = pick(scores, best) < pick(scores, candidate) - aids.delay_margin
         candidate = np.where(better, best, candidate)[()]
@@ -329,11 +331,11 @@ class Pairing:
         nearest, rotation = self.maps.completed(of_delay(bank, candidate), state.rotation)
         return state._replace(map=nearest, rotation=rotation)
 
-    def _tells_delays_apart(self, step: Step, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
+    def _is_informative(self, step: Step, lengths: FloatArray, noise: NoiseLevel) -> BoolArray:
         """Return whether a motion counts in the scores, (...).
 
-        A steady one hardly differs from one delay to another. What differs is which of the noise of frames, as the
-        loop turned it into motion, is in it, and an error of the model is then easily taken for that noise.
+        A steady motion hardly differs from one delay to another. The difference is then the noise of single frames,
+        which the loop turned into motion, and an error of the model is easily taken for that noise.
         """
         changes = self.maps.lengths(step._replace(x=step.x - step.x[..., self._candidates.beside, :]))
         change, length = (np.maximum.reduce(each, axis=-1) for each in (changes, lengths))

@@ -1,8 +1,8 @@
-"""The turn of each camera, for features of points that it sees: a map M (3, 3) before the interaction matrix.
+"""The rotation of each camera, for features of points: a map M (3, 3) before the interaction matrix.
 
     Δy = L(y, z) M x + e₊ − e + v            x = Σ G Δq the motions of the points by the nominal model
 
-L (K, 3) of a camera has the features of its points as they are seen, and their depths z by the nominal model. That a
+L (K, 3) of a camera has the measured features of its points, and their depths z by the nominal model. That a
 camera is turned is all in M: a rotation, constant, times the ratio of the nominal to the true depth. The filter of a
 camera and a candidate delay holds θ = [vec M, e], (9 + K,), by rows of M, and its covariance P:
 
@@ -10,8 +10,8 @@ camera and a candidate delay holds θ = [vec M, e], (9 + K,), by rows of M, and 
     θ ← θ + P Hᵀ S⁻¹ ν,   P ← P − P Hᵀ S⁻¹ H P,   then e₊ takes the place of e:
     e ← σ² S⁻¹ ν,   P_ee ← σ² I − σ⁴ S⁻¹,   P_Me ← −σ² (P Hᵀ)_M S⁻¹
 
-M and P_M stay where ℓ² of no feature reaches σ² (see `map_bank`), and features that were not seen are left out of
-ν, H and S. All functions are pure; axes: (..., D candidates, c cameras).
+M and P_M stay where ℓ² of no feature reaches σ² (see `feature_map`), and features that were not measured are left out
+of ν, H and S. All functions are pure; axes: (..., D candidates, c cameras).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def point_update(
         bank: of filters side by side.
         H: (..., K, 9), how features move with the entries of M.
         feature_step: Δy, (..., K).
-        valid: which of them were seen, (..., K).
+        valid: which of them were measured, (..., K).
         frame: σ², (..., 1).
         model: c² ℓ², (..., K).
         learns: (...), whether M is learned; otherwise it is considered only.
@@ -101,7 +101,7 @@ def point_update(
 
 
 def near_turn(M: FloatArray, P: FloatArray, deviation: float, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Complete a map by the belief that it is nearly a rotation; see `map_bank.near_rotation`.
+    """Complete a map by the belief that it is nearly a rotation; see `feature_map.near_rotation`.
 
     The covariance of the entries is not that of rows, so that the nearest rotation has no closed form: it is the better
     one of two that Gauss-Newton steps reach, from the closed form of the weighted map and from the one before.
@@ -161,7 +161,7 @@ class PointMap(CameraMap[PointBank]):
     """M of each camera; a map is (..., c, 3, 3)."""
 
     def __init__(self, aids: AidsConfig, model: CameraModel, features: int) -> None:
-        """Take the settings, what is known of the cameras, and m."""
+        """Take the settings, the model of the cameras, and m."""
         super().__init__(aids)
         self.columns, self._c, self._p = model.rows, model.cameras, model.points
         self._K = features // model.cameras

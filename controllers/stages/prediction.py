@@ -1,4 +1,4 @@
-"""The predict stage: the feature that the arm is bound for, past all delays.
+"""The predict stage, a Smith predictor: the feature that the arm reaches once all delays have passed.
 
     ŷ = z + Ĵ (q(k) − q(k−d) + flight)              where the feature will be when all commands are carried out
     q̂ = q(k) + flight                               and the joints
@@ -74,11 +74,11 @@ class FeatureFilter(NamedTuple):
         )
 
     def correct(self, feature: FloatArray, valid: BoolArray, find_noise: bool) -> FeatureFilter:
-        """Return the filter after a frame in which at least one feature was seen; the others stay as predicted.
+        """Return the filter after a frame in which at least one feature was measured; the others stay as predicted.
 
         Args:
             feature: y, (..., m), m.
-            valid: which of them were seen, (..., m).
+            valid: which of them were measured, (..., m).
             find_noise: learn σ from y − z.
         """
         z, p, noise = self
@@ -93,7 +93,7 @@ class FeatureFilter(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What the predict stage hands to a law.
+    """The prediction that a law gets in place of the observation.
 
     Attributes:
         feature: ŷ, (..., m).
@@ -107,7 +107,7 @@ class Prediction(NamedTuple):
 
 
 class Past(NamedTuple):
-    """What the predict stage needs of the past.
+    """The past motion that the predict stage needs.
 
     Attributes:
         delay: d, (...), periods.
@@ -157,7 +157,7 @@ class Predictor:
         self._length = max(1, whole_periods(aids.response_length, period))
 
     def frozen(self) -> Predictor:
-        """Return a stage that goes on from a state of this one and identifies nothing more."""
+        """Return a copy that predicts from a state of this stage with identification switched off."""
         aids, other = self._aids, copy.copy(self)
         other._aids = replace(aids, response=aids.response if aids.response == "ignored" else "given", noise="given")
         return other
@@ -212,8 +212,8 @@ class Predictor:
         valid: BoolArray,
     ) -> FeatureFilter:
         state = state.advance(jacobian, joint_step, self._aids.filter_error, self._period)
-        seen = np.logical_or.reduce(valid, axis=-1)
-        return branch(seen, FeatureFilter.correct, state, feature, valid, self._aids.noise == "identified")
+        measured = np.logical_or.reduce(valid, axis=-1)
+        return branch(measured, FeatureFilter.correct, state, feature, valid, self._aids.noise == "identified")
 
 
 def shifted(reference: FloatArray, lead: FloatArray, rows: int) -> FloatArray:

@@ -27,7 +27,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.pictures.style import figure_style, method_styles
 from servobench.harness.run.experiment import draw
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve_sections, select
+from servobench.harness.run.resolution import resolve_sections, select
 from servobench.harness.run.result import COMPLETED
 
 CAUSES = {

@@ -1,4 +1,4 @@
-/* FMI 3.0 around `Model`: what both interfaces share, and co-simulation; every variable is an array of doubles. */
+/* FMI 3.0 around `Model`: both interfaces, but for the functions that FMI 2 shares; variables are arrays of doubles. */
 #include "fmi3_instance.h"
 
 #include <stdlib.h>
@@ -38,15 +38,6 @@ size_t size_of(fmi3ValueReference reference)
 }
 
 const char *fmi3GetVersion(void) { return fmi3Version; }
-
-fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t count, const fmi3String categories[])
-{
-    OPEN("fmi3SetDebugLogging", ~0);
-    const unsigned bits = category_bits(count, categories);
-    if (bits == 0) return answer(self, "fmi3SetDebugLogging", "there is no such category");
-    self->logged = on ? self->logged | bits : self->logged & ~bits;
-    return fmi3OK;
-}
 
 static Instance *instantiate(const char *function, fmi3String token, int exchange, fmi3Boolean logging,
                              fmi3InstanceEnvironment environment, fmi3LogMessageCallback log)
@@ -104,128 +95,58 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean tolera
 {
     (void)tolerance_defined;
     (void)tolerance;
-    OPEN("fmi3EnterInitializationMode", INSTANTIATED);
+    OPEN(INSTANTIATED);
     const char *message = core_begin(&self->core, start, stop_defined, stop);
     if (message == NULL) {
         model_start(&self->core.model);
         self->core.phase = INITIALISING;
     }
-    return answer(self, "fmi3EnterInitializationMode", message);
-}
-
-fmi3Status fmi3ExitInitializationMode(fmi3Instance instance)
-{
-    OPEN("fmi3ExitInitializationMode", INITIALISING);
-    return answer(self, "fmi3ExitInitializationMode", core_leave_initialisation(&self->core));
-}
-
-fmi3Status fmi3Terminate(fmi3Instance instance)
-{
-    OPEN("fmi3Terminate", RUNNING | FAILED);
-    self->core.phase = TERMINATED;
-    return fmi3OK;
-}
-
-fmi3Status fmi3Reset(fmi3Instance instance)
-{
-    OPEN("fmi3Reset", ~0);
-    core_reset(&self->core, self->core.model.exchange);
-    return fmi3OK;
+    return ANSWER(message);
 }
 
 fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference references[], size_t count,
                           fmi3Float64 values[], size_t n_values)
 {
-    OPEN("fmi3GetFloat64", INSTANTIATED | READABLE);
+    OPEN(INSTANTIATED | READABLE);
     size_t k = 0;
     for (size_t i = 0; i < count; i++) {
         if (references[i] == N_VALUES) { /* the independent variable */
-            if (k == n_values) return answer(self, "fmi3GetFloat64", "too few values for these variables");
+            if (k == n_values) return ANSWER("too few values for these variables");
             values[k++] = self->core.model.time;
             continue;
         }
         const size_t size = size_of(references[i]);
-        if (size == 0) return answer(self, "fmi3GetFloat64", NO_SUCH_VARIABLE);
-        if (k + size > n_values) return answer(self, "fmi3GetFloat64", "too few values for these variables");
+        if (size == 0) return ANSWER(NO_SUCH_VARIABLE);
+        if (k + size > n_values) return ANSWER("too few values for these variables");
         for (size_t j = 0; j < size; j++) {
             const char *message = core_get(&self->core, references[i] + j, &values[k++]);
-            if (message != NULL) return answer(self, "fmi3GetFloat64", message);
+            if (message != NULL) return ANSWER(message);
         }
     }
-    return answer(self, "fmi3GetFloat64", k == n_values ? NULL : "too many values for these variables");
+    return ANSWER(k == n_values ? NULL : "too many values for these variables");
 }
 
 fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference references[], size_t count,
                           const fmi3Float64 values[], size_t n_values)
 {
-    OPEN("fmi3SetFloat64", INSTANTIATED | INITIALISING | RUNNING);
+    OPEN(INSTANTIATED | INITIALISING | RUNNING);
     size_t k = 0;
     for (size_t i = 0; i < count; i++) {
         const size_t size = size_of(references[i]);
-        if (size == 0) return answer(self, "fmi3SetFloat64", NO_SUCH_VARIABLE);
-        if (k + size > n_values) return answer(self, "fmi3SetFloat64", "too few values for these variables");
+        if (size == 0) return ANSWER(NO_SUCH_VARIABLE);
+        if (k + size > n_values) return ANSWER("too few values for these variables");
         for (size_t j = 0; j < size; j++) {
             const char *message = core_set(&self->core, references[i] + j, values[k++]);
-            if (message != NULL) return answer(self, "fmi3SetFloat64", message);
+            if (message != NULL) return ANSWER(message);
         }
     }
     if (self->core.phase & (INSTANTIATED | INITIALISING)) model_start(&self->core.model);
-    return answer(self, "fmi3SetFloat64", k == n_values ? NULL : "too many values for these variables");
-}
-
-fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *state)
-{
-    OPEN("fmi3GetFMUState", ~0);
-    Snapshot *snapshot = snapshot_take(&self->core);
-    if (snapshot == NULL) return answer(self, "fmi3GetFMUState", "out of memory");
-    free(*state);
-    *state = snapshot;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState state)
-{
-    OPEN("fmi3SetFMUState", ~0);
-    return answer(self, "fmi3SetFMUState", core_restore(&self->core, state));
-}
-
-fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *state)
-{
-    OPEN("fmi3FreeFMUState", ~0);
-    free(*state);
-    *state = NULL;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState state, size_t *size)
-{
-    (void)state;
-    OPEN("fmi3SerializedFMUStateSize", ~0);
-    *size = sizeof(Snapshot);
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState state, fmi3Byte bytes[], size_t size)
-{
-    OPEN("fmi3SerializeFMUState", ~0);
-    if (state == NULL || size < sizeof(Snapshot)) return answer(self, "fmi3SerializeFMUState", "no state or no room");
-    memcpy(bytes, state, sizeof(Snapshot));
-    return fmi3OK;
-}
-
-fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size, fmi3FMUState *state)
-{
-    OPEN("fmi3DeserializeFMUState", ~0);
-    Snapshot *snapshot = snapshot_read(bytes, size);
-    if (snapshot == NULL) return answer(self, "fmi3DeserializeFMUState", "these bytes are no state of this model");
-    free(*state);
-    *state = snapshot;
-    return fmi3OK;
+    return ANSWER(k == n_values ? NULL : "too many values for these variables");
 }
 
 fmi3Status fmi3EnterStepMode(fmi3Instance instance)
 {
-    OPEN("fmi3EnterStepMode", STEPPING);
+    OPEN(STEPPING);
     return fmi3OK;
 }
 
@@ -234,10 +155,42 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 time, fmi3Float64 step,
                       fmi3Float64 *last_time)
 {
     (void)no_set_state;
-    OPEN("fmi3DoStep", STEPPING);
+    OPEN(STEPPING);
     *event_needed = *terminate = *early_return = false;
     const char *message = core_step(&self->core, time, step);
     *last_time = self->core.model.time;
     report_events(self);
-    return answer(self, "fmi3DoStep", message);
+    return ANSWER(message);
 }
+
+/* Model exchange */
+
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *again, fmi3Boolean *terminate,
+                                    fmi3Boolean *nominals_changed, fmi3Boolean *states_changed,
+                                    fmi3Boolean *next_event_defined, fmi3Float64 *next_event)
+{
+    OPEN(IN_EVENT);
+    int changed;
+    const char *message = core_update_discrete_states(&self->core, &changed);
+    *again = *terminate = *nominals_changed = *next_event_defined = false;
+    *states_changed = changed != 0;
+    *next_event = 0.0;
+    report_events(self);
+    return ANSWER(message);
+}
+
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *count)
+{
+    OPEN(~0);
+    *count = N_STATES;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *count)
+{
+    OPEN(~0);
+    *count = N_STATES;
+    return fmi3OK;
+}
+
+#include "shared_functions.h"

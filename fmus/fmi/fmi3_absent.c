@@ -1,4 +1,4 @@
-/* What FMI 3.0 asks every library to export and this model does not have: other types, clocks, other interfaces. */
+/* Functions that FMI 3.0 requires of every library and this model does not have: other types, clocks, interfaces. */
 #ifdef __GNUC__
 #pragma GCC diagnostic ignored "-Wunused-parameter" /* that is what absent means */
 #endif

@@ -24,7 +24,7 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
                                         const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[],
                                         size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity)
 {
-    OPEN("fmi3GetDirectionalDerivative", DIFFERENTIABLE);
+    OPEN(DIFFERENTIABLE);
     double direction[N_VALUES] = {0.0};
     const char *message = check(knowns, n_knowns, N_SETTABLE, n_seed);
     if (message == NULL) message = check(unknowns, n_unknowns, N_VALUES, n_sensitivity);
@@ -35,7 +35,7 @@ fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueRe
     for (size_t i = 0; message == NULL && i < n_unknowns; sensitivity += size_of(unknowns[i++])) {
         memcpy(sensitivity, direction + unknowns[i], size_of(unknowns[i]) * sizeof(double));
     }
-    return answer(self, "fmi3GetDirectionalDerivative", message);
+    return ANSWER(message);
 }
 
 /* The sum of the unknowns along a direction, each times its seed. */
@@ -54,7 +54,7 @@ fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueRefere
                                     const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[],
                                     size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity)
 {
-    OPEN("fmi3GetAdjointDerivative", DIFFERENTIABLE);
+    OPEN(DIFFERENTIABLE);
     const char *message = check(knowns, n_knowns, N_SETTABLE, n_sensitivity);
     if (message == NULL) message = check(unknowns, n_unknowns, N_VALUES, n_seed);
     for (size_t i = 0; message == NULL && i < n_knowns; i++) {
@@ -65,5 +65,5 @@ fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueRefere
             if (message == NULL) *sensitivity++ = weighed(direction, unknowns, n_unknowns, seed);
         }
     }
-    return answer(self, "fmi3GetAdjointDerivative", message);
+    return ANSWER(message);
 }

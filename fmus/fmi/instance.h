@@ -1,4 +1,4 @@
-/* What FMI 2 and FMI 3 have in common beside the model: phases, time, saved states, messages.
+/* The common part of FMI 2 and FMI 3 beside the model: phases, time, saved states, messages.
 
    A model is a folder with model.h and model.c. Its Model has `time` and `exchange`; the offsets and sizes of its
    variables are in the generated layout.h, its functions in model_functions.h. */
@@ -41,7 +41,7 @@ typedef struct {
     unsigned long long checksum;
 } Snapshot;
 
-/* A function that returns text returns NULL where all is well, and otherwise what to tell the user. */
+/* A function that returns text returns NULL where all is well, and otherwise a message for the user. */
 
 void core_reset(Core *core, int exchange);
 const char *core_begin(Core *core, double start, int stop_defined, double stop);
@@ -57,6 +57,14 @@ Snapshot *snapshot_take(const Core *core);
 /* NULL if `bytes` are not an intact state of this model. */
 Snapshot *snapshot_read(const void *bytes, size_t size);
 const char *core_restore(Core *core, const Snapshot *snapshot);
+
+/* How a function of either version begins, and how it ends with a message or NULL; the header of the instance defines
+   Instance and STATUS_ERROR. */
+#define OPEN(phases)                       \
+    Instance *const self = instance;       \
+    if (self == NULL) return STATUS_ERROR; \
+    if ((self->core.phase & (phases)) == 0) return ANSWER("not allowed in this phase")
+#define ANSWER(message) answer(self, __func__, message)
 
 /* Writes "function: message". Importers without printf formatting get whole texts that way. */
 void compose(char text[MESSAGE_SIZE], const char *function, const char *message);

@@ -1,8 +1,8 @@
-/* What the FMI functions ask of a model. Its model.h includes this after Model and ModelStatus. */
+/* The functions of a model that FMI calls. Its model.h includes this after Model and ModelStatus. */
 #ifndef MODEL_FUNCTIONS_H
 #define MODEL_FUNCTIONS_H
 
-/* What a status says to the user; NULL for MODEL_OK. */
+/* The message of a status; NULL for MODEL_OK. */
 const char *model_explain(ModelStatus status);
 
 /* Start values, time 0. */

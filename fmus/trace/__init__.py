@@ -1,1 +1,1 @@
-"""Records what numpy code computes as CasADi expressions, from which C is generated: one formula, read twice."""
+"""Records numpy code as CasADi expressions, from which C is generated: one formula for both."""

@@ -1,9 +1,9 @@
 """Arrays whose numbers are CasADi expressions, in the place of numpy's, and numpy's ufuncs over them.
 
-An array is a table of places in a buffer, one column of expressions. Whatever numpy does to the order and the shape of
-an array it does to the table, so that views, slices and broadcasting are numpy's own; writing to a view changes the
-buffer that it shares. A buffer holds plain numbers until an expression is written to it, and such an array can be used
-wherever numpy wants numbers.
+An array is a table of places in a buffer, one column of expressions. Numpy changes the order and the shape of the
+table as it would those of the array, so that views, slices and broadcasting are numpy's own; writing to a view changes
+the buffer that it shares. A buffer holds plain numbers until an expression is written to it, and such an array can be
+used wherever numpy wants numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ DTYPES = {"b": np.dtype(np.bool_), "i": np.dtype(np.int_), "f": np.dtype(np.floa
 
 
 class NotTraceable(ValueError):
-    """Code cannot be recorded: it decides by a number of the run, or calls what has no expression."""
+    """Code cannot be recorded: it decides by a number of the run, or calls a function that has no expression."""
 
 
 class Buffer:

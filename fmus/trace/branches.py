@@ -114,7 +114,7 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
         result = function(inside, *among)
     after = leaves_of(result)
     if [np.shape(leaf) for leaf in after] != [np.shape(leaf) for leaf in before]:
-        raise NotTraceable(f"the shape of what {_name(function)} returns depends on the run")
+        raise NotTraceable(f"the shape of the result of {_name(function)} depends on the run")
     changed = [k for k, (new, old) in enumerate(zip(after, before, strict=True)) if new is not old]
     parts = [[as_traced(leaves[k]).flat() for k in changed] for leaves in (after, before)]
     inputs = [symbol.buffer.content for symbol in symbols]
@@ -134,7 +134,7 @@ def branch(chosen: Any, function: Callable[..., Tree], tree: Tree, *arguments: A
 
 
 def _side_by_side(chosen: Traced, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
-    """Return what `branch` does for each lane by itself."""
+    """Return the results of `branch` for each lane by itself."""
     results = [
         branch(chosen[lane], function, take(tree, lane), *(take(each, lane) for each in arguments))
         for lane in np.ndindex(chosen.shape)

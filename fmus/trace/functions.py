@@ -33,7 +33,7 @@ ARRANGES: Final = frozenset(
         np.squeeze, np.expand_dims, np.ravel, np.tile, np.roll, np.atleast_1d, np.atleast_2d, np.matrix_transpose,
     }
 )  # fmt: skip
-"""What does the same to the table of places as to the numbers."""
+"""Functions that rearrange entries: they apply to the table of places as to the numbers."""
 
 
 def carry_out(function: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:  # noqa: ANN401
@@ -218,7 +218,7 @@ def inverse(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
 
 
 def cholesky(A: Any) -> Traced:  # noqa: ANN401 - anything array-like
-    """Return the lower factor, (..., n, n); what is not positive definite is a fault."""
+    """Return the lower factor, (..., n, n); a matrix that is not positive definite is a fault."""
     table = as_traced(A)
     factor = _cholesky(table.shape[-1])
     roots, least = each_matrix(factor, table)

@@ -35,7 +35,7 @@ Traced.function = staticmethod(carry_out)
 
 
 class _Numpy:
-    """numpy, except for what makes arrays."""
+    """numpy, except for the functions that make arrays."""
 
     ndarray = (np.ndarray, Traced)  # for isinstance
 
@@ -145,7 +145,7 @@ class Recorded:
 
 
 def record(
-    system: Any,  # noqa: ANN401 - whatever the functions need
+    system: Any,  # noqa: ANN401 - any system
     start: Callable[[Any, Inputs], Any],
     step: Callable[[Any, Any, Inputs], tuple[Any, Any]],
     inputs: Mapping[str, tuple[tuple[int, ...], str]],
@@ -153,7 +153,7 @@ def record(
     """Record a system.
 
     Args:
-        system: what both functions get first; a copy of it is used, whose memos may keep expressions.
+        system: first argument of both functions; a copy of it is used, whose memos may keep expressions.
         start: system, inputs -> state, a tree of arrays.
         step: system, state, inputs -> new state of the same form, and the output.
         inputs: shape and kind of each, in the order of the columns of u.

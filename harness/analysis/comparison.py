@@ -29,6 +29,7 @@ from servobench.harness.analysis.statistics import (
     signed_rank_p_value,
     success_rate,
 )
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, NOT_FOLLOWED, NOT_SETTLED, SETTLED
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -36,6 +37,7 @@ from servobench.plant.contract.checks import FloatArray
 
 KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
 CONDITION: Final = ("plant", "sensing", "task", "mismatch", "noise_factor", "latency_s", "period_s")
+HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
 
 
@@ -134,6 +136,47 @@ def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
 def achievement(runs: pd.DataFrame) -> str:
     """Return the word for a good outcome of these runs of one task: `settled`, or `followed` on a curve."""
     return FOLLOWED if len(split_tasks(runs)[1]) else SETTLED
+
+
+def handy_unit(feature_unit: str | None) -> tuple[str, float]:
+    """Return the unit in which errors of a feature are shown, and the factor to it; None is an unknown unit."""
+    return HANDY_UNITS.get(feature_unit or "", (feature_unit or "feature unit", 1.0))
+
+
+def shown_unit(name: str, runs: pd.DataFrame) -> tuple[str, float]:
+    """Return the unit in which a metric of these runs is shown, and the factor to it."""
+    metric = METRICS[name]
+    if metric.unit:
+        return metric.shown_unit, metric.factor
+    units = runs.reindex(columns=["feature_unit"])["feature_unit"].dropna().unique().tolist()
+    return (" or ".join(units), 1.0) if len(units) > 1 else handy_unit(units[0] if units else None)
+
+
+def metric_heading(name: str, runs: pd.DataFrame) -> str:
+    """Return the label of a metric with the unit in which it is shown for these runs."""
+    unit, _ = shown_unit(name, runs)
+    return METRICS[name].label if unit == "1" else f"{METRICS[name].label} [{unit}]"
+
+
+def in_handy_units(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return runs of several units with the errors of each in its handy one; runs of one unit as they are."""
+    units = runs.reindex(columns=["feature_unit"])["feature_unit"]
+    if units.nunique() < 2:
+        return runs
+    handy = [handy_unit(unit if isinstance(unit, str) else None) for unit in units]
+    factors = [factor for _, factor in handy]
+    changed = {name: factors * runs[name] for name, metric in METRICS.items() if not metric.unit and name in runs}
+    return runs.assign(feature_unit=[unit for unit, _ in handy], **changed)
+
+
+def settling_band(runs: pd.DataFrame, factor: float = 1.0) -> str:
+    """Return the settling band of these runs times a factor with its unit, `5 mm`; words where they have several."""
+    known = runs.reindex(columns=["settling_band", "feature_unit"]).dropna().drop_duplicates()
+    if len(known) != 1:
+        return "the settling band" if factor == 1.0 else f"{factor:g} settling bands"
+    (band,), (unit,) = known["settling_band"], known["feature_unit"]
+    name, handy = handy_unit(str(unit))
+    return f"{factor * handy * float(band):.3g} {name}"
 
 
 def compare_pairs(

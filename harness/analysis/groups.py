@@ -6,7 +6,7 @@ is about are in the group without a name.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -17,14 +17,17 @@ from servobench.harness.analysis.comparison import (
     achieved_share,
     achievement,
     column_of,
+    in_handy_units,
+    metric_heading,
     outcomes,
     settling_times,
+    shown_unit,
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.measures import MEASURES, in_handy_units
 from servobench.harness.analysis.statistics import MISSING, NO_ESTIMATE, Estimate, median_with_interval, success_rate
 from servobench.harness.analysis.verdict import scores
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import (
     ACHIEVED,
     JOINT_AT_LIMIT,
@@ -45,25 +48,12 @@ CONDITIONS: Final = {
     "latency_s": ("latency [ms]", 1e3),
     "period_s": ("period [ms]", 1e3),
 }  # column -> heading and factor
-MOVE_GROUPS: Final = {
-    "Time": ("settling_time_s", "overshoot"),
-    "Error": ("steady_state_error", "pose_error_mm", "pose_error_deg"),
-    "Motion": ("path_length_ratio", "command_switches"),
-}
-CURVE_GROUPS: Final = {
-    "RMS error": ("rms_error_second_lap", "rms_error_evaluated"),
-    "Motion": ("command_switches", "max_joint_position_rad"),
-}
-COST_GROUPS: Final = {
-    "Step of the controller": ("controller_time_median_us", "controller_time_p99_us", "controller_time_overruns"),
-    "Joints": ("control_effort_rad", "saturation_fraction", "joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3"),
-    "Estimate": ("jacobian_error_mean",),
-}
-RUN_GROUPS: Final = {
-    "Time": ("settling_time_s",),
-    "Error": ("steady_state_error", "rms_error_evaluated"),
-    "Motion": ("control_effort_rad",),
-}
+GROUPS: Final = {
+    "moves": ("Time", "Error", "Motion"),
+    "curves": ("RMS error", "Motion"),
+    "cost": ("Step of the controller", "Joints", "Estimate"),
+    "runs": ("Time", "Error", "Motion"),
+}  # table -> groups of columns in order; a metric says in which of them it is
 MEANINGS: Final = {
     NOT_SETTLED: "the true error did not come into the settling band, or left it again",
     NOT_FOLLOWED: "the RMS error of the judged part of the curve is too large",
@@ -103,13 +93,13 @@ def overview(runs: pd.DataFrame) -> pd.DataFrame:
 def move_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each move how many runs settled, how fast, and with what error."""
     runs = in_handy_units(runs)
-    return _by_task(split_tasks(runs)[0], MOVE_GROUPS)
+    return _by_task(split_tasks(runs)[0], "moves")
 
 
 def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return for each curve how many runs followed it, and with what error."""
     runs = in_handy_units(runs)
-    return _by_task(split_tasks(runs)[1], CURVE_GROUPS)
+    return _by_task(split_tasks(runs)[1], "curves")
 
 
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -136,7 +126,7 @@ def meanings(table: pd.DataFrame) -> dict[str, str]:
 
 def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
     """Return for each plant and controller what a step costs, as far as known, and how much the joints are used."""
-    return _table(runs, COST_GROUPS, ["plant"] if runs["plant"].nunique() > 1 else [], counted=False)
+    return _table(runs, "cost", ["plant"] if runs["plant"].nunique() > 1 else [], counted=False)
 
 
 def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
@@ -170,11 +160,11 @@ def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
     table[WHICH, "seed"] = named["seed"].astype(str).tolist()
     for name in ("status", "outcome"):
         table["How it ended", name] = named[name].astype(str).tolist()
-    for group, names in RUN_GROUPS.items():
-        for name in _known(runs, names):
-            heading, factor, digits = _heading(name, runs)
-            table[group, heading] = [f"{Estimate(factor * value, np.nan, np.nan, 1):.{digits}f}"
-                                     for value in column_of(runs, name)]  # fmt: skip
+    for group, name in _columns("runs", runs):
+        _, factor = shown_unit(name, runs)
+        table[group, metric_heading(name, runs)] = [
+            f"{Estimate(factor * value, np.nan, np.nan, 1):.{METRICS[name].digits}f}" for value in column_of(runs, name)
+        ]
     return pd.DataFrame(table)
 
 
@@ -185,15 +175,11 @@ def ordered(names: pd.Series[str]) -> list[str]:
     return [name for method in methods for name in (method, method + PUBLISHED) if name in found]
 
 
-def _by_task(runs: pd.DataFrame, groups: Mapping[str, Sequence[str]]) -> dict[str, pd.DataFrame]:
-    return {
-        str(task): _table(own, groups, _varied(runs), counted=True) for task, own in runs.groupby("task", sort=False)
-    }
+def _by_task(runs: pd.DataFrame, kind: str) -> dict[str, pd.DataFrame]:
+    return {str(task): _table(own, kind, _varied(runs), counted=True) for task, own in runs.groupby("task", sort=False)}
 
 
-def _table(
-    runs: pd.DataFrame, groups: Mapping[str, Sequence[str]], keys: Sequence[str], *, counted: bool
-) -> pd.DataFrame:
+def _table(runs: pd.DataFrame, kind: str, keys: Sequence[str], *, counted: bool) -> pd.DataFrame:
     """Return medians of measures with their intervals in groups of columns, a row for each of `keys` and controller."""
     rows = []
     for key, own in _rows(runs, keys=keys):
@@ -201,10 +187,9 @@ def _table(
         if counted:
             row["Runs", "number"] = str(len(own))
             row["Runs", f"{achievement(runs)} [%]"] = f"{achieved_share(own):.0f}"
-        for group, names in groups.items():
-            for name in _known(runs, names):
-                heading, factor, digits = _heading(name, runs)
-                row[group, heading] = f"{_median(own, name, factor):.{digits}f}"
+        for group, name in _columns(kind, runs):
+            middle = _median(own, name, shown_unit(name, runs)[1])
+            row[group, metric_heading(name, runs)] = f"{middle:.{METRICS[name].digits}f}"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -230,15 +215,14 @@ def _varied(runs: pd.DataFrame) -> list[str]:
     return [name for name in CONDITIONS if name in runs and runs[name].nunique(dropna=False) > 1]
 
 
-def _known(runs: pd.DataFrame, names: Sequence[str]) -> list[str]:
-    return [name for name in names if name in MEASURES and column_of(runs, name).notna().any()]
-
-
-def _heading(name: str, runs: pd.DataFrame) -> tuple[str, float, int]:
-    """Return heading, factor and digits of a measure of `runs`."""
-    measure = MEASURES[name]
-    unit, factor = measure.scale(runs)
-    return measure.name if unit == "1" else f"{measure.name} [{unit}]", factor, measure.digits
+def _columns(kind: str, runs: pd.DataFrame) -> list[tuple[str, str]]:
+    """Return the metrics of a table that these runs have, each with its group, in the order of the groups."""
+    return [
+        (group, name)
+        for group in GROUPS[kind]
+        for name, metric in METRICS.items()
+        if metric.tables.get(kind) == group and column_of(runs, name).notna().any()
+    ]
 
 
 def _median(own: pd.DataFrame, name: str, factor: float) -> Estimate:

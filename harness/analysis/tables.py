@@ -14,17 +14,20 @@ from typing import Final, TypeAlias
 import pandas as pd
 
 from servobench.harness.analysis.comparison import (
+    CURVE,
+    POINT_TO_POINT,
     achieved_share,
     achievement,
     column_of,
     compare_pairs,
     outcomes,
+    settling_band,
     settling_times,
+    shown_unit,
     split_conditions,
     split_tasks,
     with_places,
 )
-from servobench.harness.analysis.measures import MEASURES, Measure, settling_band
 from servobench.harness.analysis.statistics import (
     MISSING,
     NO_ESTIMATE,
@@ -33,6 +36,7 @@ from servobench.harness.analysis.statistics import (
     tail_mean,
 )
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.metrics import METRICS, Summary
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWED, FOLLOWING_BANDS, SETTLED
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.settings import suggest
@@ -55,6 +59,7 @@ SWEEP_COLUMNS: Final = (
     "rms_error_evaluated",
     *BAND,
 )  # what `sweep_tables` and `outcome_legend` read
+STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
 
@@ -110,7 +115,7 @@ def statistics_rows(
 
 
 def _controller_rows(runs: pd.DataFrame) -> list[Row]:
-    unit, factor = MEASURES["steady_state_error"].scale(runs)
+    unit, factor = shown_unit("steady_state_error", runs)
     rows: list[Row] = []
     for name, own in runs.groupby("controller", sort=False):
         ended = outcomes(own)
@@ -144,14 +149,15 @@ def _pair_rows(runs: pd.DataFrame, metric: str | None, never: float | None) -> l
         known = runs[metric].dropna()
         never = 2.0 * float(known.max()) if len(known) else 1.0
     compared = compare_pairs(runs, pairs, never=never, metric=metric, keys=("seed",))
-    measure = MEASURES.get(metric, Measure(metric.replace("_", " "), 2, "1"))
-    unit, factor = measure.scale(runs)
-    what = measure.name if unit == "1" else f"{measure.name}, {unit}"
+    label, (unit, factor) = metric.replace("_", " "), ("1", 1.0)
+    if metric in METRICS:
+        label, (unit, factor) = METRICS[metric].label, shown_unit(metric, runs)
+    difference = f"difference in {label}" if unit == "1" else f"difference in {label}, {unit}"
     return [
         {
             "pair": Cell(f"{pair.first} − {pair.second}"),
             "pairs": Cell(pair.difference.count),
-            f"difference in {what}": Cell(pair.difference.scaled(factor), ".2f"),
+            difference: Cell(pair.difference.scaled(factor), ".2f"),
             "p after Holm": Cell(pair.corrected_p_value, ".2g"),
         }
         for pair in compared
@@ -187,30 +193,24 @@ def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
 def summary_tables(runs: pd.DataFrame) -> Tables:
     """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
+        kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
         rows = []
         for name, own in place.groupby("controller", sort=False):
-            unit, factor = MEASURES["rms_error_evaluated"].scale(place)
-            if achievement(place) == FOLLOWED:
-                special = {
-                    f"RMS lap 2\n{unit}": _middle(own, "rms_error_second_lap", factor, 1),
-                    "joints\nrad": _middle(own, "max_joint_position_rad", 1.0, 2),
-                }
-            else:
-                special = {
-                    "after\ns": _middle(own, "settling_time_s", 1.0, 2),
-                    "over\n%": _middle(own, "overshoot", 100.0, 0),
-                }
-            rows.append(
-                {
-                    "controller": str(name),
-                    "outcome": _shares(own),
-                    **special,
-                    f"RMS end\n{unit}": _middle(own, "rms_error_evaluated", factor, 1),
-                    "switches": _middle(own, "command_switches", 1.0, 0),
-                    "step\nµs": _middle(own, "controller_time_median_us", 1.0, 0) + (LATE if _is_late(own) else ""),
-                }
-            )
+            row = {"controller": str(name), "outcome": _shares(own)}
+            for column, summary in _summaries(kind):
+                unit, factor = shown_unit(column, place)
+                heading = summary.heading if unit == "1" else f"{summary.heading}\n{unit}"
+                row[heading] = _middle(own, column, factor, summary.digits)
+                if column == STEP_TIME and _is_late(own):
+                    row[heading] += LATE
+            rows.append(row)
         yield f"{task} on {plant}, {mismatch}", pd.DataFrame(rows)
+
+
+def _summaries(kind: str) -> list[tuple[str, Summary]]:
+    """Return the metrics of the summary of a kind of task, those of this kind only before those of all tasks."""
+    known = [(name, metric.summary) for name, metric in METRICS.items() if metric.summary]
+    return [pair for pair in known if pair[1].kind == kind] + [pair for pair in known if pair[1].kind is None]
 
 
 def _shares(runs: pd.DataFrame) -> str:

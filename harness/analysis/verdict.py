@@ -20,13 +20,14 @@ from servobench.harness.analysis.comparison import (
     column_of,
     outcomes,
     settling_times,
+    shown_unit,
     split_conditions,
     split_tasks,
 )
-from servobench.harness.analysis.measures import MEASURES
 from servobench.harness.analysis.statistics import Estimate, holm, median_with_interval, signed_rank_p_value
 from servobench.harness.config.registry import CONTROLLERS, find_controller
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED
 from servobench.harness.run.result import COMPLETED
 
@@ -121,11 +122,11 @@ def scores(place: pd.DataFrame) -> tuple[pd.DataFrame, str, int]:
     That is the settling time of a move, and the error of the judged part of a curve.
     """
     if len(split_tasks(place)[1]):
-        unit, factor = MEASURES["rms_error_evaluated"].scale(place)
+        unit, factor = shown_unit("rms_error_evaluated", place)
         values = factor * column_of(place, "rms_error_evaluated").where(place["status"] == COMPLETED)
-        digits = MEASURES["rms_error_evaluated"].digits
+        digits = METRICS["rms_error_evaluated"].digits
     else:
-        values, unit, digits = settling_times(place), "s", MEASURES["settling_time_s"].digits
+        values, unit, digits = settling_times(place), "s", METRICS["settling_time_s"].digits
     table = place.assign(score=values.fillna(np.inf))
     return table.pivot_table(index="seed", columns="controller", values="score", sort=False), unit, digits
 
@@ -153,7 +154,7 @@ def _of_one_run(runs: pd.DataFrame) -> str:
     name, place = row["controller"], f"{row['task']} on {row['plant']}"
     if row["status"] != COMPLETED:
         return f"`{name}` ended {place} early: {row['status']}."
-    unit, factor = MEASURES["rms_error_evaluated"].scale(runs)
+    unit, factor = shown_unit("rms_error_evaluated", runs)
     if len(split_tasks(runs)[1]):
         verb = "followed" if row["outcome"] in ACHIEVED else f"did not follow ({row['outcome']})"
         return f"`{name}` {verb} {place} with an RMS error of {factor * row['rms_error_evaluated']:.1f} {unit}."

@@ -15,10 +15,8 @@ import pandas as pd
 
 from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
-from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
-from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.grid import Grid
+from servobench.harness.batch.plan import Batch, Cell, Grid
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
 from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
@@ -26,7 +24,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
-from servobench.harness.run.resolved import check_settings
+from servobench.harness.run.resolution import check_settings
 from servobench.harness.run.result import RunResult
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING

@@ -16,14 +16,15 @@ import contextlib
 import math
 import pickle
 from collections import deque
-from collections.abc import Hashable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Hashable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
 from servobench.controllers.networks.fit import Progress
 from servobench.harness.batch.guard import LOST, End, Task, Tell
+from servobench.harness.batch.plan import Cell
 from servobench.harness.batch.pool import Answer
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import (
@@ -37,21 +38,11 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
-from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
 
 BLOCK: Final = 128  # [runs] that advance together: more of them leave the cache of a processor
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A run and its further columns in the table of runs."""
-
-    request: RunRequest
-    columns: Mapping[str, Any] = field(default_factory=dict)  # such as the place along the axis that a sweep varies
-    picture: bool = False  # keep what the camera saw last
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from servobench.harness.batch import results
 from servobench.harness.config.robots import OWN_ROBOT
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import TIMES, RunRequest
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.mismatch import Mismatch
 

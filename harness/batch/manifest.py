@@ -11,7 +11,7 @@ from typing import Any
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.harness.batch.named_files import named_files
-from servobench.harness.batch.survey import Survey
+from servobench.harness.batch.plan import Survey
 from servobench.harness.config.installation import git_commit, installed_version
 from servobench.harness.config.registry import Offer, find_plant, published
 from servobench.harness.config.robots import find_robot, find_sensing
@@ -52,7 +52,7 @@ def describe_batch(
 
     Args:
         runs: what was asked for.
-        sections: their typed settings by section, as `servobench.harness.run.resolved.resolve_sections` returns them.
+        sections: their typed settings by section, as `servobench.harness.run.resolution.resolve_sections` returns them.
         side_by_side: by plant, the controllers whose runs advance together, without the times of their steps.
         own: controllers and plants that users gave.
         steps: the table of steps is kept, too.

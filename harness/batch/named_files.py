@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from servobench.harness.batch.checksums import digest
-from servobench.harness.batch.survey import Survey
+from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import MAPPED, Offer
 from servobench.harness.config.robots import sensing_file, sensing_place
 from servobench.harness.config.source import PLACE, neighbours

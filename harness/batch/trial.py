@@ -33,7 +33,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.config.source import folder_of_module, is_below
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import Ending
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.bench.plant import PlantEntry, PlantSetup

@@ -141,7 +141,7 @@ def _carried_out(new: NewRun) -> LoggedRun:
     from servobench.harness.pictures.replay import logged_run
     from servobench.harness.run.episode import run_experiment
     from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolved import check_settings
+    from servobench.harness.run.resolution import check_settings
     from servobench.plant.rendered.settings import RenderedConfig
 
     names, settings = new.names(), read_settings(new.config, new.set_ or [])

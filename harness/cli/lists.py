@@ -105,7 +105,7 @@ def init(
     from servobench.harness.config.registry import find_controller, find_plant
     from servobench.harness.config.settings import Settings
     from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolved import known_sections, resolve_sections
+    from servobench.harness.run.resolution import known_sections, resolve_sections
     from servobench.harness.run.tasks import find_task
 
     names = selection.split_plants(plants), selection.split_controllers(controllers), selection.split_tasks(tasks)

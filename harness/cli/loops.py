@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from servobench.harness.analysis.loops.equilibrium import Source
     from servobench.harness.analysis.loops.loop_analysis import LoopAnalysis
     from servobench.harness.config.settings import Settings
-    from servobench.harness.run.resolved import ResolvedRun
+    from servobench.harness.run.resolution import ResolvedRun
 
 TABLE = "analyse.csv"
 
@@ -91,7 +91,7 @@ def _resolved(controllers: list[str], mismatch: str, seed: int, robot: str, sett
     """Return a run for each controller on the kinematic plant."""
     from servobench.harness.analysis.loops.equilibrium import PLANT, TASK
     from servobench.harness.run.request import RunRequest, read_mismatch
-    from servobench.harness.run.resolved import check_settings, resolve
+    from servobench.harness.run.resolution import check_settings, resolve
 
     names = selection.split_controllers(",".join(controllers), robot)
     check_settings(settings, [PLANT, TASK, *names])

@@ -21,7 +21,7 @@ from servobench.harness.cli.terminal import refuse
 
 if TYPE_CHECKING:
     from servobench.harness.batch.campaign import Execution, Observer
-    from servobench.harness.batch.compare import Batch
+    from servobench.harness.batch.plan import Batch
     from servobench.harness.batch.workers import Bounds
     from servobench.harness.config.settings import Settings
 
@@ -221,7 +221,7 @@ class Combinations:
         Raises:
             ConfigurationError: a name that is unknown or given twice, or seeds that cannot be read.
         """
-        from servobench.harness.batch.compare import Batch, parse_seeds
+        from servobench.harness.batch.plan import Batch, parse_seeds
 
         return Batch(
             selection.split_plants(self.plants, robot=self.robot),

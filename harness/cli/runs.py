@@ -77,7 +77,7 @@ def run(
     The exit code is 1 if the run failed.
     """
     from servobench.harness.batch.campaign import Execution, comparison
-    from servobench.harness.batch.compare import Batch, parse_seeds
+    from servobench.harness.batch.plan import Batch, parse_seeds
 
     if None not in (method, controller) and method != controller:
         refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
@@ -133,7 +133,7 @@ def train(
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.knowledge import NETWORKS
-    from servobench.harness.run.resolved import check_settings
+    from servobench.harness.run.resolution import check_settings
     from servobench.plant.contract.cache import cache_folder
 
     settings, (controller,) = overrides.settings(), choose_controllers([controller])

@@ -55,7 +55,7 @@ def sweep(
     from servobench.harness.analysis.tables import SWEEP_COLUMNS, sweep_legend, sweep_tables
     from servobench.harness.batch import results
     from servobench.harness.batch.campaign import Campaign, carry_out
-    from servobench.harness.batch.sweep import SweepPlan, parse_variation
+    from servobench.harness.batch.plan import SweepPlan, parse_variation
     from servobench.harness.cli.progress import watching
 
     plan = SweepPlan(
@@ -114,7 +114,7 @@ def robustness(
 
     The robustness map; each axis of the mismatch or of the sensor is varied by itself.
     """
-    from servobench.harness.batch.compare import parse_seeds
+    from servobench.harness.batch.plan import parse_seeds
     from servobench.harness.cli.progress import watching
     from servobench.harness.studies.robustness import find_lines, make_map
 

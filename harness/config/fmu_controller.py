@@ -29,11 +29,11 @@ from servobench.plant.contract.files import read_toml
 from servobench.plant.contract.settings import File, Names, Positive, Values, nested, override, settings
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import FmuDescription, Variable, read_description, total_size
+from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
-from servobench.plant.fmu.port import Port
+from servobench.plant.fmu.library import InstanceOptions
+from servobench.plant.fmu.world import STRUCTURAL, setter, structural_sizes
 
 CONVENTION: Final[Mapping[str, str]] = {
     "outputs": "joint_velocity_command",
@@ -98,7 +98,7 @@ class FmuController(Controller):
                   for name, each in mapping.parameters.items())  # fmt: skip
         setters = ((variables[0], setter(variables, name, each, ())) for variables, name, each in values)
         self._setters = [act for _, act in sorted(setters, key=lambda pair: pair[0].causality != STRUCTURAL)]
-        asked = Asked(mapping.tolerance, mapping.debug_log)
+        asked = InstanceOptions(mapping.tolerance, mapping.debug_log)
         self._instance = open_instance(self._description, root, asked=asked)
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)

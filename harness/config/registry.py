@@ -41,8 +41,8 @@ CONTROLLER_GROUP = "servobench.controllers"
 
 PLANTS = {
     "kinematic": "servobench.plant.kinematic:ENTRY",
-    "bullet": "servobench.plant.rendered.bullet.bullet_plant:ENTRY",
-    "mujoco": "servobench.plant.rendered.mujoco.mujoco_plant:ENTRY",
+    "bullet": "servobench.plant.rendered.plants:BULLET",
+    "mujoco": "servobench.plant.rendered.plants:MUJOCO",
     "fmu": "servobench.fmus.ur5_plant:ENTRY",
 }
 RENDERED = ("bullet", "mujoco")  # a run without a named plant is on the first one that is installed
@@ -140,7 +140,7 @@ def find_plant(name: str) -> PlantEntry:
         ConfigurationError: no such plant, a mapping that cannot be used, or a third party's that cannot be loaded.
     """
     if name.startswith(MAPPED):
-        from servobench.plant.fmu.fmu_plant import mapped_entry  # noqa: PLC0415 - only the extra fmu brings its needs
+        from servobench.plant.fmu.world import mapped_entry  # noqa: PLC0415 - only the extra fmu brings its needs
 
         try:
             return mapped_entry(user_path(name.removeprefix(MAPPED)))
@@ -323,10 +323,10 @@ def default_plant() -> tuple[str, str]:
 def scene_of(plant: str) -> OpenScene:
     """Return what opens a scene of the engine of a rendered plant; engines load slowly, so only here."""
     if plant == "mujoco":
-        from servobench.plant.rendered.mujoco.scene import MujocoScene  # noqa: PLC0415
+        from servobench.plant.rendered.mujoco import MujocoScene  # noqa: PLC0415
 
         return MujocoScene
-    from servobench.plant.rendered.bullet.scene import BulletScene  # noqa: PLC0415
+    from servobench.plant.rendered.bullet import BulletScene  # noqa: PLC0415
 
     return BulletScene
 

@@ -10,10 +10,10 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import PLACE, SourceFile
 from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
-from servobench.plant.robot import catalogue
+from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.robot import Robot
 
-DEFAULT_ROBOT: Final = catalogue.UR5
+DEFAULT_ROBOT: Final = ur5.UR5
 OWN_ROBOT: Final = "own"  # in the column `robot`: the plant brings it
 
 

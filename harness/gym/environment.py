@@ -16,16 +16,16 @@ from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.gym.spaces import Floats32, View
 from servobench.harness.run.experiment import Drawn, Experiment, build, check_possible
+from servobench.harness.run.loop import Rollout
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolved import ResolvedRun, check_settings, resolve
+from servobench.harness.run.resolution import ResolvedRun, check_settings, resolve
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.faults import FeatureLost, RunFault
+from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.rendered.overview import Overview
-from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 SEEDS: Final = 2**31  # that an environment draws from where it is given none
@@ -73,7 +73,6 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
     arm that touches the table at its start: then no feature is valid, and the first step terminates the episode.
 
     Attributes:
-        observation: of the plant, as controllers get it; None before the first `reset`.
         natural_size: of a feature, in its unit.
         resolved: what all runs have in common.
     """
@@ -100,7 +99,6 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigurationError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         self.render_mode = render_mode
-        self.observation: Observation | None = None
         self.resolved: Final = resolve_environment(plant, task, mismatch, robot, sensing, settings)
         experiment = build(self.resolved)
         try:
@@ -109,12 +107,18 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             experiment.plant.close()
             raise
         self._experiment: Experiment | None = experiment
+        self._rollout: Rollout | None = None
         self._over = True
         self._view = View(experiment.plant.spec, self.resolved.run.preview_rows)
         self.metadata = self.metadata | {"render_fps": 1.0 / self._view.spec.period}
         self._outside: OutsideView | None = None
         self.natural_size = self._view.spec.feature.scale
         self.observation_space, self.action_space = self._view.observations, self._view.actions
+
+    @property
+    def observation(self) -> Observation | None:
+        """The present observation of the plant, as controllers get it; None before the first `reset`."""
+        return None if self._rollout is None else self._rollout.observation
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -137,20 +141,20 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         self.close()
         self._experiment = experiment = build(with_seed(self.resolved, run_seed))
         rows = experiment.periods + 1 + experiment.run.preview_rows  # also those after the last period
-        self._desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
-        self._k = self._lost = 0
+        desired = experiment.scenario.reference.sampled(self._view.spec.period, rows)
         self._action = np.zeros(self._view.spec.n)
         self._over = False
         info = {"seed": run_seed, "robot": experiment.drawn.as_record()}
         self._fault: RunFault | None = None
         try:
-            self.observation = experiment.plant.reset(named_seed(run_seed, "plant"))
+            observation = experiment.plant.reset(named_seed(run_seed, "plant"))
         except RunFault as fault:
             spec, start = self._view.spec, experiment.scenario.start
             start = np.zeros(spec.n) if start is None else start
-            self.observation, self._fault = Observation(0.0, start, np.zeros(spec.m), feature_valid=False), fault
+            observation, self._fault = Observation(0.0, start, np.zeros(spec.m), feature_valid=False), fault
             info["reason"] = str(fault)
-        return self._see(), info
+        self._rollout = Rollout(experiment.plant, observation, desired, experiment.loop)
+        return self._see(self._rollout), info
 
     def step(self, action: npt.ArrayLike) -> tuple[Floats32, float, bool, bool, dict[str, Any]]:
         """Hold an action for a period.
@@ -166,35 +170,29 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             gymnasium.error.ResetNeeded: `reset` has not been called, or the episode is over.
             ValueError: an action that is not (n,) finite numbers.
         """
-        experiment, reason = self._experiment, None
-        if experiment is None or self._over:
+        experiment, rollout, reason = self._experiment, self._rollout, None
+        if experiment is None or rollout is None or self._over:
             raise gymnasium.error.ResetNeeded("call reset before step: no episode has begun, or it is over")
         self._action = self._view.action(action)
-        plant, loop = experiment.plant, experiment.loop
-        if loop.camera_move is not None and self._k == loop.camera_move.period:
-            plant.move_camera(loop.camera_move.X_BC)
         try:
             if self._fault is not None:
+                rollout.k += 1
                 raise self._fault
-            self.observation = plant.step(Command(self._view.command(self._action)))
-            self._lost = 0 if self.observation.feature_valid else self._lost + 1
-            if self._lost >= loop.lost_after_periods:
-                raise FeatureLost(f"no valid feature for {self._lost} periods")
+            rollout.advance(Command(self._view.command(self._action)))
+            if rollout.lost() is not None:
+                reason = str(rollout.loss())
         except RunFault as fault:
             reason = str(fault)
-        self._k += 1
-        error = float(self._view.error(plant.truth(), self._desired[self._k]))
-        periods = 1 if reason is None else experiment.periods - self._k + 1
-        info = {"time": self._k * self._view.spec.period, "error": error} | ({"reason": reason} if reason else {})
-        ended = reason is None and self._k >= experiment.periods
+        period = self._view.spec.period
+        error = float(self._view.error(experiment.plant.truth(), rollout.reference[0]))
+        periods = 1 if reason is None else experiment.periods - rollout.k + 1
+        info = {"time": rollout.k * period, "error": error} | ({"reason": reason} if reason else {})
+        ended = reason is None and not rollout.running
         self._over = ended or reason is not None
-        return self._see(), -error * periods * self._view.spec.period, reason is not None, ended, info
+        return self._see(rollout), -error * periods * period, reason is not None, ended, info
 
-    def _see(self) -> Floats32:
-        if self.observation is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        rows = self.resolved.run.preview_rows + 1
-        return self._view.see(self.observation, self._desired[self._k : self._k + rows], self._action)
+    def _see(self, rollout: Rollout) -> Floats32:
+        return self._view.see(rollout.observation, rollout.reference, self._action)
 
     def render(self) -> ByteArray | None:
         """Return the present picture, (h, w, 3): what the plant's camera sees, or the arm from outside.
@@ -205,8 +203,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
             gymnasium.error.ResetNeeded: `reset` has not been called.
             ConfigurationError: the plant has no camera, and its arm is not known or nothing can render it.
         """
-        experiment = self._experiment
-        if experiment is None or self.observation is None:
+        experiment, rollout = self._experiment, self._rollout
+        if experiment is None or rollout is None:
             raise gymnasium.error.ResetNeeded("call reset before render")
         if self.render_mode is None:
             return None
@@ -216,8 +214,8 @@ class ServoEnv(gymnasium.Env[Floats32, Floats32]):
         if self._outside is None:
             self._outside = OutsideView(experiment.drawn, self.resolved.request)
         move = experiment.loop.camera_move
-        moved = move is not None and self._k > move.period
-        return self._outside.picture(self.observation.joint_position, self._desired[self._k], moved=moved)
+        moved = move is not None and rollout.k > move.period
+        return self._outside.picture(rollout.observation.joint_position, rollout.reference[0], moved=moved)
 
     def close(self) -> None:
         """Free the plant; calling it twice is allowed."""

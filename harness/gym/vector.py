@@ -14,6 +14,7 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym.environment import SEEDS, ServoEnv, check_options, with_seed
 from servobench.harness.gym.spaces import Floats32, View
 from servobench.harness.run.lanes import Together, build_together, side_by_side_key
+from servobench.harness.run.loop import Rollout
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.contract.signals import BoolArray, Command, Observation
@@ -26,9 +27,6 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
     A lane is the same run, to the bit, as a `ServoEnv` with its seed. All episodes have the same length and are reset
     together: if a run fails, it is terminated and the others are truncated. The step after the end resets all lanes and
     ignores the actions, as Gymnasium's own vector environments do.
-
-    Attributes:
-        observation: of the plant, as controllers get it; arrays have a leading axis.
     """
 
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - declared so by Gymnasium
@@ -92,12 +90,12 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
         self._view = View(many.bench.spec, many.loop.preview)
         rows = many.loop.periods + 1 + many.loop.preview  # also those after the last period
         period = many.bench.spec.period
-        self._desired = np.stack([each.scenario.reference.sampled(period, rows) for each in many.drawn])
-        self._k, self._ended = 0, False
-        self._lost = np.zeros(self.num_envs, dtype=np.intp)
+        desired = np.stack([each.scenario.reference.sampled(period, rows) for each in many.drawn])
+        self._ended = False
         self._action: FloatArray = np.zeros((self.num_envs, many.bench.spec.n))
-        self.observation: Observation = many.bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
-        return self._see(many), {"seed": seeds}
+        observation = many.bench.reset([named_seed(each, "plant") for each in seeds.tolist()])
+        self._rollout = Rollout(many.bench, observation, desired, many.loop)
+        return self._see(), {"seed": seeds}
 
     def step(self, actions: npt.ArrayLike) -> tuple[Floats32, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Hold an action in every lane for a period; see `ServoEnv.step`.
@@ -117,25 +115,25 @@ class ServoVectorEnv(VectorEnv[Floats32, Floats32, npt.NDArray[Any]]):
             seen, info = self.reset()
             return seen, np.zeros(self.num_envs), none, none.copy(), info
         self._action = self._view.action(actions, self.num_envs)
-        move = many.loop.camera_move
-        if move is not None and self._k == move.period:
-            many.bench.move_camera(move.X_BC)
-        self.observation = many.bench.step(Command(self._view.command(self._action)))
-        self._lost = np.where(self.observation.feature_valid, 0, self._lost + 1)
-        self._k += 1
-        failed = self._lost >= many.loop.lost_after_periods
+        rollout = self._rollout
+        rollout.advance(Command(self._view.command(self._action)))
+        lost = rollout.lost()
+        failed = np.zeros(self.num_envs, dtype=np.bool_) if lost is None else lost
         failed[list(many.bench.faults)] = True
-        error = self._view.error(many.bench.truth(), self._desired[:, self._k])
-        over = self._k >= many.loop.periods
-        self._ended = over or bool(failed.any())
+        error = self._view.error(many.bench.truth(), rollout.reference[:, 0])
+        self._ended = not rollout.running or bool(failed.any())
         period = self._view.spec.period
-        periods = np.where(failed, many.loop.periods - self._k + 1, 1)
-        info = {"time": self._k * period, "error": error}
-        return self._see(many), -error * periods * period, failed, ~failed & self._ended, info
+        periods = np.where(failed, many.loop.periods - rollout.k + 1, 1)
+        info = {"time": rollout.k * period, "error": error}
+        return self._see(), -error * periods * period, failed, ~failed & self._ended, info
 
-    def _see(self, many: Together) -> Floats32:
-        rows = self._desired[:, self._k : self._k + 1 + many.loop.preview]
-        return self._view.see(self.observation, rows, self._action)
+    @property
+    def observation(self) -> Observation:
+        """The present observation of the plant, as controllers get it; arrays have a leading axis."""
+        return self._rollout.observation
+
+    def _see(self) -> Floats32:
+        return self._view.see(self._rollout.observation, self._rollout.reference, self._action)
 
     def close_extras(self, **_options: Any) -> None:  # noqa: ANN401 - Gymnasium's
         """Free the plant."""

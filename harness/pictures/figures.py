@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from servobench.harness.analysis.comparison import with_places
 from servobench.harness.batch import results
-from servobench.harness.pictures.measures import ACCURACY, EFFORT, SMOOTHNESS, draw_measures, draw_step_times
+from servobench.harness.pictures.measures import FIGURES, draw_measures, draw_step_times
 from servobench.harness.pictures.paths import draw_paths
 from servobench.harness.pictures.responses import (
     draw_features,
@@ -193,8 +193,8 @@ def _cost_plans(
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all
     for what, measured in _parts(dict.fromkeys(runs["task"] if several else ()), size):
         chosen = runs[runs["task"].isin(list(measured))]
-        for kind, columns in (("settling", ACCURACY), ("effort", EFFORT), ("smoothness", SMOOTHNESS)):
-            yield _Plan(kind, what, tuple(measured), partial(draw_measures, chosen, columns, styles))
+        for kind in FIGURES:
+            yield _Plan(kind, what, tuple(measured), partial(draw_measures, chosen, kind, styles))
     yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
         until = shown_until(ensembles[task])

@@ -15,8 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from servobench.harness.analysis.comparison import settled_share, settling_times
-from servobench.harness.analysis.measures import MEASURES
+from servobench.harness.analysis.comparison import settled_share, settling_times, shown_unit
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
 from servobench.harness.pictures.style import (
     LETTER,
@@ -30,13 +29,12 @@ from servobench.harness.pictures.style import (
     panel_grid,
 )
 from servobench.harness.pictures.tracks import Ensembles
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
 SETTLING, NEVER = "settling_time_s", 1.3  # and where a run without a value stands, over the largest value
-ACCURACY: Final = (SETTLING, "rms_error_evaluated")
-EFFORT: Final = ("control_effort_rad", "saturation_fraction")
-SMOOTHNESS: Final = ("joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3", "command_switches")
+FIGURES: Final = ("settling", "effort", "smoothness")  # of which each shows the metrics that name it
 PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
@@ -61,20 +59,24 @@ class _Dots(NamedTuple):
     factor: float
 
 
-def draw_measures(runs: pd.DataFrame, columns: Sequence[str], styles: Styles, layout: Layout = WIDE) -> Figure | None:
-    """Draw measures of every run, a column a task, a row a measure, a line a controller; None without values.
+def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE) -> Figure | None:
+    """Draw metrics of every run, a column a task, a row a metric, a line a controller; None without values.
 
-    The measures of a single task are beside each other, on a narrow sheet below each other.
+    The metrics of a single task are beside each other, on a narrow sheet below each other.
 
     A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
 
     Args:
         runs: of one plant and mismatch.
-        columns: of the table of runs; those without any value are left out.
+        kind: one of `FIGURES`; of its metrics those without any value are left out.
         styles: controller -> style.
         layout: of the figure; a narrow one is for a single task.
     """
-    rows = [_dots(name, runs) for name in columns if name in runs and runs[name].notna().any()]
+    rows = [
+        _dots(name, runs)
+        for name, metric in METRICS.items()
+        if metric.figure == kind and name in runs and runs[name].notna().any()
+    ]
     if not rows:
         return None
     alone = runs["task"].nunique() == 1
@@ -200,8 +202,8 @@ def _short(milliseconds: float) -> str:
 
 
 def _dots(column: str, runs: pd.DataFrame) -> _Dots:
-    unit, factor = MEASURES[column].scale(runs)
-    name = MEASURES[column].name
+    unit, factor = shown_unit(column, runs)
+    name = METRICS[column].label
     if column == "rms_error_evaluated":
         name = "RMS error of the judged part"
         name += ": end of a move, last lap of a curve" if runs["task"].nunique() > 1 else ""

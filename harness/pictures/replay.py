@@ -25,8 +25,7 @@ from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.detection import ByteArray, draw_detection, find_ball
-from servobench.plant.rendered.overview import Overview
-from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.room import Overview, Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch

@@ -22,9 +22,16 @@ from matplotlib.figure import Figure
 
 from servobench.controllers.methods import PUBLISHED
 from servobench.harness.analysis import groups
-from servobench.harness.analysis.comparison import outcomes, split_tasks
+from servobench.harness.analysis.comparison import (
+    handy_unit,
+    in_handy_units,
+    metric_heading,
+    outcomes,
+    settling_band,
+    shown_unit,
+    split_tasks,
+)
 from servobench.harness.analysis.folder import describe_folder, describe_settings, other_tables
-from servobench.harness.analysis.measures import MEASURES, handy_unit, in_handy_units, settling_band
 from servobench.harness.analysis.verdict import judge, leaders
 from servobench.harness.batch import results
 from servobench.harness.config.robots import DEFAULT_ROBOT
@@ -43,6 +50,7 @@ from servobench.harness.pictures.style import (
     picture_of,
 )
 from servobench.harness.pictures.tracks import Track, Tracks, each, label_of, load_groups, longest
+from servobench.harness.run.metrics import METRICS
 from servobench.harness.run.outcome import ACHIEVED, FOLLOWING_BANDS
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
@@ -263,8 +271,8 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     """Return what the scripts draw: runs by their number, with the error over time of those whose steps are kept."""
     curves = error_curves(folder, shown)
     shown = in_handy_units(shown)
-    known = [name for name in MEASURES if name in shown and shown[name].notna().any()]
-    scales = {name: MEASURES[name].scale(shown)[1] for name in known}
+    known = [name for name in METRICS if name in shown and shown[name].notna().any()]
+    scales = {name: shown_unit(name, shown)[1] for name in known}
     place = shown.groupby(
         ["controller", *(n for n in ("task", *groups.CONDITIONS) if n in shown)], dropna=False
     ).ngroup()
@@ -281,17 +289,12 @@ def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dic
     }
     numbers = {str(row): str(number) for number, row in shown["run_id"].items()}
     return {
-        "measures": [_named(name, shown) for name in known],
+        "measures": [metric_heading(name, shown) for name in known],
         "runs": runs,
         "curves": {numbers[name]: curve for name, curve in curves.items()},
         "swatches": swatches([str(name) for name in dict.fromkeys(shown["controller"])]),
         "views": views,
     }
-
-
-def _named(name: str, runs: pd.DataFrame) -> str:
-    unit = MEASURES[name].scale(runs)[0]
-    return MEASURES[name].name if unit == "1" else f"{MEASURES[name].name} [{unit}]"
 
 
 def swatches(names: list[str]) -> dict[str, Json]:

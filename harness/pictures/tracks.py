@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from servobench.harness.analysis.comparison import POINT_TO_POINT, settling_times, with_places
-from servobench.harness.analysis.measures import handy_unit
+from servobench.harness.analysis.comparison import POINT_TO_POINT, handy_unit, settling_times, with_places
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import COMPLETED

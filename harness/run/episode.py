@@ -22,7 +22,7 @@ from servobench.harness.run.metrics import judge_run
 from servobench.harness.run.outcome import find_outcome
 from servobench.harness.run.pose_error import final_pose_error, pose_errors
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
 from servobench.harness.run.tasks import Scenario
 from servobench.plant.contract.checks import FloatArray

@@ -19,11 +19,11 @@ from servobench.harness.run.knowledge import in_view, nominal_knowledge, trained
 from servobench.harness.run.loop import CameraMove, LoopSettings
 from servobench.harness.run.plausibility import check_joints, check_reach, check_times
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
 from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
-from servobench.plant.cameras.draws import CameraDraws
+from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault

@@ -5,7 +5,7 @@ The step of a controller is recorded, and a run of it is kept inside the FMU for
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any, Final
@@ -33,8 +33,9 @@ from servobench.harness.config.registry import find_controller
 from servobench.harness.config.robots import find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten
 from servobench.harness.run.experiment import Experiment, build, draw
+from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import ResolvedRun, resolve
+from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import Observation, trusted_observation
@@ -131,39 +132,33 @@ def _step(servo: Servo, state: ServoState, inputs: Mapping[str, Any]) -> tuple[S
 
 
 def _run(experiment: Experiment) -> ControllerRun:
-    """Carry out the run that the FMU repeats to be compared; it may end early."""
-    seen, answered = [], []
+    """Carry out the run that the FMU repeats for comparison; it may end early."""
+    controller, spec = experiment.controller, experiment.plant.spec
+    unknown = np.zeros(spec.m * spec.n)
+    inputs, outputs = [], []
     try:
-        for observation, reference, command, jacobian in islice(_periods(experiment), REFERENCE_PERIODS):
-            rows = observation.joint_position, observation.feature, observation.valid.astype(np.float64), reference
-            seen.append([observation.time, *(np.ravel(row) for row in rows)])
-            answered.append([command, np.ravel(jacobian)])
+        for period in islice(periods(_begin(experiment), controller), REFERENCE_PERIODS):
+            seen, estimate = period.observation, controller.estimated_jacobian()
+            rows = seen.joint_position, seen.feature, seen.valid.astype(np.float64), period.reference
+            inputs.append([seen.time, *(np.ravel(row) for row in rows)])
+            outputs.append([period.command.joint_velocity, unknown if estimate is None else np.ravel(estimate)])
     except RunFault as fault:
-        if not answered:
+        if not outputs:
             raise ConfigurationError(f"the run that is kept inside the FMU failed at once: {fault}") from fault
-    time, *inputs = (np.array(column) for column in zip(*seen, strict=True))
-    outputs = (np.array(column) for column in zip(*answered, strict=True))
+    time, *columns = (np.array(column) for column in zip(*inputs, strict=True))
+    answers = (np.array(column) for column in zip(*outputs, strict=True))
     return ControllerRun(
         time,
-        dict(zip((POSITION, FEATURE, SEEN, REFERENCE), inputs, strict=True)),
-        dict(zip((COMMAND, JACOBIAN), outputs, strict=True)),
+        dict(zip((POSITION, FEATURE, SEEN, REFERENCE), columns, strict=True)),
+        dict(zip((COMMAND, JACOBIAN), answers, strict=True)),
     )
 
 
-def _periods(experiment: Experiment) -> Iterator[tuple[Observation, FloatArray, FloatArray, FloatArray]]:
-    """Yield observation, reference, command and estimated Jacobian of each period."""
-    plant, controller, rows = experiment.plant, experiment.controller, 1 + experiment.run.preview_rows
-    count = experiment.periods
-    desired = experiment.scenario.reference.sampled(plant.spec.period, count + rows - 1)
-    observation = plant.reset(0)
-    controller.reset(observation, 0)
-    for k in range(count):
-        reference = desired[k : k + rows]
-        command = controller.step(observation, reference)
-        estimate = controller.estimated_jacobian()
-        unknown = np.zeros((plant.spec.m, plant.spec.n))
-        yield observation, reference, command.joint_velocity, unknown if estimate is None else estimate
-        observation = plant.step(command)
+def _begin(experiment: Experiment) -> Rollout:
+    """Return the run at its first instant, with seed 0 and without the camera's move and the end by lost features."""
+    length = LoopSettings(experiment.periods, experiment.run.preview_rows)
+    desired = experiment.scenario.reference.sampled(experiment.plant.spec.period, length.periods + length.preview)
+    return begin(experiment.plant, experiment.controller, desired, length, (0, 0))
 
 
 def loop_products(request: RunRequest, settings: Settings) -> tuple[Product, Product, float]:

@@ -22,7 +22,7 @@ from servobench.harness.config.registry import find_controller, find_plant
 from servobench.harness.run.experiment import Drawn, assemble, draw, loop_settings
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import LoopSettings
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray

@@ -137,24 +137,24 @@ class StepLog:
         reference: FloatArray,
         command: Command,
         truth: Truth,
+        nanoseconds: tuple[int, int],
         estimate: FloatArray | None,
         diagnostics: Diagnostics,
-        nanoseconds: tuple[int, int],
     ) -> None:
-        """Add the row of one instant.
+        """Write the next row.
 
         Args:
-            observation: what the controller saw.
-            reference: (..., m), the desired feature now [unit of the feature].
-            command: the controller's answer.
+            observation: the one that the controller got.
+            reference: (..., 1 + preview, m), of which the first row is logged [unit of the feature].
+            command: of the controller.
             truth: the true feature and Jacobian of this instant.
+            nanoseconds: wall-clock time of the controller's and of the plant's step.
             estimate: (..., m, n), the Jacobian that the controller used, or None [unit of the feature per rad].
             diagnostics: the controller's own numbers; a name may come later than the first row.
-            nanoseconds: how long the controller's and the plant's step took.
         """
         k, rows = self._count, self._rows
         rows.time[k] = observation.time
-        rows.reference[k] = reference
+        rows.reference[k] = reference[..., 0, :]
         rows.feature[k] = observation.feature
         rows.true_feature[k] = truth.feature
         rows.joint_position[k] = observation.joint_position

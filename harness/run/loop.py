@@ -18,9 +18,10 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, NamedTuple, final
 
 import numpy as np
+import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
 from servobench.controllers.controller import Controller
@@ -29,6 +30,7 @@ from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.seeds import Seeds, named_seed
+from servobench.plant.contract.signals import Command, Observation, Truth
 
 _found: list[tuple[int, ThreadpoolController]] = []
 
@@ -43,12 +45,97 @@ class CameraMove:
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How long a run is and what ends it early."""
+    """The length of a run and the reasons to end it early."""
 
     periods: int  # control periods in the run
-    preview: int  # future rows of the reference that a controller sees
-    lost_after_periods: int  # a run ends after so many periods in a row without a valid feature
+    preview: int = 0  # future rows of the reference that a controller gets
+    lost_after_periods: int = sys.maxsize  # a run ends after so many periods in a row without a valid feature
     camera_move: CameraMove | None = None  # a move of the camera in the middle of the run, or None
+
+
+class Period(NamedTuple):
+    """A control period of a run, or of runs side by side."""
+
+    observation: Observation  # at its begin
+    reference: FloatArray  # (..., 1 + preview, m), from its begin on [unit of the feature]
+    command: Command  # held during the period
+    truth: Truth  # the true feature and Jacobian at its begin
+    nanoseconds: tuple[int, int]  # wall-clock time of the controller's and of the plant's step
+
+
+@final
+class Rollout:
+    """The plant's side of a run, for a controller or for an agent that sends commands from elsewhere.
+
+    Attributes:
+        plant: of one run, or of runs side by side.
+        observation: the present one.
+        k: periods that were begun.
+    """
+
+    def __init__(self, plant: Plant, observation: Observation, desired: FloatArray, settings: LoopSettings) -> None:
+        """Begin at an observation.
+
+        Args:
+            plant: of one run, or of runs side by side.
+            observation: the one that the plant returned last.
+            desired: (..., periods + preview, m), the desired features from now on.
+            settings: length of the run and the reasons to end it early.
+        """
+        self.plant, self.observation, self.k = plant, observation, 0
+        self._desired, self._settings = desired, settings
+        self._lost: Any = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether a period is left."""
+        return self.k < self._settings.periods
+
+    @property
+    def reference(self) -> FloatArray:
+        """The reference from now on, (..., 1 + preview, m)."""
+        return self._desired[..., self.k : self.k + 1 + self._settings.preview, :]
+
+    def advance(self, command: Command) -> None:
+        """Hold a command for a period.
+
+        Raises:
+            RunFault: the plant cannot go on.
+        """
+        move = self._settings.camera_move
+        if move is not None and self.k == move.period:
+            self.plant.move_camera(move.X_BC)
+        self.k += 1
+        self.observation = self.plant.step(command)
+        self._lost = (1 + self._lost) * (1 - self.observation.feature_valid)
+
+    def lost(self) -> npt.NDArray[np.bool_] | None:
+        """Return the runs, (...), that had no valid feature for too long; None if there are none."""
+        if np.max(self._lost) < self._settings.lost_after_periods:
+            return None
+        return np.asarray(self._lost >= self._settings.lost_after_periods)
+
+    def loss(self) -> FeatureLost:
+        """Return the fault of runs that had no valid feature for too long."""
+        periods = self._settings.lost_after_periods
+        return FeatureLost(f"no valid feature for {periods} periods, until {self.observation.time:g} s")
+
+
+def periods(rollout: Rollout, controller: Controller) -> Iterator[Period]:
+    """Yield each period of a run after the controller and the plant have taken their steps.
+
+    Raises:
+        RunFault: the run ended before its last period.
+    """
+    while rollout.running:
+        observation, reference = rollout.observation, rollout.reference
+        began = perf_counter_ns()
+        command = controller.step(observation, reference)
+        decided = perf_counter_ns()
+        truth = rollout.plant.truth()
+        released = perf_counter_ns()
+        rollout.advance(command)
+        yield Period(observation, reference, command, truth, (decided - began, perf_counter_ns() - released))
 
 
 def run_loop(
@@ -60,34 +147,32 @@ def run_loop(
         plant: of one run, or of runs side by side.
         controller: the same.
         desired: (..., periods + preview, m), the desired features from time 0 on.
-        settings: how long the run is and what ends it early.
+        settings: length of the run and the reasons to end it early.
         seed: of the run, or one of each run.
         log: receives the rows.
 
     Raises:
         RunFault: the run ended before its last period; the rows so far are in the log.
     """
-    rows, move = 1 + settings.preview, settings.camera_move
-    observation = plant.reset(_named(seed, "plant"))
-    controller.reset(observation, _named(seed, "controller"))
-    lost: Any = 0
-    for k in range(settings.periods):
-        began = perf_counter_ns()
-        command = controller.step(observation, desired[..., k : k + rows, :])
-        decided = perf_counter_ns()
-        truth = plant.truth()
-        if move is not None and k == move.period:
-            plant.move_camera(move.X_BC)
-        released = perf_counter_ns()
-        following = plant.step(command)
-        spent = (decided - began, perf_counter_ns() - released)
-        estimate, diagnostics = controller.estimated_jacobian(), controller.diagnostics()
-        log.add(observation, desired[..., k, :], command, truth, estimate, diagnostics, spent)
-        observation = following
-        lost = (1 + lost) * (1 - observation.feature_valid)
-        if np.max(lost) >= settings.lost_after_periods:
-            text = f"no valid feature for {settings.lost_after_periods} periods, until {observation.time:g} s"
-            log.end(np.asarray(lost >= settings.lost_after_periods), FeatureLost(text))
+    rollout = begin(plant, controller, desired, settings, (_named(seed, "plant"), _named(seed, "controller")))
+    for period in periods(rollout, controller):
+        log.add(*period, controller.estimated_jacobian(), controller.diagnostics())
+        lost = rollout.lost()
+        if lost is not None:
+            log.end(lost, rollout.loss())
+
+
+def begin(
+    plant: Plant,
+    controller: Controller,
+    desired: FloatArray,
+    settings: LoopSettings,
+    seeds: tuple[Any, Any],
+) -> Rollout:
+    """Reset plant and controller, each with its own of `seeds`, and return the run at its first instant."""
+    rollout = Rollout(plant, plant.reset(seeds[0]), desired, settings)
+    controller.reset(rollout.observation, seeds[1])
+    return rollout
 
 
 def _named(seed: Seeds, name: str) -> Any:  # noqa: ANN401 - as `seed`

@@ -1,30 +1,16 @@
-"""What a run is judged by, from its logged rows. All errors are those of the true feature.
+"""The metrics of a run, computed from its logged rows: `METRICS` declares each one, `judge_run` computes them.
 
-| metric | meaning |
-|---|---|
-| settling_time_s | first time after which the error stays within the band (5 mm), for at least 0.5 s; NaN if never |
-| settling_time_5pct_s | the same for 5 % of the initial error |
-| overshoot | how far the feature passes a fixed target, as a share of the initial error; NaN when tracking |
-| steady_state_error | mean error of the last second |
-| rms_error, max_error | over the whole run |
-| rms_error_second_lap | over the second lap; NaN where nothing is repeated |
-| rms_error_evaluated | over the evaluated part: the last lap, the last quarter of a move, the last half of a path |
-| path_length_ratio | true path over the straight line (point to point) or over the reference's path (tracking) |
-| max_joint_position_rad | largest |q| of all joints and periods |
-| control_effort_rad | Σ |u| dt over joints and periods |
-| saturation_fraction | share of periods in which a joint is commanded at its speed limit |
-| joint_acceleration_peak_rad_s2, joint_acceleration_rms_rad_s2 | of the commands, over joints and periods |
-| joint_jerk_peak_rad_s3, joint_jerk_rms_rad_s3 | the same of the jerk |
-| command_switches | how often a large joint command is followed by a large one of the other sign, see `sign_switches` |
-| feature_invalid_fraction | share of periods without a valid feature |
-| controller_time_overruns | periods in which the controller's step took longer than the period |
+A metric is one declaration: its column in the table of runs, its unit, its definition, how and where tables and figures
+show it, and the function that computes it. docs/results.md, the tables of a command, `servobench statistics` and the
+report are made from the declarations. All errors are those of the true feature.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +25,106 @@ DWELL = 0.5  # [s] least time within the band at the end of a run
 FINAL_SPAN = 1.0  # [s] over which the steady state is averaged
 LARGE_COMMAND = 0.1  # share of the joint's speed limit from which on a command counts as large
 SWITCH_PERIODS = 2  # within which a change of sign counts as a switch
+
+
+class Judged:
+    """The rows of a run, or of runs side by side, with the period as the last, contiguous axis.
+
+    The order of a sum decides its last bits, and stored tables are compared bit for bit: hence contiguous columns.
+
+    Attributes:
+        steps: the rows, at least one.
+        fixed: whether the task has a fixed target.
+        period: of control [s].
+        error: of the true feature, (..., k) [unit of the feature].
+        evaluated: the error in the evaluated part of the task, (..., j).
+        second_lap: the error in the second lap of a curve that is repeated, (..., l).
+        feature: the true one, (..., m, k).
+        reference: (..., m, k).
+        command: (..., n, k) [rad/s].
+        acceleration: of the commands, (..., n, k − 1) [rad/s²].
+        jerk: of the commands, (..., n, k − 2) [rad/s³].
+    """
+
+    def __init__(self, steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float) -> None:
+        """Arrange the rows; see `judge_run`."""
+        self.steps, self.fixed, self.period = steps, kind == "point_to_point", steps.spec.period
+        self.error = _columns(steps.error_norm())
+        self.feature, self.reference, self.command = map(_columns, (steps.true_feature, steps.reference, steps.command))
+        judged_from, second, third = np.searchsorted(
+            steps.time, [evaluate_from - 1e-9, lap_time - 1e-9, 2.0 * lap_time - 1e-9]
+        )
+        self.evaluated, self.second_lap = self.error[..., judged_from:], self.error[..., second:third]
+        self.acceleration, self.jerk = command_derivatives(self.command, self.period)
+
+    def same(self, value: float) -> FloatArray:
+        """Return a value that all runs share, (...)."""
+        return np.full(self.error.shape[:-1], value)
+
+
+class Summary(NamedTuple):
+    """A column of the table that a command prints at its end; of one kind of task only, if `kind` says so."""
+
+    heading: str
+    digits: int
+    kind: TaskKind | None = None
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A metric: a column of the table of runs.
+
+    Attributes:
+        column: its name.
+        unit: of the column; empty for that of the plant's feature.
+        label: its name in tables and figures.
+        digits: behind the decimal point where it is shown.
+        meaning: its definition.
+        values: of runs, (...); None where only the sensing set-up knows them, see `servobench.harness.run.pose_error`.
+        percent: whether it is shown in percent.
+        better: `less`, or empty where neither direction is better.
+        tables: the tables of the report that show it, each with the group of columns: moves, curves, cost, runs.
+        figure: the figure that shows it for each run: settling, effort or smoothness.
+        summary: its column in the table that a command prints at its end.
+    """
+
+    column: str
+    unit: str
+    label: str
+    digits: int
+    meaning: str
+    values: Callable[[Judged], FloatArray] | None = None
+    percent: bool = False
+    better: str = "less"
+    tables: Mapping[str, str] = field(default_factory=dict)
+    figure: str = ""
+    summary: Summary | None = None
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit in which it is shown; empty for that of the plant's feature or a handier one."""
+        return "%" if self.percent else self.unit
+
+    @property
+    def factor(self) -> float:
+        """Factor from the column to the unit in which it is shown."""
+        return 100.0 if self.percent else 1.0
+
+
+def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan) -> dict[str, FloatArray]:
+    """Return the metrics of a run, or of runs side by side.
+
+    Args:
+        steps: the rows, at least one.
+        kind: of the task; "point_to_point" has a fixed target.
+        evaluate_from: where the evaluated part begins [s].
+        lap_time: of a curve that is repeated [s]; NaN of any other.
+
+    Returns:
+        Metric name -> (...); NaN where a metric does not apply, as the times of runs side by side.
+    """
+    run = Judged(steps, kind, evaluate_from, lap_time)
+    return {name: metric.values(run) for name, metric in METRICS.items() if metric.values is not None}
 
 
 def settling_time(error: FloatArray, band: npt.ArrayLike, period: float, dwell: float = DWELL) -> FloatArray:
@@ -114,63 +200,25 @@ def command_derivatives(command: FloatArray, period: float) -> tuple[FloatArray,
     return acceleration, np.diff(acceleration, axis=-1) / period
 
 
-def judge_run(steps: Steps, kind: TaskKind, evaluate_from: float, lap_time: float = math.nan) -> dict[str, FloatArray]:
-    """Return the metrics of a run, or of runs side by side.
-
-    Args:
-        steps: the rows, at least one.
-        kind: of the task; "point_to_point" has a fixed target.
-        evaluate_from: where the evaluated part begins [s].
-        lap_time: of a curve that is repeated [s]; NaN of any other.
-
-    Returns:
-        Metric name -> (...); NaN where a metric does not apply, as the times of runs side by side.
-    """
-    spec, fixed = steps.spec, kind == "point_to_point"
-    error, jacobian_error, condition = map(
-        _columns, (steps.error_norm(), steps.jacobian_error(), steps.jacobian_condition())
-    )
-    # Column after column: the order of a sum decides its last bits, and stored tables are compared bit for bit.
-    feature, reference, command = map(_columns, (steps.true_feature, steps.reference, steps.command))
-    judged_from, second_lap, third_lap = np.searchsorted(
-        steps.time, [evaluate_from - 1e-9, lap_time - 1e-9, 2.0 * lap_time - 1e-9]
-    )
-    evaluated, second = error[..., judged_from:], error[..., second_lap:third_lap]
-    final = error[..., -max(1, round(FINAL_SPAN / spec.period)) :]
-    way = norm(reference[..., 0] - feature[..., 0]) if fixed else path_length(reference)
-    effort = np.abs(command)
-    acceleration, jerk = command_derivatives(command, spec.period)
-    at_limit = effort >= spec.joint_velocity_limit[:, None] * (1 - 1e-9)
-    lanes = error.shape[:-1]
-    unknown = np.full(lanes, np.nan)
+def _path_length_ratio(run: Judged) -> FloatArray:
+    way = norm(run.reference[..., 0] - run.feature[..., 0]) if run.fixed else path_length(run.reference)
     with np.errstate(divide="ignore", invalid="ignore"):
-        path_length_ratio = np.where(way > 0.0, path_length(feature) / way, np.nan)
-    return {
-        "settling_time_s": settling_time(error, spec.feature.band, spec.period),
-        "settling_time_5pct_s": settling_time(error, SETTLING_SHARE * error[..., 0], spec.period),
-        "overshoot": overshoot(feature, reference[..., 0]) if fixed else unknown,
-        "steady_state_error": final.mean(axis=-1),
-        "rms_error": _rms(error),
-        "max_error": error.max(axis=-1),
-        "rms_error_second_lap": _rms(second) if second.shape[-1] else unknown,
-        "rms_error_evaluated": _rms(evaluated) if evaluated.shape[-1] else unknown,
-        "path_length_ratio": path_length_ratio,
-        "max_joint_position_rad": np.abs(_columns(steps.joint_position)).max(axis=(-2, -1)),
-        "control_effort_rad": _flat(effort).sum(axis=-1) * spec.period,
-        "saturation_fraction": at_limit.any(axis=-2).mean(axis=-1),
-        "joint_acceleration_peak_rad_s2": _peak(acceleration, unknown),
-        "joint_acceleration_rms_rad_s2": _rms(_flat(acceleration)) if acceleration.size else unknown,
-        "joint_jerk_peak_rad_s3": _peak(jerk, unknown),
-        "joint_jerk_rms_rad_s3": _rms(_flat(jerk)) if jerk.size else unknown,
-        "command_switches": sign_switches(command, spec.joint_velocity_limit).astype(np.float64),
-        "feature_invalid_fraction": np.mean(_columns(~steps.feature_valid), axis=-1),
-        "jacobian_error_mean": _of_known(np.mean, jacobian_error),
-        "jacobian_condition_max": _of_known(np.max, condition),
-        "controller_time_median_us": np.full(lanes, np.median(steps.controller_time)),
-        "controller_time_p99_us": np.full(lanes, np.quantile(steps.controller_time, 0.99)),
-        "controller_time_overruns": np.full(lanes, _overruns(steps.controller_time, spec.period)),
-        "plant_time_median_us": np.full(lanes, np.median(steps.plant_time)),
-    }
+        return np.where(way > 0.0, path_length(run.feature) / way, np.nan)
+
+
+def _steady_state(run: Judged) -> FloatArray:
+    return np.asarray(run.error[..., -max(1, round(FINAL_SPAN / run.period)) :].mean(axis=-1))
+
+
+def _saturation(run: Judged) -> FloatArray:
+    at_limit = np.abs(run.command) >= run.steps.spec.joint_velocity_limit[:, None] * (1 - 1e-9)
+    return np.asarray(at_limit.any(axis=-2).mean(axis=-1))
+
+
+def _overruns(run: Judged) -> FloatArray:
+    """Return the number of steps of the controller that took longer than the period; NaN where times are unknown."""
+    times = run.steps.controller_time
+    return run.same(math.nan if np.isnan(times).any() else float(np.count_nonzero(times > 1e6 * run.period)))
 
 
 def _columns(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -183,13 +231,13 @@ def _flat(values: FloatArray) -> FloatArray:
     return values.reshape(*values.shape[:-2], -1)
 
 
-def _peak(values: FloatArray, unknown: FloatArray) -> FloatArray:
-    return np.asarray(np.abs(values).max(axis=(-2, -1))) if values.size else unknown
+def _peak(run: Judged, values: FloatArray) -> FloatArray:
+    return np.asarray(np.abs(values).max(axis=(-2, -1))) if values.size else run.same(np.nan)
 
 
-def _overruns(times: FloatArray, period: float) -> float:
-    """Return how many of the times (k,) [µs] are longer than the period [s]; NaN where they are not known."""
-    return math.nan if np.isnan(times).any() else float(np.count_nonzero(times > 1e6 * period))
+def _rms(run: Judged, values: FloatArray) -> FloatArray:
+    """Return the root mean square over the last axis; NaN where it is empty."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=-1))) if values.shape[-1] else run.same(np.nan)
 
 
 def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatArray:
@@ -200,5 +248,157 @@ def _of_known(summary: Callable[..., FloatArray], values: FloatArray) -> FloatAr
     return np.array([summary(row) if len(row) else np.nan for row in rows]).reshape(values.shape[:-1])
 
 
-def _rms(error: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.mean(error**2, axis=-1)))
+_ALL: Final = (
+    Metric(
+        "settling_time_s", "s", "settling time", 2,
+        "k·dt of the first row from which on e stays ≤ `settling_band` to the end; NaN if the last row is outside, or "
+        "the error came in less than 0.5 s before the end",
+        lambda run: settling_time(run.error, run.steps.spec.feature.band, run.period),
+        tables={"moves": "Time", "runs": "Time"}, figure="settling", summary=Summary("after", 2, "point_to_point"),
+    ),
+    Metric(
+        "settling_time_5pct_s", "s", "settling time, 5 % band", 2,
+        "the same with 5 % of e_0",
+        lambda run: settling_time(run.error, SETTLING_SHARE * run.error[..., 0], run.period),
+    ),
+    Metric(
+        "overshoot", "1", "overshoot", 1,
+        "how far the feature passes a fixed target: max over k of (y_k − y_0)·w / (w·w) − 1 with w = y_ref − y_0, at "
+        "least 0; NaN when the reference moves",
+        lambda run: overshoot(run.feature, run.reference[..., 0]) if run.fixed else run.same(np.nan),
+        percent=True, tables={"moves": "Time"}, summary=Summary("over", 0, "point_to_point"),
+    ),
+    Metric(
+        "steady_state_error", "", "last second", 2,
+        "mean of e over the last second",
+        _steady_state, tables={"moves": "Error", "runs": "Error"},
+    ),
+    Metric(
+        "rms_error", "", "RMS of the run", 2,
+        "root of the mean of e² over all rows",
+        lambda run: _rms(run, run.error),
+    ),
+    Metric(
+        "max_error", "", "largest error", 1,
+        "largest e",
+        lambda run: run.error.max(axis=-1),
+    ),
+    Metric(
+        "rms_error_second_lap", "", "RMS of the second lap", 2,
+        "the same as `rms_error` over the second lap, the first one after the entry; NaN where nothing is repeated",
+        lambda run: _rms(run, run.second_lap),
+        tables={"curves": "RMS error"}, summary=Summary("RMS lap 2", 1, "curve"),
+    ),
+    Metric(
+        "rms_error_evaluated", "", "RMS of the judged part", 2,
+        "root of the mean of e² over the judged part of the [task](plants.md#tasks); NaN if the run ended before it",
+        lambda run: _rms(run, run.evaluated),
+        tables={"curves": "RMS error", "runs": "Error"}, figure="settling", summary=Summary("RMS end", 1),
+    ),
+    Metric(
+        "path_length_ratio", "1", "path ratio", 3,
+        "length of the true path over the distance from the start to the target, or over the length of the reference's "
+        "path if that moves",
+        _path_length_ratio, tables={"moves": "Motion"},
+    ),
+    Metric(
+        "max_joint_position_rad", "rad", "largest joint position", 2,
+        "largest |q| of all joints and rows, as the encoders report it",
+        lambda run: np.abs(_columns(run.steps.joint_position)).max(axis=(-2, -1)),
+        better="", tables={"curves": "Motion"}, summary=Summary("joints", 2, "curve"),
+    ),
+    Metric(
+        "control_effort_rad", "rad", "control effort", 2,
+        "sum of |u| dt over joints and rows",
+        lambda run: _flat(np.abs(run.command)).sum(axis=-1) * run.period,
+        tables={"cost": "Joints", "runs": "Motion"}, figure="effort",
+    ),
+    Metric(
+        "saturation_fraction", "1", "saturated periods", 1,
+        "share of rows in which at least one joint is commanded at its speed limit",
+        _saturation, percent=True, tables={"cost": "Joints"}, figure="effort",
+    ),
+    Metric(
+        "joint_acceleration_peak_rad_s2", "rad/s²", "peak acceleration", 1,
+        "largest |a| of all joints and rows, a_k = (u_k − u_(k−1)) / dt of consecutive commands; the step from rest to "
+        "the first command does not count; NaN for a single row. A step of the command has a = Δu / dt, so compare "
+        "only runs of equal periods",
+        lambda run: _peak(run, run.acceleration),
+    ),
+    Metric(
+        "joint_acceleration_rms_rad_s2", "rad/s²", "RMS acceleration", 2,
+        "root of the mean of a² over joints and rows",
+        lambda run: _rms(run, _flat(run.acceleration)),
+        tables={"cost": "Joints"}, figure="smoothness",
+    ),
+    Metric(
+        "joint_jerk_peak_rad_s3", "rad/s³", "peak jerk", 0,
+        "largest |j|, j_k = (a_k − a_(k−1)) / dt; NaN for fewer than three rows",
+        lambda run: _peak(run, run.jerk),
+    ),
+    Metric(
+        "joint_jerk_rms_rad_s3", "rad/s³", "RMS jerk", 1,
+        "root of the mean of j² over joints and rows",
+        lambda run: _rms(run, _flat(run.jerk)),
+        tables={"cost": "Joints"}, figure="smoothness",
+    ),
+    Metric(
+        "command_switches", "1", "sign switches", 0,
+        "how often joints are driven to and fro: periods whose command is at least 10 % of the joint's speed limit and "
+        "whose last command of that size, one or two periods before, had the other sign; sum over joints",
+        lambda run: sign_switches(run.command, run.steps.spec.joint_velocity_limit).astype(np.float64),
+        tables={"moves": "Motion", "curves": "Motion"}, figure="smoothness", summary=Summary("switches", 0),
+    ),
+    Metric(
+        "feature_invalid_fraction", "1", "periods without a feature", 1,
+        "share of rows without a valid feature",
+        lambda run: np.mean(_columns(~run.steps.feature_valid), axis=-1), percent=True,
+    ),
+    Metric(
+        "jacobian_error_mean", "1", "mean Jacobian error", 1,
+        "mean of `jacobian_error` over the rows that have one",
+        lambda run: _of_known(np.mean, _columns(run.steps.jacobian_error())),
+        percent=True, tables={"cost": "Estimate"},
+    ),
+    Metric(
+        "jacobian_condition_max", "1", "largest condition number", 0,
+        "largest `jacobian_condition`",
+        lambda run: _of_known(np.max, _columns(run.steps.jacobian_condition())), better="",
+    ),
+    Metric(
+        "controller_time_median_us", "µs", "controller step, median", 0,
+        "median of `controller_time_us`; this and the next three are null where runs [advanced "
+        "together](experiments.md)",
+        lambda run: run.same(float(np.median(run.steps.controller_time))),
+        tables={"cost": "Step of the controller"}, summary=Summary("step", 0),
+    ),
+    Metric(
+        "controller_time_p99_us", "µs", "controller step, 99 %", 0,
+        "99th percentile of it",
+        lambda run: run.same(float(np.quantile(run.steps.controller_time, 0.99))),
+        tables={"cost": "Step of the controller"},
+    ),
+    Metric(
+        "controller_time_overruns", "1", "steps over the period", 0,
+        "rows whose `controller_time_us` is longer than the period",
+        _overruns, tables={"cost": "Step of the controller"},
+    ),
+    Metric(
+        "plant_time_median_us", "µs", "plant step, median", 0,
+        "median of `plant_time_us`",
+        lambda run: run.same(float(np.median(run.steps.plant_time))), better="",
+    ),
+    Metric(
+        "pose_error_mm", "mm", "pose error, last second", 1,
+        "mean distance of the target from its taught position over the last second; a column only of sensing set-ups "
+        "that are judged by the pose of a target",
+        tables={"moves": "Error"},
+    ),
+    Metric(
+        "pose_error_deg", "deg", "angle error, last second", 2,
+        "mean rotation of the target from its taught orientation over the last second; likewise",
+        tables={"moves": "Error"},
+    ),
+)  # fmt: skip
+METRICS: Final = {metric.column: metric for metric in _ALL}
+"""Every metric by the name of its column, in the order of the table of runs."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunSettings
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.tasks import TASKS, PointTask, Scenario, find_task
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray

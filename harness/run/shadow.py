@@ -16,7 +16,7 @@ from servobench.harness.run.contract import held_to_contract
 from servobench.harness.run.experiment import build
 from servobench.harness.run.log import JOINT_UNIT, StepLog, column_name
 from servobench.harness.run.loop import LoopSettings, careful, run_loop
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault

@@ -37,8 +37,7 @@ from servobench.harness.analysis.statistics import (
     signed_rank_p_value,
     success_rate,
 )
-from servobench.harness.batch.blocks import Cell
-from servobench.harness.batch.compare import Batch
+from servobench.harness.batch.plan import Batch, Cell
 from servobench.harness.config.registry import RENDERED
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.result import COMPLETED

@@ -18,16 +18,12 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from servobench.harness.analysis.comparison import settled_share, settling_times
+from servobench.harness.analysis.comparison import settled_share, settling_band, settling_times
 from servobench.harness.analysis.loops.loop_analysis import latency_border
-from servobench.harness.analysis.measures import settling_band
 from servobench.harness.analysis.statistics import Estimate, median_with_interval
 from servobench.harness.batch import results
-from servobench.harness.batch.blocks import Cell
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
-from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.grid import Grid
-from servobench.harness.batch.sweep import Place
+from servobench.harness.batch.plan import Batch, Cell, Grid, Place
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import RENDERED, find_controller, find_plant
 from servobench.harness.config.robots import DEFAULT_ROBOT
@@ -35,7 +31,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.pictures.measures import Curves, draw_curves, same_curves
 from servobench.harness.pictures.style import TEXT, WIDTH, Styles, add_legend, figure_style, method_styles, save_figure
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import check_settings
+from servobench.harness.run.resolution import check_settings
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.settings import suggest
 from servobench.plant.kinematic import KinematicConfig

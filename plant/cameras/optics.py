@@ -20,6 +20,7 @@ from servobench.plant.contract.lanes import norm, outer
 from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
+CAMERA: Final = PinholeCamera()  # as planned, of every set-up in pixels
 NEAR: Final = 0.02  # [m] least depth: a point behind it is not seen, and its features are those of this depth
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 

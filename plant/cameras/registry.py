@@ -6,14 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Self
 
-from servobench.plant.cameras.draws import ON_HAND, OPTICAL, CameraDraws, draw_cameras
 from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.model import Mount
-from servobench.plant.cameras.pixel import PIXEL
-from servobench.plant.cameras.placing import nominal_model, true_model
-from servobench.plant.cameras.plate import PLATE
-from servobench.plant.cameras.position import POSITION
-from servobench.plant.cameras.stereo import STEREO
+from servobench.plant.cameras.placement import ON_HAND, OPTICAL, CameraDraws, draw_cameras, nominal_model, true_model
+from servobench.plant.cameras.setups import PIXEL, PLATE, POSITION, STEREO
 from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample

@@ -1,7 +1,7 @@
-"""One interface to an instance of an FMU for FMI 2 and FMI 3; one of model exchange only is integrated.
+"""One interface to an instance of an FMU for FMI 2 and FMI 3, with its ports and saved states.
 
-The libraries are called by ctypes with argument objects that are made once: a call then costs a third of a microsecond,
-whereas converting lists at every call costs several.
+A model-exchange FMU is integrated. The libraries are called by ctypes with argument objects that are made once: a call
+then costs a third of a microsecond, whereas converting lists at every call costs several.
 """
 
 from __future__ import annotations
@@ -10,28 +10,137 @@ import contextlib
 import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias, final
 
 import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FmuError
-from servobench.plant.fmu.asked import NOTHING, Asked
-from servobench.plant.fmu.description import FmuDescription, Variable
-from servobench.plant.fmu.exchange import Integrator
-from servobench.plant.fmu.library import condemn, is_condemned, load_library, unload_library
-from servobench.plant.fmu.messages import MessageLog
-from servobench.plant.fmu.port import Port
-from servobench.plant.fmu.states import States
+from servobench.plant.fmu.description import FmuDescription, Variable, total_size
+from servobench.plant.fmu.integrator import Integrator
+from servobench.plant.fmu.library import (
+    NO_OPTIONS,
+    InstanceOptions,
+    MessageLog,
+    condemn,
+    is_condemned,
+    load_library,
+    unload_library,
+)
 
 Call: TypeAlias = Callable[[], None]
 Kinds: TypeAlias = Mapping[str, tuple[str, Any]]  # of numbers: the word in the names of functions, the type in memory
 RawCall: TypeAlias = Callable[[], int]  # returns the status, which the caller has to check
 OK, WARNING, DISCARD, FATAL = 0, 1, 2, 4
 MIN_PROGRESS = 1e-9  # share of a step that a partial step must cover
+
+
+class Port:
+    """Variables that are read or written together, with their buffer; instances side by side have a row each.
+
+    Attributes:
+        values: (..., size), the buffer.
+        members: the variables themselves.
+        variables: value references and their number, for C.
+    """
+
+    def __init__(self, variables: Sequence[Variable], lead: tuple[int, ...] = ()) -> None:
+        """Prepare the buffer, whose leading axis is `lead`."""
+        self.members = tuple(variables)
+        self.values: FloatArray = np.zeros((*lead, total_size(variables)))
+        self._address = self.values.ctypes.data
+        count = len(variables)
+        references = (ctypes.c_uint32 * count)(*(variable.reference for variable in variables))
+        self.variables = references, ctypes.c_size_t(count)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each number of a row, for messages."""
+        return tuple(label for variable in self.members for label in variable.labels())
+
+    @property
+    def summary(self) -> str:
+        """A few names, for messages."""
+        return ", ".join(self.labels[:3]) + (", …" if len(self.labels) > 3 else "")
+
+    def pointer(self, row: int = 0) -> ctypes.c_void_p:
+        """Return a row of the buffer, for C."""
+        return ctypes.c_void_p(self._address + row * self.values.shape[-1] * self.values.itemsize)
+
+
+@dataclass(frozen=True, eq=False)
+class FmuState:
+    """A saved state of an FMU's world.
+
+    Attributes:
+        fmu: of each instance: bytes for any process with the same FMU, or, if it cannot serialise, a handle of the
+            world that saved it.
+        period: number of periods since the start.
+        integrated: (..., n), rad, joint positions of an FMU that has none itself.
+    """
+
+    fmu: tuple[bytes | ctypes.c_void_p, ...]
+    period: int
+    integrated: FloatArray
+
+
+class Stateful(Protocol):
+    """The part of an instance that is used here."""
+
+    state: ClassVar[str]
+    deserialise: ClassVar[str]
+
+    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
+        """Call a function of the library and check its status; raises FmuError."""
+
+
+@final
+class States:
+    """The states of one instance."""
+
+    def __init__(self, instance: Stateful) -> None:
+        """Take the instance."""
+        self._instance, self._word = instance, instance.state
+
+    def save(self) -> ctypes.c_void_p:
+        """Return the present state; it has to be given to `free`."""
+        state = ctypes.c_void_p()
+        self._instance.call(f"Get{self._word}", ctypes.byref(state))
+        return state
+
+    def restore(self, state: ctypes.c_void_p) -> None:
+        """Return to a saved state."""
+        self._instance.call(f"Set{self._word}", state)
+
+    def free(self, state: ctypes.c_void_p) -> None:
+        """Free a saved state."""
+        self._instance.call(f"Free{self._word}", ctypes.byref(state))
+
+    def save_bytes(self) -> bytes:
+        """Return the present state as bytes that another process understands."""
+        state = self.save()
+        try:
+            size = ctypes.c_size_t()
+            self._instance.call(f"Serialized{self._word}Size", state, ctypes.byref(size))
+            content = (ctypes.c_char * size.value)()
+            self._instance.call(f"Serialize{self._word}", state, content, size)
+            return bytes(content)
+        finally:
+            self.free(state)
+
+    def restore_bytes(self, content: bytes) -> None:
+        """Return to a state from `save_bytes`."""
+        state = ctypes.c_void_p()
+        place = ctypes.c_size_t(len(content)), ctypes.byref(state)
+        self._instance.call(f"{self._instance.deserialise}{self._word}", content, *place)
+        try:
+            self.restore(state)
+        finally:
+            self.free(state)
 
 
 class Instance(ABC):
@@ -60,7 +169,7 @@ class Instance(ABC):
         description: FmuDescription,
         root: Path,
         library: Any = None,  # noqa: ANN401 - ctypes
-        asked: Asked = NOTHING,
+        asked: InstanceOptions = NO_OPTIONS,
     ) -> None:
         """Make an instance.
 

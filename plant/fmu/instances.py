@@ -1,25 +1,31 @@
-"""The instances of one FMU for runs side by side, which share its library: opened, called, dropped and closed together.
+"""The instances of one FMU for runs side by side, by FMI 2.0 or FMI 3.0: opened, called, dropped and closed together.
 
-A single run has one instance. The inner loop calls one function of all instances and then the next; a call returns a
-status, which is 0 unless there is something to settle. An instance that fails is not called again.
+The instances share the library. A single run has one instance. The inner loop calls one function of all instances and
+then the next; a call returns a status, which is 0 unless there is something to settle. An instance that fails is not
+called again.
 """
 
 from __future__ import annotations
 
 import ctypes
+import math
+import os
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+import numpy as np
 
 from servobench.plant.contract.faults import FmuError
-from servobench.plant.fmu.asked import NOTHING, Asked
 from servobench.plant.fmu.description import FmuDescription
-from servobench.plant.fmu.instance import OK, Instance, RawCall
-from servobench.plant.fmu.instance2 import Instance2
-from servobench.plant.fmu.instance3 import Instance3
-from servobench.plant.fmu.library import load_library, unload_library
-from servobench.plant.fmu.port import Port
+from servobench.plant.fmu.instance import DISCARD, OK, WARNING, Instance, Kinds, Port, RawCall
+from servobench.plant.fmu.library import NO_OPTIONS, InstanceOptions, MessageLog, load_library, unload_library
+
+MODEL_EXCHANGE, CO_SIMULATION = 0, 1
+LAST_SUCCESSFUL_TIME = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +84,11 @@ class Instances:
     """
 
     def __init__(
-        self, description: FmuDescription, root: Path, fail: Callable[[int, FmuError], None], asked: Asked = NOTHING
+        self,
+        description: FmuDescription,
+        root: Path,
+        fail: Callable[[int, FmuError], None],
+        asked: InstanceOptions = NO_OPTIONS,
     ) -> None:
         """Load the library; `open` makes the instances.
 
@@ -165,7 +175,7 @@ def open_instance(
     description: FmuDescription,
     root: Path,
     library: Any = None,  # noqa: ANN401 - ctypes
-    asked: Asked = NOTHING,
+    asked: InstanceOptions = NO_OPTIONS,
 ) -> Instance:
     """Return an instance of the FMU that is extracted to `root`, which the caller closes; see `Instance`."""
     kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
@@ -174,3 +184,198 @@ def open_instance(
 
 def _nothing() -> int:
     return OK
+
+
+_Logger = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
+_Allocate = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
+_Free = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+
+
+class _EventInfo(ctypes.Structure):
+    _fields_ = (
+        ("again", ctypes.c_int),
+        ("ends", ctypes.c_int),
+        ("nominals_changed", ctypes.c_int),
+        ("states_changed", ctypes.c_int),
+        ("has_next", ctypes.c_int),
+        ("next_time", ctypes.c_double),
+    )
+
+
+class _Callbacks(ctypes.Structure):
+    _fields_ = (
+        ("logger", _Logger),
+        ("allocate", _Allocate),
+        ("free", _Free),
+        ("step_finished", ctypes.c_void_p),
+        ("environment", ctypes.c_void_p),
+    )
+
+
+_logs: weakref.WeakValueDictionary[int, MessageLog] = weakref.WeakValueDictionary()
+
+
+def _log_message(environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes) -> None:
+    """Pass a message to the log of the instance that it came from; the environment says which."""
+    log = _logs.get(environment or 0) or MessageLog("fmu")
+    log.add(status, (message or b"").decode("utf-8", errors="replace"))
+
+
+_on_message = _Logger(_log_message)
+
+
+class Instance2(Instance):
+    """One instance of an FMI 2.0 FMU."""
+
+    prefix, real, state, deserialise, early = "fmi2", "Real", "FMUstate", "DeSerialize", "discard"
+    derivatives = "GetDerivatives"
+    kinds: ClassVar[Kinds] = {
+        "Real": ("Real", np.float64),
+        "Integer": ("Integer", np.int32),
+        "Enumeration": ("Integer", np.int32),
+        "Boolean": ("Boolean", np.int32),
+    }
+
+    def _instantiate(self) -> int | None:
+        self._callbacks = _callbacks(self.log)
+        create = self.function("Instantiate")
+        create.restype = ctypes.c_void_p
+        address: int | None = create(
+            self.description.model_name.encode(),
+            ctypes.c_int(MODEL_EXCHANGE if self.description.exchange else CO_SIMULATION),
+            self.description.token.encode(),
+            (self.root / "resources").as_uri().encode(),
+            ctypes.byref(self._callbacks),
+            ctypes.c_int(0),
+            ctypes.c_int(self.asked.debug_log is not None),
+        )
+        return address
+
+    def _initialise(self, time: float) -> None:
+        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.asked.tolerance
+        wanted = ctypes.c_int(tolerance is not None), ctypes.c_double(tolerance or 0.0)
+        self.call("SetupExperiment", *wanted, ctypes.c_double(time), no, nothing)
+        self.call("EnterInitializationMode")
+        self.call("ExitInitializationMode")
+
+    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """See `Instance.step_call`."""
+        if self.description.exchange:
+            return self._integrated(now, step)
+        return partial(self.function("DoStep"), self._component, now, step, ctypes.c_int(1))
+
+    def update_discrete_states(self) -> tuple[bool, bool, float]:
+        """See `Instance.update_discrete_states`."""
+        info = _EventInfo()
+        self.call("NewDiscreteStates", ctypes.byref(info))
+        return bool(info.again), bool(info.ends), info.next_time if info.has_next else math.inf
+
+    def _reached(self, status: int, time: float) -> float | None:
+        if status != DISCARD:
+            self.check("fmi2DoStep", status)
+            return None
+        reached = ctypes.c_double()
+        asked = ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
+        if self.function("GetRealStatus")(self._component, *asked) != OK:
+            raise self.log.failure("fmi2DoStep", "discard and not how far it came")
+        return reached.value
+
+    def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
+        return (pointer,)
+
+
+def _callbacks(log: MessageLog) -> _Callbacks:
+    """Return the callbacks of an instance; fmpy's proxy formats messages with printf arguments, which ctypes cannot."""
+    import fmpy  # noqa: PLC0415 - see parse_description
+
+    callbacks = _Callbacks(
+        logger=_on_message,
+        allocate=ctypes.cast(fmpy.calloc, _Allocate),
+        free=ctypes.cast(fmpy.free, _Free),
+        environment=id(log),
+    )
+    _logs[id(log)] = log
+    try:
+        from fmpy.logging import addLoggerProxy  # noqa: PLC0415 - a library that not every platform has
+    except OSError:
+        return callbacks
+    addLoggerProxy(ctypes.byref(callbacks))
+    return callbacks
+
+
+LogMessage = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
+
+
+class Instance3(Instance):
+    """One instance of an FMI 3.0 FMU; without event mode, so that events are handled inside its steps."""
+
+    prefix, real, state, deserialise, early = "fmi3", "Float64", "FMUState", "Deserialize", "early"
+    derivatives = "GetContinuousStateDerivatives"
+    kinds: ClassVar[Kinds] = {
+        "Float64": ("Float64", np.float64),
+        "Float32": ("Float32", np.float32),
+        **{
+            f"{sign}Int{bits}": (f"{sign}Int{bits}", f"{sign}int{bits}".lower())
+            for sign in ("", "U")
+            for bits in (8, 16, 32, 64)
+        },
+        "Enumeration": ("Int64", np.int64),
+        "Boolean": ("Boolean", np.bool_),
+    }
+
+    def _instantiate(self) -> int | None:
+        log = self.log
+        self._end, self._early, self._last_time = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_double()
+
+        def on_message(_environment: int | None, status: int, _category: bytes, message: bytes) -> None:
+            log.add(status, (message or b"").decode("utf-8", errors="replace"))
+
+        self._on_message = LogMessage(on_message)
+        exchange = self.description.exchange
+        create = self.function("InstantiateModelExchange" if exchange else "InstantiateCoSimulation")
+        create.restype = ctypes.c_void_p
+        no, null = ctypes.c_bool(False), ctypes.c_void_p()
+        names = self.description.model_name, self.description.token, str(self.root / "resources") + os.sep
+        common = [*(name.encode() for name in names), no, ctypes.c_bool(self.asked.debug_log is not None)]
+        early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
+        end = [null, self._on_message]
+        address: int | None = create(*common, *end) if exchange else create(*common, *early_return, *end, null)
+        return address
+
+    def _initialise(self, time: float) -> None:
+        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.asked.tolerance
+        wanted = ctypes.c_bool(tolerance is not None), ctypes.c_double(tolerance or 0.0)
+        self.call("EnterInitializationMode", *wanted, ctypes.c_double(time), no, nothing)
+        self.call("ExitInitializationMode")
+
+    def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
+        """See `Instance.step_call`."""
+        if self.description.exchange:
+            return self._integrated(now, step)
+        end, early = self._end, self._early
+        results = [ctypes.byref(result) for result in (ctypes.c_bool(), end, early, self._last_time)]
+        call = partial(self.function("DoStep"), self._component, now, step, ctypes.c_bool(True), *results)
+        return lambda: call() or (WARNING if end.value or early.value else OK)
+
+    def update_discrete_states(self) -> tuple[bool, bool, float]:
+        """See `Instance.update_discrete_states`."""
+        again, ends, nominals, states, has_next = (ctypes.c_bool() for _ in range(5))
+        following = ctypes.c_double()
+        results = [ctypes.byref(each) for each in (again, ends, nominals, states, has_next, following)]
+        self.call("UpdateDiscreteStates", *results)
+        return again.value, ends.value, following.value if has_next.value else math.inf
+
+    def _reached(self, status: int, time: float) -> float | None:
+        self.check("fmi3DoStep", status)
+        if self._end.value:
+            raise FmuError(f"{self.description.path.name}: fmi3DoStep asked to end the simulation at {time:.6g} s")
+        return self._last_time.value if self._early.value else None
+
+    def _buffer(self, pointer: ctypes.c_void_p, size: int) -> tuple[Any, ...]:
+        return pointer, ctypes.c_size_t(size)
+
+    def configure(self, port: Port) -> None:
+        """See `Instance.configure`."""
+        self.call("EnterConfigurationMode")
+        self.writer(port)()
+        self.call("ExitConfigurationMode")

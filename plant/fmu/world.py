@@ -1,41 +1,63 @@
-"""Any FMI 2 or FMI 3 co-simulation FMU as a world.
+"""Any FMI 2 or FMI 3 FMU as a plant; delay, noise, latency and lost frames are those of the bench.
 
 An `FmuMapping` says which variables are commands, joints and features; names are looked up once, at construction. The
-FMU is stepped with its own period, which divides that of the world; commands are held meanwhile.
+FMU is stepped with its own period, which divides that of the world; commands are held meanwhile. Parameters of any type
+are set before every run.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from math import prod
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench.plant import TrueModel, World
+from servobench.plant.bench.bench import Bench, build_bench
+from servobench.plant.bench.plant import PlantEntry, PlantSetup, TrueModel, World
 from servobench.plant.contract.checks import FloatArray, as_array, is_finite, whole_steps
 from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.seeds import Seeds
-from servobench.plant.contract.settings import Names
+from servobench.plant.contract.sensing import SensingConfig
+from servobench.plant.contract.settings import Names, NonNegative, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.asked import Asked
-from servobench.plant.fmu.description import Variable, read_description
-from servobench.plant.fmu.instance import Instance
+from servobench.plant.fmu.description import REAL_TYPES, FmuDescription, Variable, read_description, total_size
+from servobench.plant.fmu.instance import FmuState, Instance, Port
 from servobench.plant.fmu.instances import Instances, Lane
-from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, unusual_step
-from servobench.plant.fmu.messages import logger
+from servobench.plant.fmu.library import InstanceOptions, logger
+from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import mapped_model
-from servobench.plant.fmu.parameters import STRUCTURAL, setter, structural_sizes
-from servobench.plant.fmu.port import Port
-from servobench.plant.fmu.states import FmuState
 from servobench.plant.robot.arm import rpy_from_rotation
 from servobench.plant.robot.hand_eye import SensedArm
 
 SEEN_ABOVE = 0.5  # a number that says whether a feature is seen
+STRUCTURAL: Final = "structuralParameter"
+BITS: Final = {
+    "Integer": 32,
+    "Enumeration": 32,
+    **{f"{sign}Int{bits}": bits for sign in ("", "U") for bits in (8, 16, 32, 64)},
+}
+EXACT: Final = 2**53  # up to which a float64 holds every whole number
+
+
+Setter = Callable[[Instance, int], None]
+
+
+@settings
+class FmuConfig:
+    """Settings of an FMU plant; the same as those of the kinematic plant where both have them."""
+
+    command_delay: NonNegative = 0.05
+    """[s] between a command and its first effect; a multiple of the control period, or whole milliseconds."""
+    sensing: SensingConfig = nested(SensingConfig)
+    """Noise, latency, frame period and lost frames."""
+    isolate: bool = True
+    """Carry its runs out in a process of their own, with limits; false for an FMU that you trust like servobench."""
 
 
 class FmuWorld(World):
@@ -83,7 +105,7 @@ class FmuWorld(World):
         self.lead = np.shape(start)[:-1]
         self._start = as_array("start", start, (*self.lead, self.spec.n))
         self._rows: Any = np.arange(*self.lead) if self.lead else ()
-        asked = Asked(mapping.tolerance, mapping.debug_log)
+        asked = InstanceOptions(mapping.tolerance, mapping.debug_log)
         self._instances = Instances(self.description, root, self.fail, asked)
         try:
             self._connect(mapping)
@@ -293,3 +315,115 @@ class FmuWorld(World):
     def close(self) -> None:
         """Free all instances and unload the library."""
         self._instances.close()
+
+
+def structural_sizes(description: FmuDescription, values: Mapping[str, npt.NDArray[Any]]) -> dict[str, int]:
+    """Return the values that a mapping gives to structural parameters.
+
+    Raises:
+        ValueError: a value that is no size.
+    """
+    sizes: dict[str, int] = {}
+    for name, value in values.items():
+        variables = description.find(name, "parameters", None)
+        if variables[0].causality == STRUCTURAL:
+            check_value(variables, name, value)
+            sizes |= {variable.name: int(np.ravel(value)[0]) for variable in variables}
+    return sizes
+
+
+def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -> None:
+    """Check that a value fits the type of the parameter that a mapping names.
+
+    Raises:
+        ValueError: it does not; says what was wanted.
+    """
+    kind, given = variables[0].type, np.asarray(value)
+    if len({variable.type for variable in variables}) > 1:
+        raise ValueError(f"parameter {name!r} stands for variables of several types; name each by itself")
+    came = given.tolist()
+    if kind == "String":
+        fits, wanted = given.dtype.kind == "U", "text"
+    elif kind == "Boolean":
+        fits, wanted = given.dtype.kind == "b", "true or false"
+    elif kind in BITS:
+        signed = not kind.startswith("U")
+        low, high = (-(2 ** (BITS[kind] - 1)), 2 ** (BITS[kind] - 1) - 1) if signed else (0, 2 ** BITS[kind] - 1)
+        low, high = max(low, -EXACT), min(high, EXACT)
+        fits = given.dtype.kind == "f" and bool(((given == np.round(given)) & (given >= low) & (given <= high)).all())
+        wanted = f"a whole number from {low} to {high}"
+    elif kind in REAL_TYPES:
+        fits, wanted = given.dtype.kind == "f", "a number"
+    else:
+        raise ValueError(f"parameter {name!r} is of type {kind}, which a mapping cannot set")
+    if not fits:
+        raise ValueError(f"parameter {name!r} is of type {kind}: wanted {wanted}, got {came!r}")
+
+
+def setter(variables: list[Variable], name: str, value: npt.NDArray[Any], lead: tuple[int, ...]) -> Setter:
+    """Return a function that gives a parameter its value in an instance, by the row of its run.
+
+    Args:
+        variables: that the name stands for.
+        name: for messages.
+        value: one for all of its values, or each, also for each of the runs side by side.
+        lead: leading axes of the runs.
+
+    Raises:
+        ValueError: a value of the wrong type or size.
+    """
+    check_value(variables, name, value)
+    size, given = total_size(variables), np.asarray(value)
+    if given.shape not in ((), (size,), (*lead, size)):
+        raise ValueError(f"parameter {name!r} must have {size} values, got {given.size}")
+    if variables[0].type == "String":
+        texts = [str(text) for text in np.broadcast_to(given, (size,)).tolist()]
+        return lambda instance, _row: instance.set_texts(variables, texts)
+    port = Port(variables, lead)
+    port.values[...] = given
+    if variables[0].causality == STRUCTURAL:
+        return lambda instance, _row: instance.configure(port)
+    return lambda instance, row: instance.writer(port, row)()
+
+
+def build_fmu(
+    mapping: FmuMapping,
+    setup: PlantSetup,
+    command_delay: float,
+    sensing: SensingConfig,
+    lag: float | None = None,
+    model: SensedArm | None = None,
+) -> Bench:
+    """Return the plant of an FMU, for a registry.
+
+    Args:
+        mapping: the roles of its variables.
+        setup: start and control period.
+        command_delay: between a command and its first effect, s.
+        sensing: noise, latency, frame period and lost frames.
+        lag: time constant of the FMU's joints, s; None where it is unknown.
+        model: what the FMU is known to be, for names, unit and natural size of its features.
+
+    Raises:
+        ValueError: an FMU or mapping that cannot be used; also if the FMU itself says so.
+    """
+    try:
+        start = mapping.start if setup.start is None else setup.start
+        return build_bench(lambda own: FmuWorld(mapping, start, own.period, lag, model), setup, command_delay, sensing)
+    except FmuError as error:
+        raise ValueError(str(error)) from error
+
+
+def mapped_entry(path: Path) -> PlantEntry:
+    """Return the registry's entry of the plant `fmu:PATH`, the FMU that the mapping at `path` describes.
+
+    Raises:
+        ValueError: the mapping cannot be used.
+    """
+    mapping = read_mapping(path)
+
+    def build(config: FmuConfig, setup: PlantSetup) -> Bench:
+        return build_fmu(mapping, setup, config.command_delay, config.sensing)
+
+    summary = f"the FMU {mapping.file.name}, as mapped by {path.name}"
+    return PlantEntry(f"fmu:{path}", summary, FmuConfig, build, own_robot=True)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -46,6 +46,7 @@ MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
 RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
+MARGIN = COLOUR_MARGIN + 2  # [px] and two for what rounding and the sampling point of a pixel make of an edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,3 +284,56 @@ def draw_detection(rgb: ByteArray, detection: Detection | None, camera: PinholeC
         ends = ((centre[0] - dx, centre[1] - dy), (centre[0] + dx, centre[1] + dy))
         cv2.line(picture, *ends, OUTLINE, thickness, cv2.LINE_AA, shift)
     return picture
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+class Window(NamedTuple):
+    """Rows and columns of an image, counted from the upper left corner, both ends of which are whole pixels.
+
+    Attributes:
+        top: first row.
+        left: first column.
+        bottom: row after the last one.
+        right: column after the last one.
+    """
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+
+    def cut(self, image: npt.NDArray[Scalar]) -> npt.NDArray[Scalar]:
+        """Return the part of an image (h, w, ...) in this window, without a copy."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+
+def whole(camera: PinholeCamera) -> Window:
+    """Return the window of all pixels."""
+    return Window(0, 0, camera.height, camera.width)
+
+
+def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
+    """Return the window outside of which no pixel shows a ball, with a margin for noise; None where none does.
+
+    Args:
+        centre: (3,) [m], of the ball in the camera frame.
+        radius: [m].
+        camera: its intrinsics.
+    """
+    x, y, z = centre.tolist()
+    if z <= radius + camera.near:
+        return None if z < -radius else whole(camera)
+    depth2 = z * z - radius * radius
+    ends = [
+        [(at * z + side * radius * math.sqrt(at * at + depth2)) / depth2 for at in (x, y)] + [1.0] for side in (-1, 1)
+    ]
+    (left, top), (right, bottom) = camera.project(ends).tolist()
+    window = Window(
+        max(0, math.floor(top) - MARGIN),
+        max(0, math.floor(left) - MARGIN),
+        min(camera.height, math.ceil(bottom) + 1 + MARGIN),
+        min(camera.width, math.ceil(right) + 1 + MARGIN),
+    )
+    return window if window.top < window.bottom and window.left < window.right else None

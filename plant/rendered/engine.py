@@ -17,10 +17,9 @@ from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
 
 if TYPE_CHECKING:
-    from servobench.plant.rendered.detection import ByteArray
+    from servobench.plant.rendered.detection import ByteArray, Window
     from servobench.plant.rendered.drives import DriveConfig
     from servobench.plant.rendered.room import Room
-    from servobench.plant.rendered.window import Window
 
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 

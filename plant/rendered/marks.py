@@ -24,9 +24,10 @@ import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.detection import RED_RANGE, ByteArray, HueRange, Patch, largest_patch
-from servobench.plant.rendered.urdf import RED
-from servobench.plant.rendered.urdf_elements import Colour
 from servobench.plant.robot.camera import IntArray, PinholeCamera
+
+Colour = tuple[float, float, float, float]  # red, green, blue and opacity, each up to 1
+RED: Final[Colour] = (0.90, 0.06, 0.05, 1.0)  # of the ball
 
 
 class MarkColour(NamedTuple):

@@ -1,16 +1,85 @@
-"""What there is to see in the world of a rendered plant, and the files from which an engine loads it."""
+"""The bodies in the world of a rendered plant: arm, table, floor, boxes, and target and cameras of a sensing set-up.
+
+A target of one point is the red ball, one of three or four points a plate with a disc for each of them. The plate is a
+cross of thin rods with a white pad behind each disc, so that it hides nothing and a disc stands out in every posture.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, replace
+from typing import Final, Self
+from xml.etree import ElementTree as ET
 
-from servobench.plant.rendered.meshes import BALL_MESH, sphere_obj
-from servobench.plant.rendered.rig import Rig, arm_files
-from servobench.plant.rendered.urdf import Box, bench_files, boxes_urdf
+import numpy as np
+
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.marks import MARK_COLOURS, RED
+from servobench.plant.rendered.urdf import (
+    BALL_LINK,
+    BALL_MESH,
+    BASE_PART,
+    DARK_GREY,
+    Box,
+    add_joint,
+    add_link,
+    arm_tree,
+    arm_urdf,
+    bench_files,
+    boxes_urdf,
+    draw_cylinder,
+    draw_mesh,
+    sphere_obj,
+    text,
+)
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
+
+WHITE: Final = (0.97, 0.97, 0.97, 1.0)
+DISC_RADIUS: Final = 0.02  # [m] for a UR5
+PAD_RADIUS: Final = 0.035  # [m] of the white pad behind a disc, for a UR5
+LAYER: Final = 0.001  # [m] thickness of discs and pads, for a UR5
+ROD_RADIUS: Final = 0.004  # [m] for a UR5
+HOUSING: Final = (0.02, 0.06)  # [m] radius and length of a camera on the hand, for a UR5; too near to see itself
+EYE: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
+TARGET: Final = (0.40, 0.0, 0.26)  # [m] what it looks at
+CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Where target and cameras of a set-up are.
+
+    Attributes:
+        target: (p, 3) [m], in the flange frame, or with cameras on the hand in the base frame.
+        hand: (c, 4, 4), poses of the cameras in the flange frame; None where they are beside the arm and not drawn.
+        scale: of all lengths, over those of a UR5's bench.
+        ball_radius: [m].
+    """
+
+    target: FloatArray
+    hand: FloatArray | None
+    scale: float
+    ball_radius: float
+
+    @classmethod
+    def of(cls, model: EyeModel, robot: Robot) -> Rig | None:
+        """Return the rig of a set-up; None where it is the ball on the flange, which every arm carries.
+
+        Raises:
+            ValueError: a target that cannot be drawn.
+        """
+        on_hand = model.mount == "hand"
+        count = len(model.target)
+        if count == 1 and not on_hand:
+            return None
+        if count > len(MARK_COLOURS) or (count > 1 and not np.any(_normal(model.target))):
+            raise ValueError(
+                f"sensing {model.eye.name} has a target of {count} points, and what can be drawn is a ball, of one "
+                "point, or a plate with three or four discs that are not in line"
+            )
+        return cls(model.target, model.cameras if on_hand else None, robot.workspace.scale, robot.workspace.ball_radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,15 +89,15 @@ class Room:
     Attributes:
         arm: the true kinematics.
         scenery: whether the table and the floor are there.
-        boxes: what else is in the room.
         robot: by its maker's description, for the looks.
-        rig: what a sensing set-up has in place of the ball on the flange; None for the ball.
+        boxes: obstacles.
+        rig: target and cameras of a sensing set-up; None for the ball on the flange.
     """
 
     arm: SerialArm
     scenery: bool
+    robot: Robot
     boxes: tuple[Box, ...] = ()
-    robot: Robot = field(default_factory=partial(find_robot, UR5))
     rig: Rig | None = None
 
     def files(self) -> dict[str, str]:
@@ -43,3 +112,92 @@ class Room:
         if self.boxes:
             files["boxes.urdf"] = boxes_urdf(self.boxes)
         return files
+
+
+def arm_files(arm: SerialArm, robot: Robot, rig: Rig | None) -> dict[str, str]:
+    """Return the files, text by name, of an arm with what is on it, `arm.urdf`, and of a target in the world, if any.
+
+    Args:
+        arm: the kinematics, mismatch included.
+        robot: by its maker's description.
+        rig: of the set-up; None for the ball on the flange.
+    """
+    if rig is None:
+        return {"arm.urdf": arm_urdf(arm, robot)}
+    tree = arm_tree(arm, robot)
+    (carried,) = (link for link in tree.iter("link") if link.get("name") == BALL_LINK)
+    for visual in carried.findall("visual"):
+        carried.remove(visual)
+    if rig.hand is None:
+        _draw_target(carried, rig, rig.target - arm.tool)
+        return {"arm.urdf": text(tree)}
+    radius, length = rig.scale * np.array(HOUSING)
+    for pose in rig.hand:
+        lens = pose[:3, 3] - arm.tool
+        draw_cylinder(carried, DARK_GREY, lens - length * pose[:3, 2], lens, radius)
+    body = ET.Element("robot", name="target")
+    middle = rig.target.mean(axis=0)
+    add_link(body, "world", *BASE_PART)
+    _draw_target(add_link(body, "target", *BASE_PART), rig, rig.target - middle)
+    add_joint(body, "place", ("world", "target"), np.stack([middle, np.zeros(3)]), turns=False)
+    return {"arm.urdf": text(tree), "target.urdf": text(body)}
+
+
+def _draw_target(link: ET.Element, rig: Rig, points: FloatArray) -> None:
+    """Draw ball or plate at points (p, 3) [m] of a link's frame."""
+    if len(points) == 1:
+        draw_mesh(link, RED, BALL_MESH, rig.ball_radius)
+        return
+    scale = rig.scale
+    back, middle = LAYER * scale * _normal(points), points.mean(axis=0)
+    for point, colour in zip(points, MARK_COLOURS, strict=False):
+        draw_cylinder(link, colour.paint, point, point + back, DISC_RADIUS * scale)
+        draw_cylinder(link, WHITE, point + back, point + 2.0 * back, PAD_RADIUS * scale)
+        draw_cylinder(link, DARK_GREY, middle + 6.0 * back, point + 6.0 * back, ROD_RADIUS * scale)
+
+
+def _normal(points: FloatArray) -> FloatArray:
+    """Return the unit normal of a plate, (3,), away from whoever sees its discs; zeros where there is none."""
+    normal = np.cross(points[1] - points[0], points[2] - points[0]) if len(points) > 2 else np.zeros(3)
+    length = np.linalg.norm(normal)
+    return np.asarray(normal / length if length > 1e-9 else np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """A camera that sees the whole arm.
+
+    Attributes:
+        camera: its optics.
+        X_BC: (4, 4), its pose in the base frame.
+    """
+
+    camera: PinholeCamera
+    X_BC: FloatArray
+
+    @classmethod
+    def of(cls, scale: float, fineness: float = 1.0) -> Self:
+        """Return the view of an arm.
+
+        Args:
+            scale: of its workspace, over that of a UR5.
+            fineness: pixels for one pixel of `CAMERA`, along each side; above 1 edges become smooth once scaled down.
+        """
+        size = {"width": round(fineness * CAMERA.width), "height": round(fineness * CAMERA.height)}
+        return cls(replace(CAMERA, **size), _look_at(scale * np.array(EYE), scale * np.array(TARGET)))
+
+    def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return where points (k, 3) m of the base frame appear, (k, 2) px, and their depths, (k,) m."""
+        p_C = (points - self.X_BC[:3, 3]) @ self.X_BC[:3, :3]
+        return self.camera.project(p_C), p_C[:, 2]
+
+
+def _look_at(eye: FloatArray, target: FloatArray) -> FloatArray:
+    """Return X_BC, (4, 4), of a camera at `eye` that looks at `target`, both (3,) m, with the horizon level."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
+    pose[:3, 3] = eye
+    return pose

@@ -13,8 +13,8 @@ from servobench.plant.contract.settings import Count, NonNegative, Number, Posit
 from servobench.plant.rendered.drives import DriveConfig, drives_for
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.camera import DepthNoise, FieldOfView, PinholeCamera
-from servobench.plant.robot.catalogue import UR5
 from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import UR5
 
 BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
 

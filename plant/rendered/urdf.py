@@ -1,40 +1,31 @@
-"""URDF of an arm with a ball on its flange, and of the table and floor on which it stands.
+"""URDF of an arm with a ball on its flange, and of the table and floor on which it stands, with their meshes.
 
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
-fixed transform. A mismatched arm therefore turns into a mismatched simulation.
+fixed transform. A mismatched arm therefore turns into a mismatched simulation. The rendered arm has looks and no
+collision shapes, the simulated one the same cylinders and spheres as collision shapes and no looks.
 
-The rendered arm has looks and no collision shapes, the simulated one the same cylinders and spheres as collision shapes
-and no looks.
+Numbers are written with `repr`, so that none loses a digit. Meshes are Wavefront OBJ text: PyBullet's own sphere is so
+coarse that its front lies 6 % of the radius too deep, and its boxes draw six faces of which one can be seen.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.meshes import BALL_MESH, rectangles_obj
-from servobench.plant.rendered.urdf_elements import (
-    add_joint,
-    add_link,
-    add_visual,
-    draw_cylinder,
-    draw_mesh,
-    draw_sphere,
-    numbers,
-    text,
-)
-from servobench.plant.robot.arm import SerialArm, rotation_from_rpy
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.rendered.marks import RED, Colour
+from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.robot import Robot
 
 BASE_LINK, FLANGE_LINK, BALL_LINK = "base", "flange", "ball"
 ALUMINIUM = (0.76, 0.78, 0.80, 1.0)
 DARK_GREY = (0.26, 0.28, 0.31, 1.0)
 LIGHT_BLUE = (0.42, 0.66, 0.86, 1.0)
-RED = (0.90, 0.06, 0.05, 1.0)
 TABLE_TOP = (0.86, 0.85, 0.82, 1.0)
 TABLE_RIM = (0.48, 0.50, 0.53, 1.0)
 FLOOR_A, FLOOR_B = (0.55, 0.59, 0.63, 1.0), (0.51, 0.55, 0.59, 1.0)
@@ -43,6 +34,148 @@ TABLE_THICKNESS = 0.04  # [m] of its top as an obstacle
 FLOOR_DROP, TILE = 0.75, 0.4  # [m] floor below the table's top; side of a floor tile
 LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBullet's default is 1 kg
 BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
+BALL_MESH = "ball.obj"  # file in which URDFs look for the unit sphere
+BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
+
+
+def text(robot: ET.Element) -> str:
+    """Return a URDF as text."""
+    ET.indent(robot)
+    return ET.tostring(robot, encoding="unicode")
+
+
+def numbers(values: npt.ArrayLike) -> str:
+    """Return numbers as URDF writes them, with spaces between."""
+    return " ".join(repr(value) for value in np.asarray(values, dtype=np.float64).tolist())
+
+
+def rpy_along(direction: npt.ArrayLike) -> FloatArray:
+    """Return the roll, pitch, yaw, (3,) rad, that turn the z axis into `direction` (3,)."""
+    x, y, z = np.asarray(direction, dtype=np.float64).tolist()
+    return np.array([0.0, np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)])
+
+
+def add_link(
+    robot: ET.Element,
+    name: str,
+    mass: float,
+    inertia: npt.ArrayLike,
+    *,
+    centre: npt.ArrayLike = (0.0, 0.0, 0.0),
+    along: npt.ArrayLike = (0.0, 0.0, 1.0),
+) -> ET.Element:
+    """Add a link and return it.
+
+    Args:
+        robot: the URDF.
+        name: of the link.
+        mass: kg.
+        inertia: kg m², about the centre of mass: (2,) across `along` and about it, or (3, 3) in the body frame.
+        centre: (3,), m, centre of mass in the body frame.
+        along: (3,), the direction about which the link is symmetric, in the body frame.
+    """
+    link = ET.SubElement(robot, "link", name=name)
+    inertial = ET.SubElement(link, "inertial")
+    rpy, (xx, yy, zz) = _principal(np.asarray(inertia, dtype=np.float64), along)
+    ET.SubElement(inertial, "origin", xyz=numbers(centre), rpy=numbers(rpy))
+    ET.SubElement(inertial, "mass", value=repr(float(mass)))
+    ET.SubElement(inertial, "inertia", ixx=repr(xx), iyy=repr(yy), izz=repr(zz), ixy="0", ixz="0", iyz="0")
+    return link
+
+
+def _principal(inertia: FloatArray, along: npt.ArrayLike) -> tuple[FloatArray, list[float]]:
+    """Return roll, pitch, yaw [rad] of the principal axes of an inertia, and the moments about them [kg m²]."""
+    if inertia.ndim == 1:
+        across, about = inertia.tolist()
+        return rpy_along(along), [across, across, about]
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return rpy_from_rotation(axes), moments.tolist()
+
+
+def add_joint(robot: ET.Element, name: str, ends: tuple[str, str], origin: FloatArray, *, turns: bool) -> None:
+    """Add a joint about z, or a fixed one.
+
+    Args:
+        robot: the URDF.
+        name: of the joint.
+        ends: names of the parent link and of the child link.
+        origin: (2, 3), the joint in the parent's frame: translation, m, and roll, pitch, yaw, rad.
+        turns: whether it turns; a turning joint has no limits, as the plant holds them.
+    """
+    joint = ET.SubElement(robot, "joint", name=name, type="continuous" if turns else "fixed")
+    ET.SubElement(joint, "parent", link=ends[0])
+    ET.SubElement(joint, "child", link=ends[1])
+    ET.SubElement(joint, "origin", xyz=numbers(origin[0]), rpy=numbers(origin[1]))
+    if turns:
+        ET.SubElement(joint, "axis", xyz="0 0 1")
+
+
+def add_visual(link: ET.Element, colour: Colour, xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> ET.Element:
+    """Add a drawn part at `xyz` (3,) m, `rpy` (3,) rad of the body frame and return its empty geometry."""
+    visual = ET.SubElement(link, "visual")
+    ET.SubElement(visual, "origin", xyz=numbers(xyz), rpy=numbers(rpy))
+    # PyBullet keeps materials by name, so every colour needs a name of its own.
+    material = ET.SubElement(visual, "material", name="rgba_" + "_".join(f"{255 * part:.0f}" for part in colour))
+    ET.SubElement(material, "color", rgba=numbers(colour))
+    return ET.SubElement(visual, "geometry")
+
+
+def draw_cylinder(link: ET.Element, colour: Colour, start: npt.ArrayLike, end: npt.ArrayLike, radius: float) -> None:
+    """Draw a cylinder between two points (3,) m of the body frame; nothing where they coincide."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    length = float(np.linalg.norm(b - a))
+    if length > 1e-6:
+        geometry = add_visual(link, colour, (a + b) / 2, rpy_along(b - a))
+        ET.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(length))
+
+
+def draw_sphere(link: ET.Element, colour: Colour, centre: npt.ArrayLike, radius: float) -> None:
+    """Draw a sphere at a point (3,) m of the body frame."""
+    geometry = add_visual(link, colour, centre, np.zeros(3))
+    ET.SubElement(geometry, "sphere", radius=repr(float(radius)))
+
+
+def draw_mesh(link: ET.Element, colour: Colour, file_name: str, scale: float) -> None:
+    """Draw a mesh at the body frame's origin, `scale` times as large as in its file."""
+    geometry = add_visual(link, colour, np.zeros(3), np.zeros(3))
+    ET.SubElement(geometry, "mesh", filename=file_name, scale=numbers([scale] * 3))
+
+
+@lru_cache(maxsize=4)
+def sphere_obj(subdivisions: int = BALL_SUBDIVISIONS) -> str:
+    """Return the unit sphere as a Wavefront OBJ file with normals, so that it is shaded smoothly.
+
+    Args:
+        subdivisions: how often the triangles of an icosahedron are split in four; 4 give 2562 vertices and a mean
+            depth error of 0.05 % of the radius.
+    """
+    from trimesh.creation import icosphere  # noqa: PLC0415 - takes half a second
+
+    sphere = icosphere(subdivisions)
+    points = [f"{x!r} {y!r} {z!r}" for x, y, z in sphere.vertices.tolist()]
+    lines = [f"v {point}" for point in points] + [f"vn {point}" for point in points]
+    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (sphere.faces + 1).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def rectangles_obj(rectangles: list[tuple[float, float, float, float]], height: float) -> str:
+    """Return horizontal rectangles that face up as a Wavefront OBJ file.
+
+    Args:
+        rectangles: x_lower, y_lower, x_upper, y_upper of each, m.
+        height: z of all, m.
+
+    Returns:
+        The file's text: four vertices and two triangles a rectangle.
+    """
+    lines = ["vn 0 0 1"]
+    for x0, y0, x1, y1 in rectangles:
+        lines += [f"v {x!r} {y!r} {height!r}" for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+    for first in range(1, 4 * len(rectangles), 4):
+        a, b, c, d = (f"{first + k}//1" for k in range(4))
+        lines += [f"f {a} {b} {c}", f"f {a} {c} {d}"]
+    return "\n".join(lines) + "\n"
 
 
 class Box(NamedTuple):
@@ -59,12 +192,12 @@ class Box(NamedTuple):
     size: tuple[float, float, float]
 
 
-def arm_urdf(arm: SerialArm, robot: Robot | None = None) -> str:
+def arm_urdf(arm: SerialArm, robot: Robot) -> str:
     """Return the URDF of an arm with masses and looks of a robot; its joint angles are the true ones, θ.
 
     Args:
         arm: the kinematics, mismatch included.
-        robot: by its maker's description; None for the UR5.
+        robot: by its maker's description, for masses and shapes.
 
     Returns:
         The URDF as text: the base, a link a joint in the arm's order, the flange and the ball, which is drawn by a
@@ -73,23 +206,22 @@ def arm_urdf(arm: SerialArm, robot: Robot | None = None) -> str:
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    return text(arm_tree(arm, robot or find_robot(UR5)))
+    return text(arm_tree(arm, robot))
 
 
-def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot | None = None) -> str:
+def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool) -> str:
     """Return the URDF of an arm without looks, with a point load at the ball.
 
     Args:
         arm: the kinematics, mismatch included.
         payload: kg.
         shapes: whether the parts that `arm_urdf` draws are collision shapes.
-        robot: by its maker's description; None for the UR5.
+        robot: by its maker's description, for masses and shapes.
 
     Raises:
         ValueError: the arm has another number of joints than the robot.
     """
-    described = robot or find_robot(UR5)
-    tree = arm_tree(arm, described)
+    tree = arm_tree(arm, robot)
     for link in tree.iter("link"):
         for visual in link.findall("visual"):
             if not shapes:
@@ -99,7 +231,7 @@ def arm_mechanics(arm: SerialArm, payload: float, *, shapes: bool, robot: Robot 
             for material in visual.findall("material"):
                 visual.remove(material)
             for mesh in visual.findall("geometry/mesh"):
-                mesh.tag, mesh.attrib = "sphere", {"radius": repr(described.workspace.ball_radius)}
+                mesh.tag, mesh.attrib = "sphere", {"radius": repr(robot.workspace.ball_radius)}
         mass = link.find("inertial/mass")
         if link.get("name") == BALL_LINK and mass is not None:
             mass.set("value", repr(LIGHT_PART[0] + payload))

@@ -1,16 +1,16 @@
-"""The world of a rendered plant: an arm with dynamics, seen by cameras in whose images the target is found.
+"""The world of a rendered plant: an arm with dynamics, and cameras in whose rendered images the target is detected.
 
 A physics engine (`servobench.plant.rendered.engine`) moves the arm under the drives of
-`servobench.plant.rendered.drives`, at 1 kHz, and renders it. Controllers see and command reported positions q, which
+`servobench.plant.rendered.drives`, at 1 kHz, and renders it. Controllers get and command reported positions q, which
 are (θ − o)/g of the simulator's angles θ, in steps of the encoders. A link that meets another one, the table, the floor
-or an obstacle ends the run. What is measured, and when it is missing, is in `servobench.plant.rendered.ball_sight` for
-the ball in 3-D and in `servobench.plant.rendered.mark_sight` for other sensing set-ups. Delay, latency and lost frames
-are those of `servobench.plant.bench.bench`.
+or an obstacle ends the run. Features are measured by `servobench.plant.rendered.detectors`. Delay, latency and lost
+frames are those of `servobench.plant.bench.bench`.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -23,18 +23,63 @@ from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth
-from servobench.plant.rendered.contact import Contacts
 from servobench.plant.rendered.detection import ByteArray
+from servobench.plant.rendered.detectors import open_sight
 from servobench.plant.rendered.drives import PHYSICS_STEP
-from servobench.plant.rendered.engine import Engine, Joints, Machine
-from servobench.plant.rendered.mark_sight import open_sight
-from servobench.plant.rendered.rig import Rig
-from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.engine import Engine, Joints, Machine, Overlap
+from servobench.plant.rendered.room import Rig, Room
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.robot.catalogue import UR5, find_robot
+from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
+from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.ur5 import UR5
 
 CONTACT_STEPS = 10  # physics steps between two looks for contact, 10 mm at 1 m/s; and at the end of a period
+LAST_ON_TABLE = 1  # base and shoulder stand on the table
+BUILT_INTO_EACH_OTHER = (0, 2)  # base and upper arm, whose housings meet inside the shoulder in every pose
+
+
+class Contacts:
+    """The contact of one arm; neighbouring links never count, nor do base and shoulder on their table."""
+
+    def __init__(self, overlaps: Callable[[FloatArray], Iterable[Overlap]], arm: SerialArm, robot: Robot) -> None:
+        """Find the links that are built into each other.
+
+        Args:
+            overlaps: from joint angles (n,) [rad] to the bodies that overlap.
+            arm: the true kinematics.
+            robot: by its maker's description; its home is free of contact.
+        """
+        self._overlaps = overlaps
+        self._names = ["base", *arm.joint_names]
+        self._built_in = {BUILT_INTO_EACH_OTHER}
+        if robot.name != UR5:
+            at_home = overlaps(arm.joint_angle(robot.workspace.home))
+            self._built_in |= {_pair(link, other) for link, other in at_home if isinstance(other, int)}
+
+    def find(self, angle: FloatArray, *, room: bool = True, own: bool = True) -> tuple[str, str] | None:
+        """Return the names of two bodies that are in contact, or None.
+
+        Args:
+            angle: (n,) [rad], joint angles.
+            room: whether contact with table, floor and boxes counts.
+            own: whether contact of the arm with itself counts.
+        """
+        for link, other in self._overlaps(angle):
+            if isinstance(other, str):
+                if room and link > LAST_ON_TABLE:
+                    return self._names[link], other
+            elif own:
+                first, second = pair = _pair(link, other)
+                if second - first > 1 and pair not in self._built_in:
+                    return self._names[first], self._names[second]
+        return None
+
+
+def _pair(link: int, other: int) -> tuple[int, int]:
+    """Return the numbers of two links in order."""
+    return min(link, other), max(link, other)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +120,7 @@ class RenderedWorld(World):
         self._camera = model.camera
         boxes, robot = config.boxes(), setup.nominal or find_robot(UR5)
         rig = Rig.of(model, robot) if isinstance(model, EyeModel) else None
-        self._scene = engine.scene(Room(arm, config.scenery, boxes, robot, rig), window=config.view)
+        self._scene = engine.scene(Room(arm, config.scenery, robot, boxes, rig), window=config.view)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
         ordered = np.minimum(*stops), np.maximum(*stops)
         angle = arm.joint_angle(self._start)

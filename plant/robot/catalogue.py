@@ -21,9 +21,9 @@ from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
+from servobench.plant.robot.ur5 import UR5
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
-UR5: Final = "ur5"
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
     title.lower(): partial(universal_robot, title) for title in UNIVERSAL_ROBOTS
 } | {"panda": panda}

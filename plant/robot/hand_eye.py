@@ -25,8 +25,6 @@ from servobench.plant.robot.arm import JointLimits, SerialArm, narrowed
 FEATURE_NAMES = ("x", "y", "z")
 FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
 ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
-
-
 WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are looked for
 
 

@@ -15,7 +15,7 @@ which therefore stays where it was in the image, and the axis is drawn among tho
 most 45°: a camera tilted further would look from below the table. `camera_move` turns the camera in the same way, by
 exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a random
 stream of its own, so the same seed gives the same directions at all magnitudes. The axes of cameras that see pixels are
-drawn by `servobench.plant.cameras.draws`.
+drawn by `servobench.plant.cameras.placement`.
 """
 
 from __future__ import annotations

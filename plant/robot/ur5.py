@@ -16,6 +16,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.arm import SerialArm, arm_from_calibration, arm_from_dh
 from servobench.plant.robot.hand_eye import HandEyeModel
 
+UR5 = "ur5"  # the name of the robot, by which it is found
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 # Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i): lengths in m, angles in rad.

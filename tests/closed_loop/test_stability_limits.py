@@ -6,7 +6,7 @@ from servobench.harness.analysis.loops.equilibrium import SmallLoop, warm_up
 from servobench.harness.analysis.loops.loop_analysis import analyse_loop
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 
 PUBLISHED = ("pid+true", "mfac+ukf", "mpc+true", "rbf_pid:published")
 # The law of rbfnn_mfac is not among them: what it learns grows with the error, which no linear model has.

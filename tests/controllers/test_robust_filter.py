@@ -17,7 +17,7 @@ from servobench.controllers.estimators.robust_filter import (
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out_together
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import FilterDiverged
 
 M, N, NOISE = 3, 4, 0.001

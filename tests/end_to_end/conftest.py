@@ -34,7 +34,7 @@ def open_scene(engine):
     scenes = []
 
     def build(**options):
-        scenes.append(scene_of(engine)(Room(rendered.MODEL.arm, **options)))
+        scenes.append(scene_of(engine)(Room(rendered.MODEL.arm, robot=rendered.UR5, **options)))
         return scenes[-1]
 
     yield build

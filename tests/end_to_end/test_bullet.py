@@ -12,13 +12,13 @@ import pytest
 
 pybullet = pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
-from kit.rendered import BARE, HOME, IDEAL, MODEL
+from kit.rendered import BARE, HOME, IDEAL, MODEL, UR5
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.bullet.bullet_plant import build_bullet
-from servobench.plant.rendered.bullet.mechanics import Mechanics
+from servobench.plant.rendered.bullet import Mechanics
 from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.plants import build_bullet
 
 
 @pytest.fixture
@@ -52,13 +52,13 @@ def test_closing_disconnects_and_may_be_repeated():
 
 
 def test_naming_the_plant_does_not_load_pybullet():
-    code = "import sys, servobench.plant.rendered.bullet.bullet_plant; sys.exit('pybullet' in sys.modules)"
+    code = "import sys, servobench.plant.rendered.plants; sys.exit('pybullet' in sys.modules)"
     root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 
 
 def test_motion_under_torques_is_that_of_pybullets_own_engine():
-    mechanics, h, q = Mechanics(MODEL.arm, payload=1.0, assumed_payload=0.0), PHYSICS_STEP, HOME
+    mechanics, h, q = Mechanics(MODEL.arm, payload=1.0, assumed_payload=0.0, robot=UR5), PHYSICS_STEP, HOME
     client, arm, joints, v = mechanics._client, mechanics._arm, list(range(6)), np.zeros(6)
     torque, body = np.array([5.0, -8.0, 10.0, 2.0, 0.5, 0.0]), mechanics.body(HOME, v)
     pybullet.setPhysicsEngineParameter(fixedTimeStep=h, physicsClientId=client)

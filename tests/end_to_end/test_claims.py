@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from kit.command import servobench
-from servobench.harness.batch.compare import TUNING
+from servobench.harness.batch.plan import TUNING
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.claims import (
     CIRCLE,

@@ -12,7 +12,7 @@ from servobench.harness.config.registry import choose_controller, find_controlle
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 
 SETTINGS = {"kinematic": {"sensing": {"drop_probability": 0.05}}}
 MAPPING = """

@@ -22,9 +22,8 @@ from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
-from servobench.plant.fmu.fmu_plant import FmuConfig, mapped_entry
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
-from servobench.plant.fmu.world import FmuWorld
+from servobench.plant.fmu.world import FmuConfig, FmuWorld, mapped_entry
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
 
 QUIET = FmuConfig(0.0, SensingConfig(0.0))

@@ -14,10 +14,11 @@ from kit.foreign_fmu import build_crane, describe
 from servobench.fmus.compile import this_platform
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.harness.batch import results
-from servobench.harness.batch.blocks import Cell, Job
+from servobench.harness.batch.blocks import Job
+from servobench.harness.batch.plan import Cell
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 
 ABORTS = "#include <stdlib.h>\n__attribute__((constructor)) static void load(void) { abort(); }\n"
 RUN = (

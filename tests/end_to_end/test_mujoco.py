@@ -12,12 +12,11 @@ import pytest
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 from kit.plants import NEEDS_BULLET, mismatched
-from kit.rendered import BARE, HOME, IDEAL, MODEL, build
+from kit.rendered import BARE, HOME, IDEAL, MODEL, UR5, build
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
 from servobench.plant.rendered.drives import DriveConfig
-from servobench.plant.rendered.mujoco.engine import describe_renderer
-from servobench.plant.rendered.mujoco.scene import MujocoScene
+from servobench.plant.rendered.mujoco import MujocoScene, describe_renderer
 from servobench.plant.rendered.room import Room
 from servobench.plant.robot.camera import PinholeCamera
 
@@ -91,11 +90,11 @@ def test_a_camera_sees_the_ball_where_that_of_bullet_sees_it():
 
 @NEEDS_BULLET
 def test_depths_are_those_of_bullet_but_at_edges():
-    from servobench.plant.rendered.bullet.scene import BulletScene
+    from servobench.plant.rendered.bullet import BulletScene
 
     camera, depths = PinholeCamera(), []
     for kind in (BulletScene, MujocoScene):
-        scene = kind(Room(MODEL.arm, scenery=True))
+        scene = kind(Room(MODEL.arm, scenery=True, robot=UR5))
         scene.place(HOME)
         depths.append(camera.metric_depth(scene.render(camera, MODEL.X_BC)[1]))
         scene.close()
@@ -130,7 +129,7 @@ def test_closing_frees_the_context_and_may_be_repeated(open_plant):
 
 
 def test_naming_the_plant_does_not_load_mujoco():
-    code = "import sys, servobench.plant.rendered.mujoco.mujoco_plant; sys.exit('mujoco' in sys.modules)"
+    code = "import sys, servobench.plant.rendered.plants; sys.exit('mujoco' in sys.modules)"
     root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", code], cwd=root, check=False).returncode == 0
 

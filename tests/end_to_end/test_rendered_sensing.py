@@ -7,11 +7,10 @@ import pytest
 from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered import ball_sight
-from servobench.plant.rendered.ball_sight import DepthCamera
-from servobench.plant.rendered.detection import RED_RANGE, find_patch, locate_ball
+from servobench.plant.rendered import detectors as ball_sight
+from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
+from servobench.plant.rendered.detectors import DepthCamera
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.rendered.window import MARGIN, whole, window_around
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
 

@@ -19,10 +19,10 @@ from kit.documents import ROOT
 from page_studies import STUDIES, held_out, physical, readme, side_by_side, worlds
 from page_studies.study import Study, nothing, sweep
 from servobench.harness.batch import results
-from servobench.harness.batch.compare import TUNING, parse_seeds
+from servobench.harness.batch.plan import TUNING, parse_seeds
 from servobench.harness.config.settings import read_settings
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve_sections
+from servobench.harness.run.resolution import resolve_sections
 from servobench.harness.studies import robustness
 from servobench.harness.studies import robustness as map_lines
 

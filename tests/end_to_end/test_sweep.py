@@ -12,8 +12,7 @@ import pytest
 from kit.command import finish, judged, part_count, servobench, start, wait_for
 from servobench.harness.batch import results
 from servobench.harness.batch.blocks import CHUNK
-from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.sweep import SweepPlan, parse_variation
+from servobench.harness.batch.plan import Batch, SweepPlan, parse_variation
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import RunResult
 

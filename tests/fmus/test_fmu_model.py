@@ -20,8 +20,8 @@ from servobench.plant.contract.faults import FmuError
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.description import read_description
+from servobench.plant.fmu.instance import Port
 from servobench.plant.fmu.instances import open_instance
-from servobench.plant.fmu.port import Port
 from servobench.plant.kinematic import ENTRY as KINEMATIC
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 

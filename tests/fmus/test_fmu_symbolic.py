@@ -21,8 +21,8 @@ from servobench.harness.run.request import RunRequest
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.signals import Command
-from servobench.plant.fmu.fmu_plant import mapped_entry
 from servobench.plant.fmu.model_exchange import FmuModel
+from servobench.plant.fmu.world import mapped_entry
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME

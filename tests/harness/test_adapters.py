@@ -13,7 +13,7 @@ import servobench
 from kit.command import judged
 from kit.command import servobench as command
 from kit.own import CELL, CONFIGURED_CELL, PLAIN_CELL, WHOLE, write
-from servobench.harness.batch.asked import changed_source
+from servobench.harness.batch.campaign import changed_source
 from servobench.harness.config.registry import choose_controller, choose_plant, find_plant, offered, offering
 from servobench.harness.config.settings import ConfigurationError
 

@@ -13,18 +13,15 @@ import pytest
 
 from kit.command import judged
 from servobench.harness.batch import blocks, results
-from servobench.harness.batch.blocks import Cell, Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
-from servobench.harness.batch.compare import Batch
-from servobench.harness.batch.grid import Grid
 from servobench.harness.batch.guard import End
+from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, parse_variation, survey
 from servobench.harness.batch.pool import Answer
-from servobench.harness.batch.survey import survey
-from servobench.harness.batch.sweep import SweepPlan, parse_variation
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import Ending, RunResult
 
 PLAN = SweepPlan(

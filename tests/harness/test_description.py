@@ -14,9 +14,9 @@ from servobench.harness.config import registry
 from servobench.harness.config.description import configuration_file, describe_settings
 from servobench.harness.config.registry import controller_names
 from servobench.harness.config.settings import ConfigurationError, Settings, flatten, read_settings
-from servobench.harness.run import resolved
+from servobench.harness.run import resolution as resolved
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve_sections
+from servobench.harness.run.resolution import resolve_sections
 from servobench.harness.run.tasks import TASKS
 
 PLANTS = ("kinematic", "bullet", "mujoco", "fmu")

@@ -104,8 +104,9 @@ def test_methods_as_published_have_a_panel_of_their_own_beside_the_upper_bounds(
     assert divisions(names) == wanted
     assert divisions(names[1:]) == {"": names[1:]}
 
-    rows = [made_up_row(name, controller=name) for name in names]
-    ensembles = load(tmp_path / "out", rows, [made_up_steps(name) for name in names])
+    run_ids = [name.replace(":", ".") for name in names]
+    rows = [made_up_row(run_id, controller=name) for run_id, name in zip(run_ids, names, strict=True)]
+    ensembles = load(tmp_path / "out", rows, [made_up_steps(run_id) for run_id in run_ids])
     panels = draw_moves(ensembles, STYLES).axes
     assert [axes.get_title() for axes in panels] == ["exp1, with aids", "exp1, as published"]
     for axes, labels in zip(panels, wanted.values(), strict=True):
@@ -181,8 +182,8 @@ def test_steps_longer_than_the_period_are_marked_and_counted(tmp_path):
 def test_moves_that_never_settled_stand_at_the_edge_and_are_counted():
     times = [1.0, 2.0, math.nan, 3.0]
     runs = pd.DataFrame([made_up_row(str(i), seed=i, settling_time_s=time) for i, time in enumerate(times)])
-    figure = draw_measures(runs, ("settling_time_s",), STYLES)
-    (axes,) = figure.axes
+    figure = draw_measures(runs, "settling", STYLES)
+    axes = figure.axes[0]
     assert [text.get_text() for text in axes.texts] == ["1 of 4"]
     points, middle = axes.get_lines()
     assert np.asarray(points.get_xdata()).tolist() == pytest.approx([1.0, 2.0, axes.get_xlim()[1], 3.0])

@@ -17,7 +17,7 @@ from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.gym import ENVIRONMENT
 from servobench.harness.gym.environment import MARK, ServoEnv
 from servobench.harness.gym.vector import ServoVectorEnv
-from servobench.plant.rendered.overview import Overview
+from servobench.plant.rendered.room import Overview
 
 RENDERS = default_plant()[0] in RENDERED
 
@@ -106,7 +106,7 @@ def test_a_plant_without_a_camera_is_shown_from_outside_with_its_ball_and_the_ta
         (ball,), _ = view.pixels(drawn.true.arm.ball_position(env.observation.joint_position)[None])
         np.testing.assert_allclose(red.mean(axis=0)[::-1], ball, atol=3.0)
         model = drawn.moved if k else drawn.true
-        (target,), _ = view.pixels(model.to_base(env._desired[0])[None])
+        (target,), _ = view.pixels(model.to_base(env._rollout.reference[0])[None])
         x, y = np.round(target).astype(int)
         np.testing.assert_array_equal(picture[y, x], MARK)
     env.close()

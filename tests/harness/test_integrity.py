@@ -17,9 +17,8 @@ from kit.folders import made_up_row
 from servobench.harness.batch import parquet, results
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.checksums import SUMS, DamagedFile, fault, read_sums
-from servobench.harness.batch.compare import Batch
 from servobench.harness.batch.integrity import examine
-from servobench.harness.batch.sweep import SweepPlan
+from servobench.harness.batch.plan import Batch, SweepPlan
 from servobench.harness.batch.workers import Bounds
 from servobench.harness.config.settings import ConfigurationError, Settings
 

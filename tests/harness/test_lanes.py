@@ -10,7 +10,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.episode import carry_out, carry_out_together
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.faults import FilterDiverged
 
 ROUGH = {"kinematic": {"sensing": {"drop_probability": 0.1, "latency": 0.05}}, "random": {"duration": 2.5}}

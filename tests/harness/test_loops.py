@@ -24,7 +24,7 @@ from servobench.harness.analysis.loops.response import (
 from servobench.harness.analysis.loops.systems import ArmModel, StateSpace, closed_loop, decay, is_stable
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic

@@ -9,7 +9,7 @@ import pytest
 
 import servobench
 from servobench.harness.batch.named_files import named_files
-from servobench.harness.batch.survey import Survey
+from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import neighbours

@@ -17,7 +17,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve, resolve_sections
+from servobench.harness.run.resolution import resolve, resolve_sections
 from servobench.harness.run.tasks import TASKS, taught
 from servobench.plant.robot.catalogue import find_robot
 
@@ -88,7 +88,7 @@ def test_the_manifest_says_which_arm_it_was(tmp_path):
 
 
 def test_a_robot_for_a_plant_that_brings_its_own_is_refused(monkeypatch):
-    from servobench.harness.run import resolved
+    from servobench.harness.run import resolution as resolved
     from servobench.plant.kinematic import ENTRY
 
     monkeypatch.setattr(resolved, "installed_plant", lambda name: replace(ENTRY, own_robot=True))

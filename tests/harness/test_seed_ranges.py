@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servobench.harness.batch.compare import TUNING, refuse_tuning_seeds, tuning_seeds
+from servobench.harness.batch.plan import TUNING, refuse_tuning_seeds, tuning_seeds
 from servobench.harness.config.settings import ConfigurationError
 
 

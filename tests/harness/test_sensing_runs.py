@@ -15,7 +15,7 @@ from servobench.controllers.methods import METHODS
 from servobench.controllers.units import in_natural_units
 from servobench.harness.batch.manifest import describe_sensing
 from servobench.harness.batch.named_files import named_files
-from servobench.harness.batch.survey import Survey
+from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import find_sensing, sensing_names
 from servobench.harness.config.settings import ConfigurationError, Settings
@@ -25,7 +25,7 @@ from servobench.harness.run.experiment import build, build_experiment, train_net
 from servobench.harness.run.pose_error import pose_error
 from servobench.harness.run.references import View
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup

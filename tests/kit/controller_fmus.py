@@ -17,7 +17,7 @@ from servobench.harness.config.settings import Settings
 from servobench.harness.run.experiment import Experiment, build
 from servobench.harness.run.export import controller_model
 from servobench.harness.run.request import RunRequest
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.plant.contract.signals import Command, Observation
 
 PERIODS = 120

@@ -10,6 +10,7 @@ from servobench.plant.rendered.drives import DriveConfig
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import HandEyeModel
 
 HOME = np.array(ur5.HOME)
@@ -26,7 +27,8 @@ IDEAL = configure(
     latency=0.0,
     drop_probability=0.0,
 )
-MODEL = ur5.nominal_ur5()
+UR5 = find_robot("ur5")
+MODEL = UR5.nominal
 
 
 def build(config=BARE, start=HOME, period=0.05, model=MODEL, *, engine):

@@ -19,11 +19,11 @@ def straight_move(diagnostics=({}, {}, {}, {}), periods=4, milliseconds=(0.001, 
         jacobian = np.diag([CONDITION[k], 1.0])
         log.add(
             Observation(float(k), [0.1 * k, 0.0], [X[k] + 0.01, 0.0], k < 3),
-            np.array([1.0, 0.0]),
+            np.array([[1.0, 0.0]]),
             Command([VELOCITY[k], 0.0]),
             Truth(np.array([X[k], 0.0]), jacobian),
+            (int(1e6 * milliseconds[k]), 5000),
             None if ESTIMATE[k] is None else ESTIMATE[k] * jacobian,
             diagnostics[k],
-            (int(1e6 * milliseconds[k]), 5000),
         )
     return log

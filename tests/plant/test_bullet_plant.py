@@ -5,7 +5,7 @@ import pytest
 
 from kit.plants import NEEDS_BULLET, configure
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.rendered.bullet.bullet_plant import build_bullet
+from servobench.plant.rendered.plants import build_bullet
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("pybullet", reason="PyBullet is not installed; from Python 3.12 on it has no wheel")
 
-from servobench.plant.rendered.bullet.engine import BANNER, without_banner
+from servobench.plant.rendered.bullet import BANNER, without_banner
 
 
 def python(program, **streams):
@@ -18,15 +18,13 @@ def python(program, **streams):
 
 
 def test_importing_the_engine_prints_nothing():
-    program = "import sys; sys.stderr.write('a'); import servobench.plant.rendered.bullet.engine; sys.stderr.write('b')"
+    program = "import sys; sys.stderr.write('a'); import servobench.plant.rendered.bullet; sys.stderr.write('b')"
     done = python(program, capture_output=True)
     assert (done.stdout, done.stderr) == ("", "ab")
 
 
 def test_the_engine_can_be_imported_without_a_standard_error():
-    program = (
-        "import os; os.close(2); from servobench.plant.rendered.bullet.engine import pybullet; print(pybullet.DIRECT)"
-    )
+    program = "import os; os.close(2); from servobench.plant.rendered.bullet import pybullet; print(pybullet.DIRECT)"
     assert python(program, stdout=subprocess.PIPE).stdout == "2\n"
 
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS
-from servobench.plant.cameras.draws import draw_cameras
 from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.model import NEAREST, EyeModel
-from servobench.plant.cameras.optics import Optics, in_image, locate, project
-from servobench.plant.cameras.placing import CAMERA, HAND_DISTANCE
+from servobench.plant.cameras.optics import CAMERA, Optics, in_image, locate, project
+from servobench.plant.cameras.placement import HAND_DISTANCE, draw_cameras
 from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.optics import Optics, ideal_optics, locate, project
-from servobench.plant.cameras.placing import CAMERA
+from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics, locate, project
 from servobench.plant.cameras.registry import EYES
+from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
-from servobench.plant.rendered.lens import Lens, as_planned
-from servobench.plant.rendered.mark_sight import needs_depth
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
 
 COLUMNS, ROWS = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))

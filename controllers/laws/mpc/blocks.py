@@ -1,4 +1,4 @@
-"""The horizon of a predictive law as equal blocks of constant joint velocity, whatever the control rate."""
+"""The horizon of a predictive law as equal blocks of constant joint velocity, at any control rate."""
 
 from __future__ import annotations
 

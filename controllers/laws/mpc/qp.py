@@ -126,7 +126,7 @@ class QpBounds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class QpSolution:
-    """What a solver returned.
+    """The result of a solver.
 
     Attributes:
         success: whether the rest can be used.
@@ -203,8 +203,8 @@ def exceeds(shape: QpShape, bounds: QpBounds, J: FloatArray, plan: FloatArray, t
         beyond = (travel > bounds.travel_upper[..., None, :]) | (travel < bounds.travel_lower[..., None, :])
         broken = broken | _any(beyond, axis=(-2, -1))
     if len(shape.view_rows):
-        seen = travel @ transposed(shape.view_rows @ J)
-        broken = broken | _any(seen < bounds.view_margin[..., None, :], axis=(-2, -1))
+        moved = travel @ transposed(shape.view_rows @ J)
+        broken = broken | _any(moved < bounds.view_margin[..., None, :], axis=(-2, -1))
     return np.asarray(broken)
 
 
@@ -307,7 +307,7 @@ def _solve_qpoases(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArra
 def _matrices(shape: QpShape) -> Any:  # noqa: ANN401 - casadi.Function
     """Return (J, targets) -> H, g, c, Aᵀ of the criterion ½ xᵀHx + gᵀx + c and the rows A x, as dense matrices.
 
-    CasADi stores columns first: what it takes and returns is transposed here, so that numpy sees rows first. Building
+    CasADi stores columns first: its inputs and outputs are transposed here, so that numpy has rows first. Building
     takes longer than many a run, so that controllers of equal programs share the function.
     """
     import casadi  # noqa: PLC0415 - other methods start without it

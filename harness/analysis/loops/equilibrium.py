@@ -8,7 +8,7 @@ here; only the motions are small.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, final
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from servobench.controllers.servo import Servo, ServoController, ServoState
 from servobench.harness.analysis.loops.linearisation import Rest, frozen, linearise
 from servobench.harness.analysis.loops.systems import ArmModel, StateSpace
 from servobench.harness.config.robots import find_robot
-from servobench.harness.run.experiment import Experiment, build
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.experiment import build
+from servobench.harness.run.loop import LoopSettings, Rollout, begin, periods
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.plant.bench.plant import Plant, PlantSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.sensing import without_disturbance
@@ -72,10 +73,14 @@ def warm_up(resolved: ResolvedRun, duration: float = WARM_UP) -> Warm:
         ConfigurationError: a name or a setting that cannot be used.
         RunFault: the controller or the plant cannot go on.
     """
-    experiment = build(resolved)
+    experiment, seed = build(resolved), resolved.request.seed
     plant, controller, run = experiment.plant, experiment.controller, experiment.run
-    observation = _run(experiment, run.periods(duration), resolved.request.seed)
-    truth, model = plant.truth(), experiment.drawn.true
+    length = LoopSettings(run.periods(duration), run.preview_rows)
+    desired = experiment.scenario.reference.sampled(plant.spec.period, length.periods + length.preview)
+    rollout = begin(plant, controller, desired, length, (seed, seed))
+    for _ in periods(rollout, controller):
+        pass
+    observation, truth, model = rollout.observation, plant.truth(), experiment.drawn.true
     if truth.jacobian is None or not isinstance(model, HandEyeModel):
         raise ValueError(f"plant must be {PLANT} for a linear model, got {resolved.request.plant}")
     arm = arm_model(resolved.plant, truth.jacobian, run.period)
@@ -90,16 +95,6 @@ def arm_model(config: KinematicConfig, jacobian: FloatArray, period: float) -> A
     """
     age = max(config.sensing.frame_period - period, 0.0) / 2.0
     return ArmModel(jacobian, period, config.lag, config.command_delay, config.sensing.latency + age)
-
-
-def _run(experiment: Experiment, periods: int, seed: int) -> Observation:
-    plant, controller, preview = experiment.plant, experiment.controller, experiment.run.preview_rows
-    desired = experiment.scenario.reference.sampled(plant.spec.period, periods + preview + 1)
-    observation = plant.reset(seed)
-    controller.reset(observation, seed)
-    for k in range(periods):
-        observation = plant.step(controller.step(observation, desired[k : k + 1 + preview]))
-    return observation
 
 
 def at_rest(warm: Warm, source: Source) -> tuple[Servo, ServoState, Rest]:
@@ -185,14 +180,28 @@ class SmallLoop:
 
     def _features(self, factor: float, latency: float | None, offset: float) -> FloatArray:
         """Return the true feature in each period, (periods, m), with the desired one moved by an offset [m]."""
-        plant, state, rest, period = self._plant(latency), self._state, self._rest, self._period
-        reference = rest.reference(rest.feature + offset)
-        observation = plant.reset(0)
-        features = np.zeros((round(DURATION / period), len(rest.feature)))
-        for k in range(len(features)):
-            seen = rest.observation(observation.feature, observation.joint_position, k * period)
-            state, u = self._servo.step(state, seen, reference)
-            observation = plant.step(Command(factor * u))
-            features[k] = plant.truth().feature
+        plant, rest = self._plant(latency), self._rest
+        count = round(DURATION / self._period)
+        desired = np.broadcast_to(rest.feature + offset, (count + 1 + rest.preview, len(rest.feature)))
+        controller = _FrozenController(self._servo, self._state, rest, factor)
+        rollout = Rollout(plant, plant.reset(0), desired, LoopSettings(count + 1, rest.preview))
+        features = np.array([period.truth.feature for period in periods(rollout, controller)])
         plant.close()
-        return features
+        return features[1:]
+
+
+@final
+class _FrozenController(Controller):
+    """A frozen servo after its rest, whose command is multiplied by a factor."""
+
+    def __init__(self, servo: Servo, state: ServoState, rest: Rest, factor: float) -> None:
+        self._servo, self._state, self._rest, self._factor = servo, state, rest, factor
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Keep the state of the rest."""
+
+    def step(self, observation: Observation, reference: FloatArray) -> Command:
+        """See `Controller.step`."""
+        seen = self._rest.observation(observation.feature, observation.joint_position, observation.time)
+        self._state, u = self._servo.step(self._state, seen, reference)
+        return Command(self._factor * u)

@@ -26,7 +26,7 @@ from servobench.harness.analysis.loops.systems import ArmModel, StateSpace, clos
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import ResolvedRun
+from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.tasks import find_task, taught
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault

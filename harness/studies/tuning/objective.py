@@ -29,14 +29,14 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from servobench.harness.batch.blocks import Cell, Job, carry_out_blocks, cut, even_size
-from servobench.harness.batch.compare import TUNING, tuning_seeds
+from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
+from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.lanes import side_by_side_key
 from servobench.harness.run.request import RunRequest, read_mismatch
-from servobench.harness.run.resolved import ResolvedRun, resolve_sections, select
+from servobench.harness.run.resolution import ResolvedRun, resolve_sections, select
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.sensing import can_vary_sensing
 from servobench.plant.contract.settings import Periods, settings

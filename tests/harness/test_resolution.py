@@ -8,7 +8,7 @@ from kit.plants import NEEDS_BULLET
 from servobench.harness.config.registry import controller_names, engine_of
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.resolved import resolve
+from servobench.harness.run.resolution import resolve
 from servobench.plant.robot.mismatch import Mismatch
 
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import Any, Final, Protocol
 
 from servobench.plant.contract.faults import FmuError
-from servobench.plant.fmu.asked import Asked
 from servobench.plant.fmu.description import FmuDescription
+from servobench.plant.fmu.library import InstanceOptions
 
 RELATIVE_TOLERANCE: Final = 1e-8
 MAX_SOLVER_STEPS: Final = 100_000  # of CVode in one step
@@ -24,7 +24,7 @@ class Exchanging(Protocol):
     """The part of an instance of model exchange that is used here."""
 
     description: FmuDescription
-    asked: Asked
+    asked: InstanceOptions
 
     def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
         """Call a function of the library and check its status; raises FmuError."""

@@ -1,0 +1,166 @@
+/* The functions that FMI 2 and FMI 3 share: they differ in names and types, which the header of the instance defines.
+   One source file of each version includes this. */
+#ifndef SHARED_FUNCTIONS_H
+#define SHARED_FUNCTIONS_H
+
+#include <stdlib.h>
+#include <string.h>
+
+Status FMI(SetDebugLogging)(Handle instance, Boolean on, size_t count, const String categories[])
+{
+    OPEN(~0);
+    const unsigned bits = category_bits(count, categories);
+    if (bits == 0) return ANSWER("there is no such category");
+    self->logged = on ? self->logged | bits : self->logged & ~bits;
+    return STATUS_OK;
+}
+
+Status FMI(ExitInitializationMode)(Handle instance)
+{
+    OPEN(INITIALISING);
+    return ANSWER(core_leave_initialisation(&self->core));
+}
+
+Status FMI(Terminate)(Handle instance)
+{
+    OPEN(RUNNING | FAILED);
+    self->core.phase = TERMINATED;
+    return STATUS_OK;
+}
+
+Status FMI(Reset)(Handle instance)
+{
+    OPEN(~0);
+    core_reset(&self->core, self->core.model.exchange);
+    return STATUS_OK;
+}
+
+/* Saved states */
+
+Status FMI_STATE(Get, )(Handle instance, State *state)
+{
+    OPEN(~0);
+    Snapshot *snapshot = snapshot_take(&self->core);
+    if (snapshot == NULL) return ANSWER("out of memory");
+    free(*state);
+    *state = snapshot;
+    return STATUS_OK;
+}
+
+Status FMI_STATE(Set, )(Handle instance, State state)
+{
+    OPEN(~0);
+    return ANSWER(core_restore(&self->core, state));
+}
+
+Status FMI_STATE(Free, )(Handle instance, State *state)
+{
+    OPEN(~0);
+    free(*state);
+    *state = NULL;
+    return STATUS_OK;
+}
+
+Status FMI_STATE(Serialized, Size)(Handle instance, State state, size_t *size)
+{
+    (void)state;
+    OPEN(~0);
+    *size = sizeof(Snapshot);
+    return STATUS_OK;
+}
+
+Status FMI_STATE(Serialize, )(Handle instance, State state, Byte bytes[], size_t size)
+{
+    OPEN(~0);
+    if (state == NULL || size < sizeof(Snapshot)) return ANSWER("no state or no room");
+    memcpy(bytes, state, sizeof(Snapshot));
+    return STATUS_OK;
+}
+
+Status DESERIALIZE_STATE(Handle instance, const Byte bytes[], size_t size, State *state)
+{
+    OPEN(~0);
+    Snapshot *snapshot = snapshot_read(bytes, size);
+    if (snapshot == NULL) return ANSWER("these bytes are no state of this model");
+    free(*state);
+    *state = snapshot;
+    return STATUS_OK;
+}
+
+/* Model exchange */
+
+Status FMI(EnterEventMode)(Handle instance)
+{
+    OPEN(EXCHANGING);
+    const char *message = core_check_stop_time(&self->core);
+    if (message == NULL) self->core.phase = IN_EVENT;
+    return ANSWER(message);
+}
+
+Status FMI(EnterContinuousTimeMode)(Handle instance)
+{
+    OPEN(EXCHANGING);
+    self->core.phase = CONTINUOUS;
+    return STATUS_OK;
+}
+
+Status FMI(CompletedIntegratorStep)(Handle instance, Boolean no_set_state, Boolean *enter_event, Boolean *terminate)
+{
+    (void)no_set_state;
+    OPEN(CONTINUOUS);
+    *enter_event = *terminate = 0;
+    return ANSWER(core_check_stop_time(&self->core));
+}
+
+Status FMI(SetTime)(Handle instance, double time)
+{
+    OPEN(EXCHANGING);
+    self->core.model.time = time;
+    return STATUS_OK;
+}
+
+/* There are as many event indicators as states. */
+static const char *check_count(size_t count) { return count == N_STATES ? NULL : "wrong number of values"; }
+
+Status FMI(SetContinuousStates)(Handle instance, const double states[], size_t count)
+{
+    OPEN(EXCHANGING);
+    const char *message = check_count(count);
+    if (message == NULL) model_set_states(&self->core.model, states);
+    return ANSWER(message);
+}
+
+static const char *copy_values(Instance *self, size_t offset, double values[], size_t count)
+{
+    const char *message = check_count(count);
+    for (size_t i = 0; message == NULL && i < count; i++) core_get(&self->core, offset + i, &values[i]);
+    return message;
+}
+
+Status FMI(GetContinuousStates)(Handle instance, double states[], size_t count)
+{
+    OPEN(READABLE);
+    return ANSWER(copy_values(self, OFFSET_STATES, states, count));
+}
+
+Status GET_DERIVATIVES(Handle instance, double derivatives[], size_t count)
+{
+    OPEN(DERIVATIVE_PHASES);
+    return ANSWER(copy_values(self, OFFSET_DERIVATIVES, derivatives, count));
+}
+
+Status FMI(GetEventIndicators)(Handle instance, double indicators[], size_t count)
+{
+    OPEN(READABLE);
+    return ANSWER(copy_values(self, OFFSET_INDICATORS, indicators, count));
+}
+
+Status FMI(GetNominalsOfContinuousStates)(Handle instance, double nominals[], size_t count)
+{
+    OPEN(~0);
+    const char *message = check_count(count);
+    for (size_t i = 0; message == NULL && i < count; i++) nominals[i] = 1.0;
+    return ANSWER(message);
+}
+
+#endif

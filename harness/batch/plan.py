@@ -1,0 +1,345 @@
+"""Plans of batches: the runs of a comparison and of a sweep, made when they are needed, and which seeds are for what.
+
+A run's seed decides its true robot, its task and its noise. Methods are tuned on the seeds `TUNING` and judged on all
+others, so that no method is judged by a robot on which it was tuned.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache, partial
+from textwrap import shorten
+from typing import Any, Final, Generic, TypeAlias, TypeVar, overload
+
+import numpy as np
+
+from servobench.harness.config.registry import find_plant
+from servobench.harness.config.robots import DEFAULT_ROBOT
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.request import RunRequest, read_mismatch
+from servobench.plant.cameras.registry import DEFAULT_SENSING
+from servobench.plant.robot.mismatch import Magnitude, Mismatch, parse_magnitudes
+
+MAX_SEEDS: Final = 1_000_000  # of a batch
+MAX_SEED: Final = 2**63 - 1  # which the tables hold
+MAX_SHOWN: Final = 200  # [characters] of what was given, in a message
+TUNING: Final = range(10_000, 20_000)  # seeds of `servobench tune`; all others are for judging
+
+
+@dataclass(frozen=True)
+class Batch:
+    """All combinations of these."""
+
+    plants: tuple[str, ...]
+    controllers: tuple[str, ...]
+    tasks: tuple[str, ...]
+    mismatches: tuple[str, ...]
+    seeds: Sequence[int]
+    robot: str = DEFAULT_ROBOT
+    """a name or the path of a file; all runs of a batch have one"""
+    sensings: tuple[str, ...] = (DEFAULT_SENSING,)
+
+    def requests(self) -> Grid[RunRequest]:
+        """Return the runs, seeds varying fastest."""
+        return Grid(partial(_request, self.robot), *self.axes())
+
+    def axes(self) -> tuple[Sequence[Any], ...]:
+        """Return sensing set-ups, plants, tasks, mismatches, controllers and seeds."""
+        mismatches = [read_mismatch(text) for text in self.mismatches]
+        return self.sensings, self.plants, self.tasks, mismatches, self.controllers, self.seeds
+
+
+def _request(
+    robot: str, sensing: str, plant: str, task: str, mismatch: Mismatch, controller: str, seed: int
+) -> RunRequest:
+    return RunRequest(plant, controller, task, mismatch, seed, robot=robot, sensing=sensing)
+
+
+def parse_seeds(text: str) -> Sequence[int]:
+    """Return the seeds that `text` names: a count `5`, a list `3,1,4`, or a range `100:120` (end not included).
+
+    Raises:
+        ConfigurationError: none of these, or empty.
+    """
+    came = f"got {shorten(repr(text), MAX_SHOWN, placeholder=' ...')}"
+    try:
+        if ":" in text:
+            begin, end = (int(part) for part in text.split(":"))
+            seeds: Sequence[int] = range(begin, max(begin, end))
+        elif "," in text:
+            seeds = tuple(int(part) for part in text.split(",") if part.strip())
+        else:
+            seeds = range(max(0, int(text)))
+    except ValueError as error:
+        raise ConfigurationError(f"seeds must be a count (5), a list (3,1,4) or a range (100:120), {came}") from error
+    if isinstance(seeds, range):
+        first, last = seeds.start, seeds.stop - 1
+    else:
+        first, last = min(seeds, default=-1), max(seeds, default=-1)
+    if first < 0 or last < first:
+        raise ConfigurationError(f"seeds must name at least one seed, none of them negative; {came}")
+    if last > MAX_SEED:
+        raise ConfigurationError(f"seeds must be at most {MAX_SEED}, {came}")
+    if len(seeds) > MAX_SEEDS:
+        raise ConfigurationError(f"seeds must name at most {MAX_SEEDS:,}, {came}; use several folders for more")
+    for seed, count in Counter(seeds).items() if isinstance(seeds, tuple) else ():
+        if count > 1:
+            raise ConfigurationError(f"seeds name {seed} twice, {came}")
+    return seeds
+
+
+def tuning_seeds(count: int, offset: int = 0) -> tuple[int, ...]:
+    """Return `count` seeds of the tuning range that begin `offset` after its first.
+
+    Raises:
+        ConfigurationError: fewer than one, or some of them outside the range.
+    """
+    if count < 1:
+        raise ConfigurationError(f"the number of tuning seeds must be at least 1, got {count}")
+    if offset < 0 or offset + count > len(TUNING):
+        raise ConfigurationError(
+            f"{count} seeds from {TUNING.start + offset} on leave the tuning range {_words()}; "
+            f"count and offset must not be negative and together at most {len(TUNING)}"
+        )
+    return tuple(TUNING[offset : offset + count])
+
+
+def refuse_tuning_seeds(seeds: Iterable[int]) -> None:
+    """Refuse to judge methods by robots on which they were tuned.
+
+    Raises:
+        ConfigurationError: names the first seed of the tuning range and says what to take instead.
+    """
+    found = [seed for seed in seeds if seed in TUNING]
+    if found:
+        more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+        raise ConfigurationError(
+            f"seed {found[0]}{more} cannot be used to judge: {_words()} are kept for tuning; "
+            f"take seeds below {TUNING.start} or from {TUNING.stop} on"
+        )
+
+
+def _words() -> str:
+    return f"{TUNING.start}:{TUNING.stop}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A run and its further columns in the table of runs."""
+
+    request: RunRequest
+    columns: Mapping[str, Any] = field(default_factory=dict)  # such as the place along the axis that a sweep varies
+    picture: bool = False  # keep what the camera saw last
+
+
+Entry_co = TypeVar("Entry_co", covariant=True)
+
+
+class Grid(Sequence[Entry_co], Generic[Entry_co]):
+    """All combinations of the values of some axes, the last axis varying fastest."""
+
+    def __init__(self, make: Callable[..., Entry_co], *axes: Sequence[Any]) -> None:
+        """Plan the combinations.
+
+        Args:
+            make: returns an entry from a value of each axis.
+            axes: the values of each axis; another grid can be one.
+        """
+        self._make = make
+        self._axes = [(axis, len(axis)) for axis in reversed(axes)]
+        self._length = math.prod(length for _, length in self._axes)
+
+    def __len__(self) -> int:
+        """Return the number of combinations."""
+        return self._length
+
+    @overload
+    def __getitem__(self, index: int) -> Entry_co: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Entry_co]: ...
+    def __getitem__(self, index: int | slice) -> Entry_co | list[Entry_co]:
+        """Make one entry, or those of a slice."""
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        place = range(self._length)[index]
+        values = []
+        for axis, length in self._axes:
+            place, own = divmod(place, length)
+            values.append(axis[own])
+        return self._make(*reversed(values))
+
+
+Variation: TypeAlias = tuple[str, tuple[Magnitude, ...]]
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """All combinations of these; each variation is put on top of every mismatch by itself, not with the others."""
+
+    batch: Batch  # plants, controllers, tasks, mismatches and seeds
+    variations: tuple[Variation, ...] = ()  # axes with their magnitudes
+    noise_factors: tuple[float, ...] = (1.0,)  # on the plants' sensor noise
+    latencies: tuple[float | None, ...] = (None,)  # [s]; None for what a plant is configured with
+    periods: tuple[float | None, ...] = (None,)  # [s] of control; None for that of the section `run`
+
+    def cells(self) -> Grid[Cell]:
+        """Return the runs, seeds varying fastest.
+
+        Raises:
+            ConfigurationError: an axis that is varied and stands in a mismatch, too.
+        """
+        for axis, _ in self.variations:
+            for text in self.batch.mismatches:
+                if axis in dict(read_mismatch(text).axes):
+                    raise ConfigurationError(f"--vary {axis} varies an axis that the mismatch {text!r} has")
+        places = [Place(axis, magnitude) for axis, magnitudes in self.variations for magnitude in magnitudes]
+        make = partial(_cell, self.batch.robot)
+        return Grid(make, places or [Place()], self.noise_factors, self.latencies, self.periods, *self.batch.axes())
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a run stands on the axis that is varied; without an axis, none is."""
+
+    axis: str = ""
+    magnitude: Magnitude | None = None
+
+    @cached_property
+    def columns(self) -> dict[str, Any]:
+        """The columns of the table of runs that say so; empty and NaN without an axis."""
+        number, unit = (math.nan, "") if self.magnitude is None else (self.magnitude.number, self.magnitude.unit)
+        return {"axis": self.axis, "magnitude": number, "unit": unit}
+
+    def vary(self, mismatch: Mismatch) -> Mismatch:
+        """Return a mismatch with the axis put on top of it."""
+        return mismatch if self.magnitude is None else _with_axis(mismatch, self.axis, self.magnitude)
+
+
+@lru_cache
+def _with_axis(mismatch: Mismatch, axis: str, magnitude: Magnitude) -> Mismatch:
+    """Return the same object for all runs at one place, so that messages to workers hold it once."""
+    return mismatch.with_axis(axis, magnitude)
+
+
+OWN_OPTIONS = {"noise": "noise 0,1,2", "latency": "latency 0,0.05,0.1", "period": "period 0.02,0.05"}
+
+
+def parse_variation(text: str) -> Variation:
+    """Return the axis and the magnitudes in `axis=begin:end:step` (both ends included) or `axis=one/another`.
+
+    The unit stands at the end, as in `camera_rotation=0:180:30deg`.
+
+    Raises:
+        ConfigurationError: an unknown axis, or an empty or malformed range.
+    """
+    axis, _, values = text.strip().partition("=")
+    if axis in OWN_OPTIONS:
+        raise ConfigurationError(f"--vary: {axis} is no axis of the mismatch and has an option, --{OWN_OPTIONS[axis]}")
+    try:
+        return axis, parse_magnitudes(axis, values)
+    except ValueError as error:
+        raise ConfigurationError(f"--vary: {error}") from error
+
+
+def _cell(
+    robot: str,
+    place: Place,
+    noise: float,
+    latency: float | None,
+    period: float | None,
+    *names: Any,  # noqa: ANN401 - as `Batch.axes`
+) -> Cell:
+    sensing, plant, task, mismatch, controller, seed = names
+    varied = place.vary(mismatch)
+    request = RunRequest(plant, controller, task, varied, seed, noise, latency, period, robot, sensing)
+    return Cell(request, place.columns)
+
+
+@dataclass
+class Survey:
+    """What runs have in common and in how far they differ; names in the order in which they come first."""
+
+    count: int = 0
+    plants: dict[str, None] = field(default_factory=dict)
+    controllers: dict[str, None] = field(default_factory=dict)
+    tasks: dict[str, None] = field(default_factory=dict)
+    mismatches: dict[str, None] = field(default_factory=dict)
+    robots: dict[str, None] = field(default_factory=dict)
+    sensings: dict[str, None] = field(default_factory=dict)
+    seeds: list[range] = field(default_factory=list)  # in order, without gaps within each
+    examples: list[RunRequest] = field(default_factory=list)
+    """With every plant in every condition (mismatch, noise, times) and with every controller, and every task."""
+    digest: str = ""  # of all runs in their order
+
+
+def survey(requests: Sequence[RunRequest]) -> Survey:
+    """Look at every run once.
+
+    Raises:
+        ConfigurationError: a run is asked for twice.
+    """
+    found = Survey(len(requests))
+    digest, names, seeds = hashlib.sha256(), array("q"), _Ranges()
+    kind: tuple[object, ...] = ()
+    seen: set[tuple[object, ...]] = set()
+    for request in requests:
+        run_id = request.run_id
+        digest.update(f"{run_id}\n".encode())
+        names.append(hash(run_id))
+        seeds.add(request.seed)
+        times = request.latency, request.period
+        condition = (request.mismatch, request.noise_factor, *times, request.robot, request.sensing)
+        last, kind = kind, (request.plant, request.controller, request.task, condition)
+        if kind == last:
+            continue
+        new = {(request.plant, condition), (request.plant, request.controller), (request.task,)} - seen
+        if new:
+            seen |= new
+            found.examples.append(request)
+    for example in found.examples:
+        found.plants[example.plant] = found.controllers[example.controller] = found.tasks[example.task] = None
+        found.mismatches[str(example.mismatch)] = found.sensings[example.sensing] = None
+        if not find_plant(example.plant).own_robot:
+            found.robots[example.robot] = None
+    found.digest, found.seeds = digest.hexdigest(), seeds.merged()
+    _refuse_repetition(requests, names)
+    return found
+
+
+def _refuse_repetition(requests: Iterable[RunRequest], hashes: array[int]) -> None:
+    """Refuse runs of the same name; only where two of the hashes are equal the names are looked at."""
+    values, counts = np.unique(np.frombuffer(hashes, dtype=np.int64), return_counts=True)
+    suspects = set(values[counts > 1].tolist())
+    if suspects:
+        names = Counter(request.run_id for request in requests if hash(request.run_id) in suspects)
+        name, count = names.most_common(1)[0]
+        if count > 1:
+            raise ConfigurationError(f"the run {name} is asked for twice")
+
+
+class _Ranges:
+    """Collects whole numbers as ranges, which are few where the numbers rise one by one again and again."""
+
+    def __init__(self) -> None:
+        self._begin = self._end = 0
+        self._done: set[tuple[int, int]] = set()
+
+    def add(self, number: int) -> None:
+        if number != self._end:
+            self._done.add((self._begin, self._end))
+            self._begin = number
+        self._end = number + 1
+
+    def merged(self) -> list[range]:
+        merged: list[range] = []
+        for begin, end in sorted({*self._done, (self._begin, self._end)}):
+            if merged and begin <= merged[-1].stop:
+                merged[-1] = range(merged[-1].start, max(end, merged[-1].stop))
+            elif end > begin:
+                merged.append(range(begin, end))
+        return merged

@@ -1,0 +1,298 @@
+"""PyBullet: a scene for the cameras, rendered by TinyRenderer, and the moving arm as rigid bodies.
+
+The world frame W is the arm's base frame B. The drives of `servobench.plant.rendered.drives` integrate the motion;
+PyBullet gives inertia, gravity torques and contact, in a physics world without looks: the arm with its true load, the
+arm as the drives believe it, and the table, the floor and the boxes around it.
+
+PyBullet's C library prints a banner, past `sys.stderr`, so the file descriptor is redirected during the import. All
+other output that is written to it in the meantime is passed on afterwards.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.drives import Drives, DriveState, RigidBody
+from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.urdf import Box, arm_mechanics, boxes_urdf, room_boxes
+from servobench.plant.robot.camera import PinholeCamera, view_matrix
+from servobench.plant.robot.robot import GRAVITY
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from servobench.plant.contract.checks import FloatArray
+    from servobench.plant.rendered.detection import ByteArray, Window
+    from servobench.plant.rendered.room import Room
+    from servobench.plant.robot.arm import SerialArm
+    from servobench.plant.robot.robot import Robot
+
+BANNER = b"pybullet build time:"  # what the line begins with
+STANDARD_ERROR = 2  # file descriptor
+CONTACT_DISTANCE = 8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
+
+
+@contextlib.contextmanager
+def without_banner(descriptor: int = STANDARD_ERROR) -> Iterator[None]:
+    """Let nothing reach a file descriptor within the context, and afterwards all that came but the banner."""
+    try:
+        kept = os.dup(descriptor)
+    except OSError:  # it is closed, so nothing can be printed
+        yield
+        return
+    with tempfile.TemporaryFile() as aside:
+        os.dup2(aside.fileno(), descriptor)
+        try:
+            yield
+        finally:
+            os.dup2(kept, descriptor)
+            os.close(kept)
+            aside.seek(0)
+            others = b"".join(line for line in aside if not line.startswith(BANNER))
+            while others:
+                others = others[os.write(descriptor, others) :]
+
+
+with without_banner():
+    import pybullet
+
+
+def describe_renderer() -> str:
+    """Return which engine renders images, its version, and how they arrive from it."""
+    images = "" if pybullet.isNumpyEnabled() else ", built without numpy: images arrive as tuples, which is slower"
+    return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
+
+
+class BulletScene(Scene):
+    """An arm with a ball on its flange in a PyBullet world of its own; joint angles here are the true ones, θ."""
+
+    def __init__(self, room: Room, *, window: bool = False) -> None:
+        """Open a world and load the room; see `OpenScene`.
+
+        Raises:
+            ValueError: a robot with another number of joints, or a window is wanted where there is no display.
+            ConnectionError: PyBullet opens no world, as too many are open.
+        """
+        if window and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+            raise ValueError("view needs a display, but the environment variable DISPLAY is not set")
+        self._client: int = pybullet.connect(pybullet.GUI if window else pybullet.DIRECT)
+        if self._client < 0:
+            raise ConnectionError("PyBullet could not open a physics world")
+        try:
+            self._load(room)
+            if window:
+                self._aim_window()
+        except BaseException:
+            self.close()
+            raise
+        n = room.arm.n
+        self._joints = list(range(n))
+        self._ball_link = n + 1
+
+    def _load(self, room: Room) -> None:
+        client = self._client
+        # With file caching PyBullet keeps every mesh that it loaded, so memory would grow with each plant.
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
+        files = room.files()
+        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+            for name, text in files.items():
+                (Path(folder) / name).write_text(text, encoding="utf-8")
+            bodies = [
+                pybullet.loadURDF(
+                    str(Path(folder) / name),
+                    useFixedBase=True,
+                    flags=pybullet.URDF_USE_INERTIA_FROM_FILE,
+                    physicsClientId=client,
+                )
+                for name in files
+                if name.endswith(".urdf")
+            ]
+        self._arm = bodies[0]
+
+    def _aim_window(self) -> None:
+        """Show the arm from the front right, without PyBullet's side panels."""
+        client = self._client
+        pybullet.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+        pybullet.resetDebugVisualizerCamera(1.9, 50.0, -30.0, (0.3, 0.0, 0.15), physicsClientId=client)
+
+    def place(self, theta: FloatArray) -> None:
+        """See `Scene.place`."""
+        for joint, angle in zip(self._joints, theta.tolist(), strict=True):
+            pybullet.resetJointState(self._arm, joint, angle, physicsClientId=self._client)
+
+    def ball_position(self) -> FloatArray:
+        """See `Scene.ball_position`; from the simulator's own link state."""
+        state = pybullet.getLinkState(
+            self._arm, self._ball_link, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        return np.array(state[4])
+
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> tuple[ByteArray, FloatArray]:
+        """See `Scene.render`; TinyRenderer knows no window, so that all is rendered."""
+        _, _, rgba, depth, _ = pybullet.getCameraImage(
+            camera.width,
+            camera.height,
+            *(matrix.T.ravel().tolist() for matrix in (view_matrix(X_BC), camera.projection_matrix())),
+            shadow=0,
+            renderer=pybullet.ER_TINY_RENDERER,
+            flags=pybullet.ER_NO_SEGMENTATION_MASK,
+            physicsClientId=self._client,
+        )
+        # A PyBullet built without numpy returns tuples.
+        shape = (camera.height, camera.width)
+        rgba, depth = np.asarray(rgba, dtype=np.uint8).reshape(*shape, 4), np.asarray(depth).reshape(shape)
+        return (rgba, depth) if window is None else (window.cut(rgba), window.cut(depth))
+
+    def close(self) -> None:
+        """See `Scene.close`."""
+        if self._client >= 0:
+            client, self._client = self._client, -1
+            if pybullet.isConnected(client):
+                pybullet.disconnect(client)
+
+
+class BulletSimulation(Simulation):
+    """The cascade of `servobench.plant.rendered.drives`, stepped at 1 kHz on the rigid bodies of `Mechanics`."""
+
+    def __init__(self, machine: Machine) -> None:
+        """Open a world with the arm in it.
+
+        Raises:
+            ValueError: a list of the drives that does not fit the joints.
+            ConnectionError: PyBullet opens no world, as too many are open.
+        """
+        drives = machine.drives
+        self._dynamics = drives.dynamics
+        self._mechanics = Mechanics(
+            machine.arm,
+            payload=drives.payload,
+            assumed_payload=drives.assumed_payload,
+            boxes=machine.boxes,
+            robot=machine.robot,
+        )
+        try:
+            self._drives = Drives(drives, machine.lag, self._mechanics.assumed_inertia(machine.start), machine.stops)
+        except BaseException:
+            self._mechanics.close()
+            raise
+
+    def start(self, angle: FloatArray) -> DriveState:
+        """See `Simulation.start`."""
+        return self._drives.start(angle, self._mechanics.body(angle, np.zeros(len(angle))))
+
+    def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
+        """See `Simulation.advance`."""
+        drives = self._drives
+        drives.take(joints, speed)
+        for _ in range(steps):
+            if self._dynamics:
+                drives.drive(self._mechanics.body(drives.angle, drives.speed))
+            else:
+                drives.track()
+        return drives.give()
+
+    def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
+        """See `Simulation.overlaps`."""
+        return self._mechanics.overlaps(angle)
+
+    def close(self) -> None:
+        """See `Simulation.close`."""
+        self._mechanics.close()
+
+
+class Mechanics:
+    """An arm in a PyBullet world without looks; joint angles here are the true ones, θ."""
+
+    def __init__(
+        self,
+        arm: SerialArm,
+        *,
+        payload: float,
+        assumed_payload: float,
+        robot: Robot,
+        boxes: tuple[Box, ...] = (),
+    ) -> None:
+        """Open a world and load the arm twice, with the true and with the assumed load.
+
+        Args:
+            arm: the true kinematics.
+            payload: kg, point load at the ball.
+            assumed_payload: kg, that of the drives' model.
+            robot: by its maker's description, for masses and shapes.
+            boxes: obstacles beside table and floor.
+
+        Raises:
+            ConnectionError: PyBullet opens no world, as too many are open.
+        """
+        self._client: int = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            raise ConnectionError("PyBullet could not open a physics world")
+        try:
+            pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self._client)
+            pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self._client)
+            loaded = arm_mechanics(arm, payload, shapes=True, robot=robot)
+            self._arm = self._load(loaded, pybullet.URDF_USE_SELF_COLLISION)
+            self._assumed = self._load(arm_mechanics(arm, assumed_payload, shapes=False, robot=robot), 0)
+            room = (*room_boxes(robot.workspace.scale), *boxes)
+            self._boxes = {self._load(boxes_urdf((box,)), 0): box.name for box in room}
+        except BaseException:
+            self.close()
+            raise
+        self._joints = list(range(arm.n))
+        self._rest = [0.0] * arm.n
+
+    def _load(self, urdf: str, flags: int) -> int:
+        with tempfile.TemporaryDirectory(prefix="servobench-") as folder:
+            path = Path(folder) / "body.urdf"
+            path.write_text(urdf, encoding="utf-8")
+            return int(
+                pybullet.loadURDF(
+                    str(path),
+                    useFixedBase=True,
+                    flags=pybullet.URDF_USE_INERTIA_FROM_FILE | flags,
+                    physicsClientId=self._client,
+                )
+            )
+
+    def assumed_inertia(self, angle: FloatArray) -> FloatArray:
+        """Return the inertia by the drives' model at joint angles (n,) [rad], (n, n) [kg m²]."""
+        return np.array(pybullet.calculateMassMatrix(self._assumed, angle.tolist(), physicsClientId=self._client))
+
+    def body(self, angle: FloatArray, speed: FloatArray) -> RigidBody:
+        """Return inertia and torques at joint angles (n,) [rad] and speeds (n,) [rad/s]."""
+        theta, rest, client, torques = angle.tolist(), self._rest, self._client, pybullet.calculateInverseDynamics
+        return RigidBody(
+            np.array(pybullet.calculateMassMatrix(self._arm, theta, physicsClientId=client)),
+            np.array(torques(self._arm, theta, speed.tolist(), rest, physicsClientId=client)),
+            np.array(torques(self._assumed, theta, rest, rest, physicsClientId=client)),
+        )
+
+    def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
+        """See `Simulation.overlaps`."""
+        client, n = self._client, len(self._joints)
+        for joint, value in zip(self._joints, angle.tolist(), strict=True):
+            pybullet.resetJointState(self._arm, joint, value, physicsClientId=client)
+        pybullet.performCollisionDetection(physicsClientId=client)
+        for point in pybullet.getContactPoints(bodyA=self._arm, physicsClientId=client):
+            if point[CONTACT_DISTANCE] <= -MIN_OVERLAP:
+                link, other = (min(each, n - 1) + 1 for each in point[3:5])  # PyBullet counts the base as -1
+                yield Overlap(link, self._boxes.get(point[2], other))
+
+    def close(self) -> None:
+        """Leave the world; calling it twice is allowed."""
+        if self._client >= 0:
+            client, self._client = self._client, -1
+            if pybullet.isConnected(client):
+                pybullet.disconnect(client)

@@ -1,1 +1,0 @@
-"""The UR5 in PyBullet, seen through a rendered camera."""

@@ -1,0 +1,398 @@
+"""MuJoCo: a scene for the cameras, rendered through OpenGL without a window, and the moving arm.
+
+MuJoCo brings no renderer: it uses the OpenGL of the machine, through EGL or OSMesa on Linux, both of which also run on
+the processor alone. The environment variable MUJOCO_GL chooses between them, as everywhere with MuJoCo.
+
+The bodies are those of the URDF that PyBullet loads. One pass gives colours and depths, without shadows, reflections
+and smoothing, which would cost many times as much on a processor. A window of an image costs less than all of it: parts
+outside of it are left out, and no other pixel is filled. OpenGL samples pixels in their middle and
+`servobench.plant.robot.camera` elsewhere, so the camera's frustum is shifted by the difference.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import cv2
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.detection import Window, whole
+from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
+from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
+from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
+from servobench.plant.robot.robot import GRAVITY
+
+if TYPE_CHECKING:
+    from servobench.plant.contract.checks import FloatArray
+    from servobench.plant.rendered.detection import ByteArray
+    from servobench.plant.rendered.room import Room
+
+if mujoco.get_mju_user_warning() is None:
+    # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; what is wrong shows in the joints.
+    mujoco.set_mju_user_warning(lambda _: None)
+
+LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # on Linux, the first choice first
+ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # what other systems bring
+INSTALL: Final = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
+SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
+AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
+LIGHT = (-0.3, 0.25, -1.0)  # direction of the light, base frame
+MAX_PARTS = 1000  # that are drawn
+SHOWN, HIDDEN = 0, 5  # groups of parts, of which MuJoCo draws the first three
+COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRND_HAZE")
+STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, the shortest that MuJoCo integrates well
+
+
+# MuJoCo would leave out what is only drawn, and join what does not move against each other.
+KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="{fuse}" strippath="true"/></mujoco>'
+
+
+def renderer_name() -> str:
+    """Return by what MuJoCo gets at OpenGL: the word of MUJOCO_GL, or else the first one that this machine has.
+
+    Raises:
+        ValueError: the machine has none.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen:
+        return chosen
+    if not sys.platform.startswith("linux"):
+        return ELSEWHERE[sys.platform]
+    for name, library in LIBRARIES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        return name
+    raise ValueError(f"MuJoCo has nothing to render with, neither EGL nor OSMesa: {INSTALL}")
+
+
+def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class that belongs to the renderer
+    """Return an OpenGL context for images of up to width × height [px]; it is current within `as_current()`.
+
+    Raises:
+        ValueError: the machine cannot render; says what to install.
+    """
+    name = renderer_name()
+    try:
+        context = import_module(f"mujoco.{name}").GLContext(width, height)
+        with context.as_current():
+            return context
+    except Exception as error:  # what is missing shows in many ways, by library and by driver
+        why = " ".join(str(error).split())
+        raise ValueError(f"MuJoCo cannot render through {name} ({type(error).__name__}: {why}): {INSTALL}") from error
+
+
+@contextmanager
+def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
+    """Let OpenGL fill no pixel of the current context outside of a rectangle, counted from the lower left corner."""
+    from OpenGL import GL  # noqa: PLC0415 - chooses its platform by what `open_context` has loaded
+
+    GL.glEnable(GL.GL_SCISSOR_TEST)
+    GL.glScissor(left, bottom, width, height)
+    try:
+        yield
+    finally:
+        GL.glDisable(GL.GL_SCISSOR_TEST)
+
+
+@cache
+def missing_renderer() -> str:
+    """Return a line about what this machine lacks for images; empty if nothing."""
+    try:
+        open_context(16, 16).free()
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+@cache
+def describe_renderer() -> str:
+    """Return which engine computes, and what renders its images."""
+    from OpenGL import GL  # noqa: PLC0415 - as above
+
+    if missing_renderer():
+        return f"MuJoCo {version('mujoco')}, nothing to render with"
+    context = open_context(16, 16)
+    with context.as_current():
+        renderer = GL.glGetString(GL.GL_RENDERER).decode()
+    context.free()
+    return f"MuJoCo {version('mujoco')}, rendered by {renderer} through {renderer_name().upper()}"
+
+
+class MujocoScene(Scene):
+    """An arm with a ball on its flange in a MuJoCo model of its own; joint angles here are the true ones, θ."""
+
+    def __init__(self, room: Room, *, window: bool = False) -> None:
+        """Load the room; see `OpenScene`.
+
+        Raises:
+            ValueError: a robot with another number of joints, nothing to render with, or a window is wanted.
+        """
+        if window:
+            raise ValueError("view needs the plant bullet: mujoco opens no window")
+        self._model = _compile(room)
+        self._data = mujoco.MjData(self._model)
+        mujoco.mj_forward(self._model, self._data)  # places the light
+        self._ball = self._model.body(BALL_LINK).id
+        self._drawn = mujoco.MjvScene(self._model, MAX_PARTS)
+        for name in COSTLY:
+            self._drawn.flags[getattr(mujoco.mjtRndFlag, name)] = 0
+        self._options, self._view = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._gl = open_context(self._model.vis.global_.offwidth, self._model.vis.global_.offheight)
+        with self._gl.as_current():
+            self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_50)
+            self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+
+    def place(self, theta: FloatArray) -> None:
+        """See `Scene.place`."""
+        self._data.qpos[:] = theta
+        mujoco.mj_kinematics(self._model, self._data)
+
+    def ball_position(self) -> FloatArray:
+        """See `Scene.ball_position`."""
+        return np.array(self._data.xpos[self._ball])
+
+    def render(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
+    ) -> tuple[ByteArray, FloatArray]:
+        """See `Scene.render`."""
+        rgb, depth = self.draw(camera, X_BC, window or whole(camera))
+        # Beyond the floor is black, to be white. A sky of MuJoCo's would stand in front of far things.
+        cv2.bitwise_not(rgb, dst=rgb, mask=cv2.inRange(depth, np.zeros(1), np.zeros(1)))
+        return rgb[::-1].copy(), 1.0 - depth[::-1].astype(np.float64)
+
+    def draw(
+        self, camera: PinholeCamera, X_BC: FloatArray, window: Window
+    ) -> tuple[ByteArray, npt.NDArray[np.float32]]:
+        """Return colours (h, w, 3) and depths (h, w) of a window as OpenGL has them, with the lowest row first.
+
+        Depths fall from 1 at the near plane to 0 at the far one, where float32 is finest.
+        """
+        self._leave_out(camera, X_BC, window)
+        mujoco.mjv_updateScene(
+            self._model, self._data, self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
+        )
+        for eye in self._drawn.camera:
+            _aim(eye, camera, X_BC)
+        shape, context = (window.bottom - window.top, window.right - window.left), self._context
+        part = (window.left, camera.height - window.bottom, *shape[::-1])
+        rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
+        with self._gl.as_current(), scissors(*part):
+            if camera.width > context.offWidth or camera.height > context.offHeight:
+                size = max(camera.width, context.offWidth), max(camera.height, context.offHeight)
+                mujoco.mjr_resizeOffscreen(*size, context)
+            mujoco.mjr_render(mujoco.MjrRect(0, 0, camera.width, camera.height), self._drawn, context)
+            mujoco.mjr_readPixels(rgb, depth, mujoco.MjrRect(*part), context)
+        return rgb, depth
+
+    def _leave_out(self, camera: PinholeCamera, X_BC: FloatArray, window: Window) -> None:
+        """Let the parts be drawn whose bounding sphere reaches into the pyramid of rays through a window."""
+        columns, rows = (window.left, window.right), (window.top, window.bottom)
+        (left, top, _), (right, bottom, _) = camera.rays(columns, rows).tolist()
+        inwards = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+        inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
+        centres = (self._data.geom_xpos - X_BC[:3, 3]) @ (X_BC[:3, :3] @ inwards.T)
+        seen = (centres >= -self._model.geom_rbound[:, None]).all(axis=1)
+        self._model.geom_group[:] = np.where(seen, SHOWN, HIDDEN)
+
+    def close(self) -> None:
+        """See `Scene.close`."""
+        if self._gl is not None:
+            with self._gl.as_current():
+                self._context.free()
+            self._gl.free()
+            self._gl = None
+
+
+def _compile(room: Room) -> Any:  # noqa: ANN401
+    """Return the model of all that is drawn, an `MjModel`."""
+    files = room.files()
+    (_, spec), *around = [(name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")]
+    for name, body in around:
+        spec.attach(body, prefix=f"{name}/", frame=spec.worldbody.add_frame())
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        dir=LIGHT,
+        ambient=[AMBIENT] * 3,
+        diffuse=[DIFFUSE] * 3,
+        specular=[0.0] * 3,
+        castshadow=False,
+    )
+    looks = spec.visual
+    looks.headlight.active = 0
+    looks.quality.offsamples, looks.quality.shadowsize = 0, 0
+    looks.quality.numslices, looks.quality.numstacks, looks.quality.numquads = SLICES, STACKS, 1
+    return spec.compile()
+
+
+def _aim(eye: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # noqa: ANN401 - an `MjvGLCamera`
+    """Let a camera of OpenGL see what `camera` sees from X_BC (4, 4), pixel by pixel."""
+    eye.pos, eye.forward, eye.up = X_BC[:3, 3], X_BC[:3, 2], -X_BC[:3, 1]
+    pixel = camera.near / camera.focal  # [m] of a pixel on the near plane
+    right, down = pixel * (PIXEL_CENTRE[0] - 0.5), pixel * (PIXEL_CENTRE[1] - 0.5)
+    half = 0.5 * camera.height * pixel
+    eye.frustum_center, eye.frustum_width = right, 0.5 * camera.width * pixel
+    eye.frustum_bottom, eye.frustum_top = -half - down, half - down
+    eye.frustum_near, eye.frustum_far, eye.orthographic = camera.near, camera.far, 0
+
+
+class MujocoState(NamedTuple):
+    """The joints, their loops, and what MuJoCo takes from one step to the next; arrays never change.
+
+    Attributes:
+        loops: angles and speeds of the joints with their loops.
+        acceleration: (n,) [rad/s²], from which the next solution of the constraints starts.
+    """
+
+    loops: DriveState
+    acceleration: FloatArray
+
+    @property
+    def angle(self) -> FloatArray:
+        """Joint angles θ, (n,) [rad]."""
+        return self.loops.angle
+
+
+class MujocoSimulation(Simulation):
+    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next."""
+
+    def __init__(self, machine: Machine) -> None:
+        """Load the arm.
+
+        Raises:
+            ValueError: a list of the drives that does not fit the joints, or bodies that MuJoCo refuses.
+        """
+        drives = machine.drives
+        drives.check(machine.arm.n)
+        self._dynamics = drives.dynamics
+        self._n = machine.arm.n
+        self._model = _moving(machine)
+        self._data = mujoco.MjData(self._model)
+        self._shapes, self._boxes = _solid(machine)
+        self._placed, self._bodies = mujoco.MjData(self._shapes), self._shapes.geom_bodyid.tolist()
+        body = self._data.qpos, self._data.qvel, self._data.qfrc_gravcomp
+        self._drives = Drives(drives, machine.lag, _assumed_inertia(machine), machine.stops, body)
+
+    def start(self, angle: FloatArray) -> MujocoState:
+        """See `Simulation.start`."""
+        data, rest = self._data, np.zeros(self._n)
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = angle, rest, rest
+        data.qfrc_applied[:] = 0.0
+        mujoco.mj_step1(self._model, data)
+        missing = data.qfrc_bias - data.qfrc_gravcomp
+        return MujocoState(DriveState(angle, rest, angle, rest, missing), rest)
+
+    def advance(self, joints: MujocoState, speed: FloatArray, steps: int) -> MujocoState:
+        """See `Simulation.advance`."""
+        drives, model, data = self._drives, self._model, self._data
+        drives.take(joints.loops, speed)
+        if not self._dynamics:
+            for _ in range(steps):
+                drives.track()
+            return MujocoState(drives.give(), joints.acceleration)
+        data.qacc_warmstart[:] = joints.acceleration
+        torque, compensation, applied = drives.torque, data.qfrc_gravcomp, data.qfrc_applied
+        for _ in range(steps):
+            mujoco.mj_step1(model, data)
+            drives.step()
+            np.subtract(torque, compensation, out=applied)  # MuJoCo adds the compensation itself
+            mujoco.mj_step2(model, data)
+        return MujocoState(drives.give(), data.qacc_warmstart.copy())
+
+    def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
+        """See `Simulation.overlaps`."""
+        model, data, bodies = self._shapes, self._placed, self._bodies
+        data.qpos[:] = angle
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_collision(model, data)
+        for pair in data.contact.geom[data.contact.dist <= -MIN_OVERLAP].tolist():
+            first, second = sorted(bodies[part] for part in pair)
+            link = min(second - 1, self._n)  # MuJoCo counts the world as 0, the base as 1
+            if first == 0:
+                yield Overlap(link, self._boxes[min(pair)])
+            else:
+                yield Overlap(link, min(first - 1, self._n))
+
+    def close(self) -> None:
+        """See `Simulation.close`; MuJoCo frees its memory with the object."""
+
+
+def _moving(machine: Machine) -> Any:  # noqa: ANN401
+    """Return the model of the arm in motion, an `MjModel` with the true load."""
+    drives = machine.drives
+    spec = read_urdf(arm_mechanics(machine.arm, drives.payload, shapes=False, robot=machine.robot))
+    option = spec.option
+    option.timestep, option.gravity = PHYSICS_STEP, (0.0, 0.0, -GRAVITY)
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # joints that are not finite shall show
+    for joint, lower, upper in zip(spec.joints, *machine.stops, strict=True):
+        joint.limited, joint.range = True, (lower, upper)
+    model = spec.compile()
+    model.dof_armature[:] = drives.rotor_inertia
+    model.dof_damping[:], model.dof_frictionloss[:] = drives.viscous_friction, drives.coulomb_friction
+    for solution in (model.jnt_solref, model.dof_solref):
+        solution[:] = STIFF, 1.0
+    model.body_gravcomp[:] = 1.0
+    light = LIGHT_PART[0]
+    model.body_gravcomp[model.body(BALL_LINK).id] = (light + drives.assumed_payload) / (light + drives.payload)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def _assumed_inertia(machine: Machine) -> FloatArray:
+    """Return the inertia of links and assumed load at the start, (n, n) [kg m²], without the rotors."""
+    payload = machine.drives.assumed_payload
+    model = read_urdf(arm_mechanics(machine.arm, payload, shapes=False, robot=machine.robot)).compile()
+    data, columns = mujoco.MjData(model), np.empty((model.nv, model.nv))
+    data.qpos[:] = machine.start
+    mujoco.mj_forward(model, data)
+    for column, joint in zip(columns, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, column, joint)
+    return columns
+
+
+def _solid(machine: Machine) -> tuple[Any, dict[int, str]]:
+    """Return the model of all that can be met, an `MjModel`, and the names of its boxes by number."""
+    spec = read_urdf(arm_mechanics(machine.arm, 0.0, shapes=True, robot=machine.robot))
+    boxes = (*room_boxes(machine.robot.workspace.scale), *machine.boxes)
+    for box in boxes:
+        half = [side / 2.0 for side in box.size]
+        spec.worldbody.add_geom(name=box.name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=box.centre, size=half)
+    model = spec.compile()
+    return model, {model.geom(box.name).id: box.name for box in boxes}
+
+
+def read_urdf(text: str, meshes: Mapping[str, str] | None = None, *, fuse: bool = False) -> Any:  # noqa: ANN401
+    """Return the editable model, an `MjSpec`, of a URDF.
+
+    Args:
+        text: the URDF.
+        meshes: Wavefront OBJ text by the file names in the URDF; other files are left alone.
+        fuse: join links that a fixed joint connects: a step takes less time, and they lose their names.
+
+    Raises:
+        ValueError: MuJoCo cannot read it.
+    """
+    head, tag, rest = text.partition(">")
+    keep = KEEP_ALL.format(fuse=str(fuse).lower())
+    spec = mujoco.MjSpec.from_string(
+        f"{head}{tag}{keep}{rest}", assets={name: mesh.encode() for name, mesh in (meshes or {}).items()}
+    )
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # a flat one has no volume
+    return spec

@@ -1,1 +1,0 @@
-"""The UR5 in MuJoCo, seen through a rendered camera."""
