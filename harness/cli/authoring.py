@@ -65,7 +65,7 @@ def check(
     """
     from rich.text import Text
 
-    from servobench.harness.batch.apart import Checks, check_apart
+    from servobench.harness.batch.trials import Checks, run_checks
     from servobench.harness.check.controllers import check_controller
     from servobench.harness.check.plants import check_plant
     from servobench.harness.check.report import Finding
@@ -88,7 +88,7 @@ def check(
             soft_wrap=True,
         )
 
-    check_apart(checks, name, limit, hear)
+    run_checks(checks, name, limit, hear)
     failed = sum(finding.verdict == "failed" for finding in findings)
     console.print(f"{name}: " + (f"{failed} of {len(findings)} checks failed" if failed else "keeps its contract"))
     if failed:
@@ -113,7 +113,7 @@ def shadow(
 
     Nothing is simulated: its commands do not change the log.
     """
-    from servobench.harness.batch.logged import logged_in_file, logged_in_folder
+    from servobench.harness.batch.logs import logged_in_file, logged_in_folder
     from servobench.harness.config.registry import choose_controller
     from servobench.harness.run.shadow import differences, has_commands
     from servobench.harness.run.shadow import shadow as see

@@ -124,7 +124,7 @@ def _shown(folder: Path | None, run_id: str | None, new: NewRun) -> LoggedRun:
 def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
     """Return a run of a results folder; without a name the only one."""
     from servobench.harness.batch import results
-    from servobench.harness.batch.logged import find_run
+    from servobench.harness.batch.logs import find_run
     from servobench.harness.config.registry import rendered_plant
     from servobench.harness.pictures.replay import logged_run
 
@@ -135,7 +135,7 @@ def _run_of(folder: Path, run_id: str | None) -> LoggedRun:
 
 def _carried_out(new: NewRun) -> LoggedRun:
     """Carry out a run to be shown."""
-    from servobench.harness.batch.apart import choose_controllers, choose_plants
+    from servobench.harness.batch.trials import choose_controllers, choose_plants
     from servobench.harness.config.registry import rendered_plant
     from servobench.harness.config.settings import flatten, read_settings
     from servobench.harness.pictures.replay import logged_run

@@ -143,9 +143,9 @@ def validate(file: FileArgument) -> None:
 
     The run happens in a process of its own.
     """
-    from servobench.harness.batch.validation import validate_apart
+    from servobench.harness.batch.trials import validate
 
-    found = validate_apart(file)
+    found = validate(file)
     for problem in found.problems:
         console.print(f"problem: {problem}", soft_wrap=True, markup=False)
     if found.deviation is None:

@@ -16,7 +16,7 @@ from servobench.harness.cli.options import JsonOption
 from servobench.harness.cli.terminal import console, print_json, refuse, say, writing
 
 if TYPE_CHECKING:
-    from servobench.harness.batch.trial import Tried
+    from servobench.harness.batch.trials import Tried
 
 DEFAULT_ROBOT = "ur5"
 STANDARD_OUTPUT = Path("-")
@@ -28,8 +28,7 @@ def plants(
     as_json: JsonOption = False,
 ) -> None:
     """List the plants, or show the settings of one."""
-    from servobench.harness.batch.apart import choose_plants
-    from servobench.harness.batch.trial import try_plants
+    from servobench.harness.batch.trials import choose_plants, try_plants
     from servobench.harness.config.registry import find_plant, unused_points
     from servobench.plant.bench.plant import PlantEntry
 
@@ -47,8 +46,7 @@ def controllers(
     """List the controllers, or show the settings of one."""
     from servobench.controllers.controller import ControllerEntry
     from servobench.controllers.parts import ESTIMATORS, LAWS
-    from servobench.harness.batch.apart import choose_controllers
-    from servobench.harness.batch.trial import try_controllers
+    from servobench.harness.batch.trials import choose_controllers, try_controllers
     from servobench.harness.config.defaults import default_config
     from servobench.harness.config.registry import find_controller, unused_points
 

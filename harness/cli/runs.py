@@ -129,7 +129,7 @@ def train(
     """
     from rich.table import Table
 
-    from servobench.harness.batch.apart import choose_controllers
+    from servobench.harness.batch.trials import choose_controllers
     from servobench.harness.cli.progress import telling
     from servobench.harness.run.experiment import train_networks
     from servobench.harness.run.knowledge import NETWORKS

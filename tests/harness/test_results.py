@@ -13,10 +13,11 @@ from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import statistics_rows, summary_legend, summary_tables
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.batch import parquet, results
+from servobench.harness.batch import results
+from servobench.harness.batch import tables as parquet
 from servobench.harness.batch.checksums import SUMS
-from servobench.harness.batch.columns import NEEDED
 from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.tables import NEEDED
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import error_curves, path_views
