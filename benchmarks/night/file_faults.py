@@ -41,7 +41,7 @@ from servobench.harness.batch.checksums import UnwritableFolder
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import is_unused
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.workers import Bounds
+from servobench.harness.batch.sandbox import Bounds
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import knowledge as network_cache
 from servobench.harness.run.knowledge import NETWORKS, network_source

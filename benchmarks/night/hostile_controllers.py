@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import ctypes
 import faulthandler
+import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -90,6 +92,21 @@ class EndsItsParent(Quiet):
     def strike(self):
         os.kill(os.getppid(), signal.SIGKILL)
         time.sleep(60)
+
+
+class StopsItsParent(Quiet):
+    def strike(self):
+        os.kill(os.getppid(), signal.SIGSTOP)
+        time.sleep(60)
+
+
+class Forges(Quiet):
+    """Answers with a pickled call in place of a result."""
+
+    def strike(self):
+        call = f"cos\nsystem\n(S'touch {os.environ.get('FORGED', '')}'\ntR."
+        json.dumps = lambda *_, **__: call
+        pickle.dumps = lambda *_, **__: call.encode()
 
 
 class ClosesFiles(Quiet):

@@ -52,12 +52,12 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
     "statistics": (("harness/analysis/statistics.py",), ("harness/test_statistics.py",)),
     "results": (
-        ("harness/batch/results.py", "harness/batch/columns.py"),
+        ("harness/batch/results.py", "harness/batch/tables.py"),
         ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
     ),
     "folders": (
-        ("harness/batch/parquet.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
-         "harness/batch/manifest_text.py"),
+        ("harness/batch/tables.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
+         "harness/batch/results.py"),
         ("harness/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
     ),
 }  # fmt: skip

@@ -26,7 +26,7 @@ from servobench.harness.batch.checksums import SUMS
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.lock import locked
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.workers import Bounds
+from servobench.harness.batch.sandbox import Bounds
 from servobench.harness.config.settings import ConfigurationError, Settings
 
 RUNS = 4

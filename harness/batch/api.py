@@ -17,7 +17,7 @@ from servobench.controllers.controller import Controller, ControllerEntry
 from servobench.harness.batch import results
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out, comparison
 from servobench.harness.batch.plan import Batch, Cell, Grid
-from servobench.harness.batch.workers import Bounds
+from servobench.harness.batch.sandbox import Bounds
 from servobench.harness.config.entries import CONTROLLER, PLANT, own_object
 from servobench.harness.config.registry import Offer, choose_controller, choose_plant, offer, offered, offering
 from servobench.harness.config.robots import DEFAULT_ROBOT

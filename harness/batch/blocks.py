@@ -15,17 +15,22 @@ from __future__ import annotations
 import contextlib
 import math
 import pickle
+from base64 import b64decode, b64encode
 from collections import deque
-from collections.abc import Hashable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import astuple, dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
 from servobench.controllers.networks.fit import Progress
-from servobench.harness.batch.guard import LOST, End, Task, Tell
 from servobench.harness.batch.plan import Cell
-from servobench.harness.batch.pool import Answer
+from servobench.harness.batch.sandbox import LOST, Answer, End, Task, Tell
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.registry import (
     Offer,
@@ -36,12 +41,15 @@ from servobench.harness.config.registry import (
     offering,
 )
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import SourceFile
 from servobench.harness.run import episode
 from servobench.harness.run.experiment import build_once
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import CRASHED, Ending, RunResult, ends_batch
 
 BLOCK: Final = 128  # [runs] that advance together: more of them leave the cache of a processor
+RUN_ID: Final = "run_id"
+TEXTS: Final = ("robot", "engine", "task_kind", "feature_unit", "reason")  # columns of a row; others are numbers
 CHUNK: Final = 8  # [runs] one by one: a crash costs at most so many, and messages and files cost little
 
 
@@ -136,8 +144,7 @@ def carry_out_blocks(
     under_way = 0
     while True:
         while under_way < workers.window and (given := again.popleft() if again else next(waiting, None)):
-            packed = _pack(given, steps, keep)
-            future = workers.submit(Task(_carry_out_packed, packed, given.jobs[0].owner, given.fresh))
+            future = workers.submit(_task(_carry_out_there, given, steps, keep))
             future.add_done_callback(lambda done, block=given: finished.put((block, done)))
             under_way += 1
         if not under_way:
@@ -156,9 +163,15 @@ def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResul
         answer: Answer = future.result()
     except workers.lost:
         answer = Answer([], End(Ending(CRASHED, LOST), certain=True))
-    done, end = list(answer.items), answer.end
-    if done and isinstance(done[0], Ending):
-        return [_failed(job.cell, done[0]) for job in block.jobs], []
+    match answer.items:
+        case [{"unreadable": [str(status), str(reason), str(trace)]}]:
+            return [_failed(job.cell, Ending(status, reason, trace)) for job in block.jobs], []
+    done, end = list[RunResult](), answer.end
+    try:
+        done.extend(unpack_result(job.cell, item) for job, item in zip(block.jobs, answer.items, strict=False))
+    except ValueError as error:
+        reason = f"the answer of the run cannot be read: {error}"
+        end = End(Ending(CRASHED, reason), certain=block.fresh and not done)
     if end is None:
         return done, []
     if not done and len(block.jobs) > 1 and block.together:
@@ -171,13 +184,17 @@ def _outcome(block: Block, future: Any, workers: Workers) -> tuple[list[RunResul
     return done, [single.part(len(done))] if len(done) < len(block.jobs) else []
 
 
-def _pack(block: Block, steps: bool, keep: Path | None) -> bytes:
+def _task(function: Callable[[Any, Tell], None], block: Block, steps: bool = False, keep: Path | None = None) -> Task:
+    """Return the task of a block; files of users are loaded first, so that the classes of their settings are found."""
     sources = tuple(each.source for each in block.own if each.source is not None)
     try:
-        return pickle.dumps((sources, pickle.dumps((block, steps, keep))))
+        packed = pickle.dumps((sources, pickle.dumps((block, steps, keep))))
     except Exception as error:
-        what = f"the run {block.jobs[0].cell.request.run_id} cannot be sent to another process"
-        raise ConfigurationError(f"{what}: {error}; use one worker") from error
+        run_id = block.jobs[0].cell.request.run_id
+        raise ConfigurationError(
+            f"the run {run_id} cannot be sent to another process: {error}; use one worker"
+        ) from error
+    return Task(function, packed, block.jobs[0].owner, block.fresh)
 
 
 def build_block(block: Block, workers: Workers, progress: Progress) -> None:
@@ -186,55 +203,56 @@ def build_block(block: Block, workers: Workers, progress: Progress) -> None:
     Args:
         block: one run.
         workers: processes of this machine.
-        progress: called with the share of a training of networks that is done.
+        progress: called with the finished share of a training of networks.
 
     Raises:
         ConfigurationError: a setting that cannot be used. If the worker ends instead, the run will say so.
     """
     refused: list[str] = []
 
-    def hear(told: tuple[float, str] | str) -> None:
-        if isinstance(told, str):
-            refused.append(told)
-        else:
-            progress(*told)
+    def hear(told: object) -> None:
+        match told:
+            case [float(share), str(subject)]:
+                progress(share, subject)
+            case str(refusal):
+                refused.append(refusal)
 
     if workers.submit is None:
         raise ValueError("workers must have processes, got none")
-    workers.submit(Task(_build, _pack(block, False, None), block.jobs[0].owner), hear).result()
+    workers.submit(_task(_build, block), hear).result()
     if refused:
         raise ConfigurationError(refused[0])
 
 
-def _build(task: bytes, tell: Tell) -> None:
-    """Build a run in a worker and tell how far its networks are trained, and what is configured wrongly."""
-    block, *_ = _unpack(task)
+def _build(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
+    """Build a run in a worker and report the training of its networks, and a wrong configuration."""
+    block, *_ = _unpack(packed)
     with offering(block.own):
         _load(block)
         tell(None)
         try:
-            build_once(block.jobs[0].run, lambda share, what: tell((share, what)))
+            build_once(block.jobs[0].run, lambda share, subject: tell([float(share), subject]))
         except ConfigurationError as error:
             tell(str(error))
 
 
-def _carry_out_packed(task: bytes, tell: Tell) -> None:
-    """Carry a block out in a worker; where it cannot be read, such as without its plug-in, tell why."""
+def _carry_out_there(packed: tuple[tuple[SourceFile, ...], bytes], tell: Tell) -> None:
+    """Carry a block out in a worker; where it cannot be read, for instance without its plug-in, report why."""
     try:
-        block, steps, keep = _unpack(task)
+        block, steps, keep = _unpack(packed)
     except Exception as error:  # noqa: BLE001 - of a plug-in
-        tell(Ending.of(error))
+        tell({"unreadable": astuple(Ending.of(error))})
         return
     with offering(block.own):
         _load(block)
-    tell(None)  # the time limit begins after what is imported once
-    _carry_out(block, tell, steps, keep)
+    tell(None)  # the time limit begins after the imports
+    _carry_out(block, lambda result: tell(pack_result(result)), steps, keep)
 
 
-def _unpack(task: bytes) -> tuple[Block, bool, Path | None]:
-    sources, content = pickle.loads(task)
+def _unpack(packed: tuple[tuple[SourceFile, ...], bytes]) -> tuple[Block, bool, Path | None]:
+    sources, content = packed
     for source in sources:
-        source.load()  # so that the classes of its settings are found
+        source.load()
     unpacked: tuple[Block, bool, Path | None] = pickle.loads(content)
     return unpacked
 
@@ -247,7 +265,9 @@ def _load(block: Block) -> None:
         find_controller(request.controller)
 
 
-def _carry_out(block: Block, tell: Tell, steps: bool, keep: Path | None, debug: bool = False) -> None:
+def _carry_out(
+    block: Block, tell: Callable[[RunResult], None], steps: bool, keep: Path | None, debug: bool = False
+) -> None:
     """Carry a block out and tell the result of each run."""
     with offering(block.own):
         together: list[RunResult] = []
@@ -267,7 +287,7 @@ def _carry_out_run(job: Job, steps: bool, keep: Path | None, debug: bool) -> Run
     except BaseException as error:
         if debug or ends_batch(error):
             raise
-        return _failed(job.cell, Ending.of(error))  # whatever a plug-in does, the others go on
+        return _failed(job.cell, Ending.of(error))  # a plug-in may raise anything; the other runs go on
     return _with_columns(job.cell, result)
 
 
@@ -277,3 +297,73 @@ def _with_columns(cell: Cell, result: RunResult) -> RunResult:
 
 def _failed(cell: Cell, ending: Ending) -> RunResult:
     return _with_columns(cell, RunResult.failed(episode.identity(cell.request), ending))
+
+
+def pack_result(result: RunResult) -> dict[str, Any]:
+    """Return a result as JSON values, which a process can read without executing code of the sender."""
+    steps = None if result.steps is None else result.steps.drop(columns=RUN_ID, errors="ignore").to_records(index=False)
+    return {"row": result.row, "steps": _pack_array(steps), "picture": _pack_array(result.picture),
+            "trace": result.trace}  # fmt: skip
+
+
+def unpack_result(cell: Cell, told: object) -> RunResult:
+    """Return the result of a run from the answer of a worker, in which code of users may have falsified anything.
+
+    Raises:
+        ValueError: it is not the result of this run.
+    """
+    match told:
+        case {
+            "row": dict(row),
+            "steps": str() | None as steps,
+            "picture": str() | None as picture,
+            "trace": str(trace),
+        }:
+            pass
+        case _:
+            raise ValueError("it is not the result of a run")
+    known = _failed(cell, Ending()).row
+    if missing := known.keys() - row.keys():
+        raise ValueError(f"it lacks {min(missing)}")
+    if row[RUN_ID] != known[RUN_ID]:
+        raise ValueError("it is that of another run")
+    for name, value in row.items():
+        usual = str if name in TEXTS else float
+        kinds = (usual, type(None)) if known.get(name) is None else (type(known[name]),)
+        if not isinstance(value, kinds):
+            raise ValueError(  # noqa: TRY004 - the data are wrong, not the call
+                f"its {name} is {str(value)[:60]!r}, wanted a value of type {kinds[0].__name__}"
+            )
+    table = None
+    if (records := _unpack_array(steps)) is not None:
+        if any(records.dtype[name].kind not in "fib" for name in records.dtype.names or ()):
+            raise ValueError("its steps are no numbers")
+        table = pd.DataFrame.from_records(records)
+        table.insert(0, RUN_ID, row[RUN_ID])
+    image = _unpack_array(picture)
+    if image is not None and (image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size):
+        raise ValueError("its picture is no image")
+    return RunResult(row, table, image, trace)
+
+
+def _pack_array(array: npt.NDArray[Any] | None) -> str | None:
+    if array is None:
+        return None
+    content = BytesIO()
+    np.save(content, array, allow_pickle=False)
+    return b64encode(content.getvalue()).decode("ascii")
+
+
+def _unpack_array(text: str | None) -> npt.NDArray[Any] | None:
+    """Return an array.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if text is None:
+        return None
+    try:
+        array: npt.NDArray[Any] = np.lib.format.read_array(BytesIO(b64decode(text)), allow_pickle=False)
+    except (EOFError, MemoryError, OverflowError, RecursionError, SyntaxError, TypeError) as error:
+        raise ValueError(str(error)) from error
+    return array

@@ -23,7 +23,8 @@ from servobench.harness.batch.integrity import check_resumable, mend, restore_ma
 from servobench.harness.batch.lock import Lock, check_empty, is_unused, locked
 from servobench.harness.batch.manifest import describe_batch
 from servobench.harness.batch.plan import Batch, Cell, Grid, Survey, refuse_tuning_seeds, survey
-from servobench.harness.batch.workers import Bounds, Workers, open_workers
+from servobench.harness.batch.sandbox import Bounds
+from servobench.harness.batch.workers import Workers, open_workers
 from servobench.harness.config.registry import Offer, offered
 from servobench.harness.config.settings import Assignment, ConfigurationError, Settings
 from servobench.harness.run.experiment import build_once

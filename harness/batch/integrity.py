@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from servobench.harness.batch import parquet, results
+from servobench.harness.batch import results
+from servobench.harness.batch import tables as parquet
 from servobench.harness.batch.checksums import (
     SUMS,
     DamagedFile,
@@ -19,9 +20,9 @@ from servobench.harness.batch.checksums import (
     write_vouched,
     writing,
 )
-from servobench.harness.batch.columns import lacking
 from servobench.harness.batch.lock import PARTS
 from servobench.harness.batch.results import FAILURES, MANIFEST, PART, RUNS, STEPS
+from servobench.harness.batch.tables import lacking
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.result import log_entry
 from servobench.plant.contract.files import PARTIAL

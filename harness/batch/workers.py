@@ -6,7 +6,6 @@ The one module that imports Dask.
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import pickle
 import re
@@ -14,18 +13,13 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from servobench.harness.batch.guard import Limits, Task
-from servobench.harness.batch.pool import Answer, Pool
-from servobench.harness.batch.processes import machine_memory
+from servobench.harness.batch.sandbox import POSSIBLE, Answer, Bounds, Limits, Pool, Task
 from servobench.harness.config.registry import Offer, is_foreign_controller, is_foreign_plant, own_modules
 from servobench.harness.config.settings import ConfigurationError
 
 MAX_DEFAULT_WORKERS: Final = 8
 SCHEDULER_TIMEOUT: Final = 10.0  # [s], until a scheduler and its first worker answer
 TASKS_PER_WORKER: Final = 2  # handed out at a time, so that no worker waits for its next task
-FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
-FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all runs of foreign code that go at a time
-LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] that each of them has at least
 MODULES: Final = ("servobench.harness.run.episode", "servobench.harness.batch.blocks")  # that a worker imports once
 
 
@@ -44,27 +38,10 @@ class Workers:
         return TASKS_PER_WORKER * self.count
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """What the runs of a batch may take, and whether code of users is kept out of this process."""
-
-    run_timeout: float | None = None  # [s] time limit of a run, inf for none; None for the usual one
-    run_memory: float | None = None  # [bytes] memory limit of a run, inf for none; None for the usual one
-    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in processes of their own, with limits
-
-    def limits(self, count: int, *, foreign: bool) -> Limits:
-        """Return the limits of a run where `count` go at a time; foreign code has some also where none are given."""
-        time, memory = self.run_timeout, self.run_memory
-        if foreign:
-            time = FOREIGN_TIME if time is None else time
-            memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine_memory() / count) if memory is None else memory
-        seconds = None if time is None or math.isinf(time) else time
-        size = None if memory is None or math.isinf(memory) else int(memory)
-        return Limits(seconds, size, addresses=self.run_memory is not None)
-
-
 def default_workers() -> int:
     """Return the number of worker processes that are used where none is given."""
+    if not POSSIBLE:
+        return 1
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(MAX_DEFAULT_WORKERS, available)
 
@@ -82,7 +59,7 @@ def can_travel(own: Sequence[Offer]) -> bool:
 def open_workers(
     count: int | None = None,
     scheduler: str | None = None,
-    bounds: Bounds = Bounds(),
+    bounds: Bounds = Bounds(),  # noqa: B008 - it is frozen
     *,
     plants: Iterable[str] = (),
     controllers: Iterable[str] = (),
@@ -119,7 +96,9 @@ def open_workers(
     foreign = any(is_foreign_plant(name, trusted=name in trusted) for name in plants)
     foreign = foreign or any(map(is_foreign_controller, controllers))
     limits = bounds.limits(count, foreign=foreign and bounds.isolate and can_travel(own))
-    if count == 1 and limits == Limits():
+    if not POSSIBLE and (count > 1 or bounds.run_timeout is not None or bounds.run_memory is not None):
+        raise ConfigurationError("worker processes and limits of runs need a system that can copy processes: use Linux")
+    if not POSSIBLE or (count == 1 and limits == Limits()):
         yield Workers()
         return
     pool = Pool(count, limits, (*MODULES, *own_modules(plants, controllers)))
@@ -151,7 +130,7 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
             ) from error
 
         def submit(task: Task) -> Any:  # noqa: ANN401 - a future
-            return client.submit(_gather, task.function, task.argument, pure=False)
+            return client.submit(_gather, task, pure=False)
 
         threads = sum(client.nthreads().values())
         yield Workers(submit, threads, cluster=True, lost=(KilledWorker,))
@@ -159,8 +138,8 @@ def _open_cluster(scheduler: str) -> Iterator[Workers]:
         client.close()
 
 
-def _gather(function: Callable[[bytes, Callable[[Any], None]], None], argument: bytes) -> Answer:
+def _gather(task: Task) -> Answer:
     """Carry a task out on a cluster."""
-    items: list[Any] = []
-    function(argument, lambda item: None if item is None else items.append(item))
-    return Answer(items)
+    answer = Answer()
+    task.carry_out(lambda item: None if item is None else answer.items.append(item))
+    return answer

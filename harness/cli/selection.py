@@ -10,7 +10,7 @@ from servobench.harness.cli.terminal import refuse, say
 
 if TYPE_CHECKING:
     from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.trial import Tried
+    from servobench.harness.batch.trials import Tried
     from servobench.plant.bench.plant import PlantEntry
 
 
@@ -105,7 +105,7 @@ def known_plant(text: str | None) -> str:
 
     The default is the first of bullet, mujoco and kinematic that is installed.
     """
-    from servobench.harness.batch.apart import choose_plants
+    from servobench.harness.batch.trials import choose_plants
     from servobench.harness.config.registry import default_plant
     from servobench.plant.bench.plant import PlantEntry
 
@@ -122,7 +122,7 @@ def known_plant(text: str | None) -> str:
 def known_controller(text: str) -> str:
     """Return the name of the controller of a run, given by name or file."""
     from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.apart import choose_controllers
+    from servobench.harness.batch.trials import choose_controllers
 
     (name,) = choose_controllers([text])
     tell_unused(ControllerEntry, [name])
@@ -165,8 +165,7 @@ def refuse_repetition(option: str, values: Sequence[object]) -> None:
 
 def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of plants given by name or by file, such as ./cell.py:Cell."""
-    from servobench.harness.batch.apart import choose_plants
-    from servobench.harness.batch.trial import try_plants
+    from servobench.harness.batch.trials import choose_plants, try_plants
     from servobench.harness.config.registry import ALL, find_plant, plant_names
     from servobench.plant.bench.plant import PlantEntry
 
@@ -180,8 +179,7 @@ def split_plants(text: str, option: str = "plants", robot: str = "ur5") -> tuple
 def split_controllers(text: str, robot: str = "ur5") -> tuple[str, ...]:
     """Return the names of controllers given by name or by file, such as ./mine.py:Mine."""
     from servobench.controllers.controller import ControllerEntry
-    from servobench.harness.batch.apart import choose_controllers
-    from servobench.harness.batch.trial import try_controllers
+    from servobench.harness.batch.trials import choose_controllers, try_controllers
     from servobench.harness.config.registry import ALL, controller_names, find_controller
 
     known, names = controller_names(), list[str]()

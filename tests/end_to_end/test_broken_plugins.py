@@ -132,11 +132,11 @@ UNUSED_PLANT = (
 DRIVER = """
 import contextlib, io, json, sys
 from servobench.controllers import methods
-from servobench.harness.batch import apart, trial
+from servobench.harness.batch import trials
 from servobench.harness.cli.main import main
 from servobench.harness.config import registry
 
-trial.ANSWER_LIMIT = apart.IMPORT_LIMIT = 4.0
+trials.TRIAL_LIMIT = trials.IMPORT_LIMIT = 4.0
 registry.METHODS = {name: registry.METHODS[name] for name in ("ukf_mfac", "constant")}
 told = []
 for arguments in json.loads(sys.argv[1]):

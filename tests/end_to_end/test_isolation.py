@@ -36,6 +36,8 @@ WANTED = {  # by controller: status and reason of its runs
     "Exits": ("crashed", f"{KILLED}: exit code 9"),
     "Segfaults": ("crashed", f"{KILLED}: SIGSEGV"),
     "EndsItsParent": ("crashed", KILLED),
+    "StopsItsParent": ("crashed", "the run stopped the process that guards it"),
+    "Forges": ("crashed", "the answer of the run cannot be read: it is not the result of a run"),
     "ClosesFiles": ("crashed", f"{KILLED}.*"),
     "Hangs": ("timed_out", "the run took longer than 8 s"),
     "LeaksInChild": ("out_of_memory", "the run held more than 600 MB of memory"),
@@ -79,8 +81,10 @@ def swept(tmp_path_factory) -> pd.DataFrame:
     out, mark = tmp_path_factory.mktemp("hostile") / "out", "swept"
     names = (FALSE_WORLD, *WANTED)
     arguments = ("--controllers", places(*names), "--workers", "1", *SHORT, *LIMITS)
-    code, output = finish(start("sweep", *arguments, "--out", str(out), **{MARK: mark}))
+    forged = out.with_name("forged")
+    code, output = finish(start("sweep", *arguments, "--out", str(out), **{MARK: mark, "FORGED": str(forged)}))
     assert code == 0, output
+    assert not forged.exists()
     assert "Traceback" not in output
     assert_nothing_stays(mark)
     return results.load_runs(out).assign(log=(out / results.FAILURES).read_text())

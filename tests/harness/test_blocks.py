@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 from concurrent.futures import Future
 from dataclasses import replace
 
@@ -15,11 +16,11 @@ from kit.command import judged
 from servobench.harness.batch import blocks, results
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.campaign import Campaign, Execution, carry_out
-from servobench.harness.batch.guard import End
 from servobench.harness.batch.plan import Batch, Cell, Grid, SweepPlan, parse_variation, survey
-from servobench.harness.batch.pool import Answer
+from servobench.harness.batch.sandbox import Answer, End
 from servobench.harness.batch.workers import Workers
 from servobench.harness.config.settings import ConfigurationError, Settings
+from servobench.harness.run.episode import identity
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun
 from servobench.harness.run.result import Ending, RunResult
@@ -105,14 +106,14 @@ def dying_workers(how: Exception | End, sizes: list[int]) -> Workers:
                 raise Struck
 
         if not any(strikes):
-            task.function(task.argument, lambda item: item is None or items.append(item))
+            task.carry_out(lambda item: item is None or items.append(item))
             future.set_result(Answer(items))
         elif isinstance(how, Exception):
             future.set_exception(how)
         else:
             if not block.together:
                 with contextlib.suppress(Struck):
-                    task.function(task.argument, tell)
+                    task.carry_out(tell)
             if how.alone:  # the last answer is lost with the guard
                 future.set_result(Answer(items[:-1], how))
             else:
@@ -191,9 +192,11 @@ def test_blocks_are_made_when_a_worker_is_about_to_need_them():
             made.append(index)
             yield job(index, None)
 
-    def submit(_task):
+    def submit(task):
+        block = blocks.pickle.loads(blocks.pickle.loads(task.argument)[1])[0]
         done = Future()
-        done.set_result(Answer([RunResult({}, None)]))
+        failed = (RunResult.failed(identity(each.cell.request), Ending("crashed")) for each in block.jobs)
+        done.set_result(Answer([blocks.pack_result(result) for result in failed]))
         return done
 
     workers = Workers(submit, 3)
@@ -225,3 +228,42 @@ def test_a_survey_finds_what_the_runs_are_without_keeping_them():
     assert found.digest == survey(list(batch.requests())).digest != survey(batch.requests()[::-1]).digest
     with pytest.raises(ConfigurationError, match="the run kinematic-constant-random-none-3 is asked for twice"):
         survey([*batch.requests(), batch.requests()[0]])
+
+
+def told(**changes: object) -> dict[str, object]:
+    row = RunResult.failed(identity(job(0, None).cell.request), Ending()).row
+    return {"row": row, "steps": None, "picture": None, "trace": ""} | changes
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        (None, "it is not the result of a run"),
+        ("cos\nsystem\n(S'true'\ntR.", "it is not the result of a run"),
+        (told(steps=[1]), "it is not the result of a run"),
+        (told(row={}), "it lacks controller"),
+        (told(row=told()["row"] | {"run_id": "../../escaped"}), "it is that of another run"),
+        (told(row=told()["row"] | {"status": 3}), "its status is '3', wanted a value of type str"),
+        (told(row=told()["row"] | {"rms_error": "small"}), "its rms_error is 'small', wanted a value of type float"),
+        (told(steps="AAAA"), "reading magic string"),
+        (told(steps=blocks._pack_array(np.array([("a",)], dtype=[("x", "U1")]))), "its steps are no numbers"),
+        (told(picture=blocks._pack_array(np.zeros((2, 2)))), "its picture is no image"),
+    ],
+)
+def test_an_answer_that_was_falsified_is_refused(answer, why):
+    with pytest.raises(ValueError, match=why):
+        blocks.unpack_result(job(0, None).cell, answer)
+
+
+def test_a_result_is_the_same_after_its_way_through_a_process():
+    steps = pd.DataFrame({"run_id": "a", "step": np.arange(3), "value": [0.1, np.nan, np.inf], "valid": [True] * 3})
+    row = RunResult.failed(identity(job(0, None).cell.request), Ending()).row | {"rms_error": np.nan}
+    steps["run_id"] = row["run_id"]
+    picture = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    packed = json.loads(json.dumps(blocks.pack_result(RunResult(row, steps, picture, "trace"))))
+    back = blocks.unpack_result(job(0, None).cell, packed)
+    pd.testing.assert_frame_equal(back.steps, steps, check_exact=True)
+    np.testing.assert_array_equal(back.picture, picture)
+    assert list(back.row) == list(row)
+    assert back.row | {"rms_error": None} == row | {"rms_error": None}
+    assert back.trace == "trace"

@@ -10,7 +10,7 @@ import pytest
 import servobench
 from kit.command import servobench as command
 from kit.own import CONFIGURED, WHOLE, write
-from servobench.harness.batch import apart
+from servobench.harness.batch import trials
 from servobench.harness.config.defaults import default_config
 from servobench.harness.config.registry import choose_controller, find_controller, offered, offering
 from servobench.harness.config.settings import ConfigurationError
@@ -267,7 +267,7 @@ COMMANDS = {
 
 @pytest.mark.parametrize(("line", "why"), HARMFUL.items())
 def test_an_import_that_ends_or_hangs_its_process_is_one_line(tmp_path, monkeypatch, capfd, line, why):
-    monkeypatch.setattr(apart, "IMPORT_LIMIT", 2.0)
+    monkeypatch.setattr(trials, "IMPORT_LIMIT", 2.0)
     write(tmp_path, f"import ctypes, os, signal, time\nprint('a banner')\n\n{line}\n{WHOLE}")
     assert command(monkeypatch, *COMMANDS["run"]) == 2
     out, errors = capfd.readouterr()

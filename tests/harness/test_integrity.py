@@ -14,12 +14,13 @@ import pytest
 
 from kit.command import judged
 from kit.folders import made_up_row
-from servobench.harness.batch import parquet, results
+from servobench.harness.batch import results
+from servobench.harness.batch import tables as parquet
 from servobench.harness.batch.campaign import Campaign, Execution, Observer, carry_out
 from servobench.harness.batch.checksums import SUMS, DamagedFile, fault, read_sums
 from servobench.harness.batch.integrity import examine
 from servobench.harness.batch.plan import Batch, SweepPlan
-from servobench.harness.batch.workers import Bounds
+from servobench.harness.batch.sandbox import Bounds
 from servobench.harness.config.settings import ConfigurationError, Settings
 
 pytestmark = pytest.mark.xdist_group("integrity")  # one process makes what these tests share

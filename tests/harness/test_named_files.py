@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import servobench
-from servobench.harness.batch.named_files import named_files
+from servobench.harness.batch.manifest import named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import offering
 from servobench.harness.config.settings import ConfigurationError

@@ -13,10 +13,11 @@ from servobench.harness.analysis import groups
 from servobench.harness.analysis.comparison import split_tasks
 from servobench.harness.analysis.tables import statistics_rows, summary_legend, summary_tables
 from servobench.harness.analysis.verdict import judge, leaders
-from servobench.harness.batch import parquet, results
+from servobench.harness.batch import results
+from servobench.harness.batch import tables as parquet
 from servobench.harness.batch.checksums import SUMS
-from servobench.harness.batch.columns import NEEDED
 from servobench.harness.batch.integrity import examine
+from servobench.harness.batch.tables import NEEDED
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.pictures.measures import draw_conditions
 from servobench.harness.pictures.report import error_curves, path_views
@@ -240,9 +241,9 @@ def read_steps(folder):
     """Read what figures, paths and curves are drawn of."""
     results.load_steps(folder)
     runs = results.load_runs(folder)
-    for group in load_groups(folder):
+    for group in load_groups(folder, runs):
         load_ensembles(folder, runs[runs["mismatch"] == group.mismatch])
-    path_views(folder)
+    path_views(folder, runs)
     error_curves(folder, runs)
 
 

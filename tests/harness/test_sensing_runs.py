@@ -13,8 +13,7 @@ import servobench
 from kit.robots import FOUR_JOINTS
 from servobench.controllers.methods import METHODS
 from servobench.controllers.units import in_natural_units
-from servobench.harness.batch.manifest import describe_sensing
-from servobench.harness.batch.named_files import named_files
+from servobench.harness.batch.manifest import describe_sensing, named_files
 from servobench.harness.batch.plan import Survey
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.robots import find_sensing, sensing_names

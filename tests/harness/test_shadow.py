@@ -8,7 +8,7 @@ import pytest
 
 from kit.command import servobench
 from servobench import compare
-from servobench.harness.batch.logged import logged_in_file, logged_in_folder
+from servobench.harness.batch.logs import logged_in_file, logged_in_folder
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.shadow import COMMAND, LOGGED, differences, shadow
 

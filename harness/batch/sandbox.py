@@ -1,0 +1,518 @@
+"""A sandbox for the code of users: a guard, and below it the process that carries the code out.
+
+    this process ── task ──> guard ── task ──> runner      answers return the same way, one by one
+                             imports servobench, no plug-in; limits time, memory and processes of all below it
+
+Answers are data: JSON, which is read and never executed, since code of users may have falsified it. The runner is a
+copy of the guard, so that a new one takes milliseconds. It is ended, with every process below the guard, when a run
+takes too long, holds too much memory or kills it; when the code of users changes, so that no plug-in meets the remains
+of another; when a task is over and left processes or much memory behind; and when the link to this process closes,
+also because this process was killed. A system that cannot copy processes (Windows) has no sandbox.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import gc
+import json
+import math
+import os
+import pickle
+import re
+import signal
+import sys
+import tempfile
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+from servobench.harness.batch import processes
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.result import CRASHED, OUT_OF_MEMORY, TIMED_OUT, Ending
+
+POSSIBLE: Final = hasattr(os, "fork")  # whether this system has sandboxes
+LOST: Final = "the run killed the process that carried it out"
+STOPPED: Final = "the run stopped the process that guards it"
+LOOK_EVERY: Final = 0.25  # [s] between two checks of time, memory and processes
+START_TIME: Final = 60.0  # [s] at least until a runner has loaded the code of a task
+GUARD_START: Final = 1800.0  # [s] until a guard has imported servobench: a machine may be busy, and a batch long
+GRACE: Final = 30.0  # [s] beyond the time limit, after which a silent guard is ended
+STOP_TIME: Final = 4.0  # [s] for a guard to end the processes below it
+TRACE_TIME: Final = 0.3  # [s] for the trace of a run that hangs
+MAX_PROCESSES: Final = 256  # below a guard: more belong to a run that copies itself
+MAX_ANSWER: Final = 2**30  # [bytes] of one answer: a larger length is damaged
+KEPT_SHARE: Final = 0.5  # of the memory limit that a runner may hold between two tasks
+FOREIGN_TIME: Final = 600.0  # [s] time limit of a run of foreign code where none is given
+FOREIGN_SHARE: Final = 0.8  # of the machine's memory for all concurrent runs of foreign code
+LEAST_FOREIGN_MEMORY: Final = 2 * 10**9  # [bytes] for each of them at least
+ITEM, ALIVE, DONE, ENDED = b"i", b"a", b"d", b"e"  # first byte of a message upwards
+
+Tell: TypeAlias = Callable[[Any], None]  # passes an answer of JSON values up; None is only a sign of life
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Resources of a run; None for no limit."""
+
+    time: float | None = None  # [s] from one answer to the next
+    memory: int | None = None  # [bytes] of a run and the processes that it starts
+    addresses: bool = False  # refuse each process more than this memory at once, even if it never touches it
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Resources of the runs of a batch as a user gives them, and whether code of users stays out of this process."""
+
+    run_timeout: float | None = None  # [s] time limit of a run, inf for none; None for the usual one
+    run_memory: float | None = None  # [bytes] memory limit of a run, inf for none; None for the usual one
+    isolate: bool = True  # carry runs of plug-ins and foreign FMUs out in sandboxes
+
+    def limits(self, count: int, *, foreign: bool) -> Limits:
+        """Return the limits of each of `count` concurrent runs; foreign code has some even where none are given."""
+        time, memory = self.run_timeout, self.run_memory
+        if foreign:
+            machine = processes.machine_memory()
+            time = FOREIGN_TIME if time is None else time
+            memory = max(LEAST_FOREIGN_MEMORY, FOREIGN_SHARE * machine / count) if memory is None else memory
+        seconds = None if time is None or math.isinf(time) else time
+        size = None if memory is None or math.isinf(memory) else int(memory)
+        return Limits(seconds, size, addresses=self.run_memory is not None)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A function of this package with its pickled argument."""
+
+    function: Callable[[Any, Tell], None]
+    argument: bytes
+    owner: str = ""  # whose code it runs: different owners never share a runner; "" for this package
+    fresh: bool = False  # needs a runner that has carried nothing out before
+
+    def carry_out(self, tell: Tell) -> None:
+        """Call the function in this process."""
+        self.function(pickle.loads(self.argument), tell)
+
+
+@dataclass(frozen=True)
+class End:
+    """The premature end of a task."""
+
+    ending: Ending
+    certain: bool  # whether its current run is the cause, and no earlier run of the same runner
+    alone: bool = False  # whether only a run with a task of its own can be certain: answers may have been lost
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answers of a task, None for one that cannot be read, and its premature end if it had one."""
+
+    items: list[Any] = field(default_factory=list)
+    end: End | None = None
+
+
+def call(function: Callable[[Any, Tell], None], argument: object, limits: Limits, hear: Tell) -> Ending | None:
+    """Call a function in a sandbox, which is a copy of this process; without sandboxes, in this process.
+
+    Args:
+        function: takes the argument and `tell`, which passes an answer of JSON values on.
+        argument: of the function; it can be pickled.
+        limits: of the call.
+        hear: receives the answers; None for one that cannot be read.
+
+    Returns:
+        How the function ended if it did not return.
+    """
+    if not POSSIBLE:
+        function(argument, lambda item: None if item is None else hear(item))
+        return None
+    sandbox = Sandbox(limits, (), copied=True)
+    try:
+        end = sandbox.carry_out(Task(function, pickle.dumps(argument), "user"), hear).end
+    finally:
+        sandbox.ask_to_end()
+        sandbox.end()
+    return None if end is None else end.ending
+
+
+class Pool:
+    """Sandboxes, which start with the first tasks, and the threads that talk to them."""
+
+    def __init__(self, count: int, limits: Limits, modules: Sequence[str]) -> None:
+        """Prepare sandboxes.
+
+        Args:
+            count: of sandboxes.
+            limits: of each run.
+            modules: imported once by each guard.
+        """
+        self._limits, self._modules = limits, modules
+        self._threads = ThreadPoolExecutor(count)
+        self._own = threading.local()
+        self._sandboxes: list[Sandbox] = []
+
+    def submit(self, task: Task, hear: Tell | None = None) -> Future[Answer]:
+        """Carry a task out; `hear` receives the answers instead of the future, in another thread."""
+        return self._threads.submit(self._carry_out, task, hear)
+
+    def stop(self) -> None:
+        """End everything; a task that was not carried out has no answer."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for sandbox in self._sandboxes:
+            sandbox.ask_to_end()
+        for sandbox in self._sandboxes:
+            sandbox.end()
+
+    def _carry_out(self, task: Task, hear: Tell | None) -> Answer:
+        if not hasattr(self._own, "sandbox"):
+            self._own.sandbox = Sandbox(self._limits, self._modules)
+            self._sandboxes.append(self._own.sandbox)
+        answer: Answer = self._own.sandbox.carry_out(task, hear)
+        return answer
+
+
+class Sandbox:
+    """A guard as seen from this process; one that was ended, for instance by a plug-in, is started anew."""
+
+    def __init__(self, limits: Limits, modules: Sequence[str], *, copied: bool = False) -> None:
+        """Prepare a guard.
+
+        Args:
+            limits: of each run.
+            modules: imported once by the guard.
+            copied: whether the guard is a copy of this process, in which no other thread may be busy.
+        """
+        self._limits, self._modules, self._copied = limits, modules, copied
+        self._lock, self._ended = threading.Lock(), False
+        self._process: BaseProcess | None = None
+        self._link: Connection | None = None
+
+    def carry_out(self, task: Task, hear: Tell | None) -> Answer:
+        """Carry one task out; `hear` receives the items instead of the answer.
+
+        Raises:
+            ConfigurationError: no process can be started.
+        """
+        answer = Answer()
+        try:
+            link = self._start()
+            link.send_bytes(pickle.dumps(task))
+            while not (silence := self._wait(link)):
+                message = link.recv_bytes()
+                kind, content = message[:1], message[1:]
+                if kind == DONE:
+                    return answer
+                if kind == ENDED:
+                    end = json.loads(content)
+                    return Answer(answer.items, End(Ending(**end["ending"]), end["certain"]))
+                if kind == ITEM:
+                    (hear or answer.items.append)(_read(content))
+        except (EOFError, OSError):
+            silence = Ending(CRASHED, LOST)
+        self._drop()
+        return Answer(answer.items, End(silence, certain=False, alone=True))
+
+    def ask_to_end(self) -> None:
+        """Ask the guard to end the processes below it, and itself."""
+        with self._lock:
+            self._ended = True
+            if self._process is not None:
+                self._process.terminate()
+
+    def end(self) -> None:
+        """Wait until the guard has ended."""
+        with self._lock:
+            if self._process is not None:
+                self._process.join(STOP_TIME)
+                self._kill(self._process)
+
+    def _wait(self, link: Connection) -> Ending | None:
+        """Wait for a message; return why there will be none."""
+        limit = None if self._limits.time is None else max(self._limits.time, START_TIME) + GRACE
+        began = time.monotonic()
+        while not link.poll(LOOK_EVERY):
+            if limit is not None and time.monotonic() - began > limit:
+                return Ending(TIMED_OUT, f"the run took longer than {limit:g} s")
+            if self._process is not None and processes.is_stopped(self._process.pid):
+                return Ending(CRASHED, STOPPED)
+        return None
+
+    def _start(self) -> Connection:
+        """Return the link to a guard that runs."""
+        if self._link is not None:
+            return self._link
+        context = get_context("fork") if self._copied else get_context("spawn")
+        ours, theirs = context.Pipe()
+        inherited = (ours,) if self._copied else ()
+        process: BaseProcess = context.Process(
+            target=_keep_guard, args=(theirs, self._limits, tuple(self._modules), inherited)
+        )
+        with self._lock:
+            if self._ended:
+                raise EOFError
+            with _interrupts_blocked(), warnings.catch_warnings():  # a process inherits the former
+                warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12: threads of libraries, which wait
+                process.start()
+            self._process = process
+        theirs.close()
+        if fault := _start_fault(ours):
+            ours.close()
+            self._drop()
+            raise ConfigurationError(fault)
+        self._link = ours
+        return ours
+
+    def _drop(self) -> None:
+        """End a guard that is gone or of no use, so that nothing waits for it when this process ends."""
+        with self._lock:
+            if self._process is not None:
+                self._kill(self._process)
+            self._process = self._link = None
+
+    @staticmethod
+    def _kill(process: BaseProcess) -> None:
+        if process.is_alive() and process.pid is not None:
+            processes.send(processes.descendants(process.pid), signal.SIGKILL)
+        process.kill()
+        process.join()
+
+
+def _start_fault(link: Connection) -> str:
+    """Wait until a guard has started and return why it has not; empty if it has."""
+    with contextlib.suppress(EOFError, OSError):
+        if not link.poll(GUARD_START):
+            return f"a worker process has not started within {GUARD_START:g} s"
+        if link.recv_bytes() == ALIVE:
+            return ""
+    return (
+        "the worker processes cannot be started; a script that starts some must keep its calls below "
+        "`if __name__ == '__main__':`"
+    )
+
+
+def _read(content: bytes) -> Any:  # noqa: ANN401 - JSON
+    """Return an answer; None if it is no JSON."""
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError):
+        return None
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Hold Ctrl-C back in this thread and in processes that are started meanwhile."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _keep_guard(link: Connection, limits: Limits, modules: Sequence[str], inherited: Sequence[Connection]) -> None:
+    """Be a guard: take tasks from a link until it closes; `inherited` are ends of links that a copy must not keep."""
+    for each in inherited:
+        each.close()
+    processes.lead_session()
+    processes.adopt_orphans()
+    processes.wake_without_parent()  # a guard that a run has stopped notices the closed link
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    for name in modules:
+        with contextlib.suppress(Exception):
+            import_module(name)
+    gc.freeze()  # so that runners go on sharing the memory of all imports
+    guard = _Guard(link, limits)
+    try:
+        link.send_bytes(ALIVE)
+        guard.serve()
+    except (EOFError, OSError):  # the other side has ended
+        pass
+    finally:
+        guard.end_runner()
+
+
+class _Guard:
+    def __init__(self, link: Connection, limits: Limits) -> None:
+        self._link, self._limits = link, limits
+        self._runner: Any = None
+        self._below: Connection | None = None
+        self._owner, self._answers = "", 0
+        self._trace = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the guard lives
+
+    def serve(self) -> None:
+        """Carry tasks out until the link closes."""
+        while True:
+            task: Task = pickle.loads(self._link.recv_bytes())
+            below = self._ready(task)
+            try:
+                below.send_bytes(pickle.dumps(task))
+                end = self._watch(below)
+            except (EOFError, OSError):
+                end = self._find_end()
+            if end is not None:
+                self._link.send_bytes(ENDED + json.dumps(asdict(end)).encode())
+                continue
+            self._link.send_bytes(DONE)
+            if self._is_used_up(task):
+                self.end_runner()
+
+    def _ready(self, task: Task) -> Connection:
+        """Return the link to a runner that may carry out a task."""
+        if self._below is not None and task.owner == self._owner and not (task.fresh and self._answers):
+            return self._below
+        self.end_runner()
+        context = get_context("fork")
+        self._below, theirs = context.Pipe()
+        self._trace.seek(0)
+        self._trace.truncate()
+        inherited = (self._link, self._below)
+        self._runner = context.Process(
+            target=_be_runner, args=(theirs, inherited, os.getpid(), self._limits, self._trace.fileno())
+        )
+        self._runner.start()
+        theirs.close()
+        self._owner, self._answers = task.owner, 0
+        return self._below
+
+    def _watch(self, below: Connection) -> End | None:
+        """Pass the answers of the runner on until it is done; return its premature end."""
+        limit = self._limits.time
+        patience, since = (None if limit is None else max(limit, START_TIME)), time.monotonic()
+        limited = limit is not None or self._limits.memory is not None
+        while True:
+            ready = wait([below, self._link], LOOK_EVERY if limited else None)
+            if below in ready:
+                message = below.recv_bytes(MAX_ANSWER)
+                if message[:1] == DONE:
+                    return None
+                if message[:1] not in (ITEM, ALIVE):
+                    return self._find_end()
+                self._answers += message[:1] == ITEM
+                patience, since = limit, time.monotonic()
+                self._link.send_bytes(message)
+            elif self._link in ready:  # nobody sends a second task: the other side has ended
+                sys.exit(1)
+            elif patience is not None and time.monotonic() - since > patience:
+                with contextlib.suppress(OSError):
+                    os.kill(self._runner.pid, signal.SIGUSR1)  # writes a trace
+                    time.sleep(TRACE_TIME)
+                return self._end(TIMED_OUT, f"the run took longer than {patience:g} s")
+            elif (end := self._check_processes()) is not None:
+                return end
+
+    def _check_processes(self) -> End | None:
+        """Check memory and number of the processes below; end them if it is too much."""
+        below = processes.descendants(os.getpid())
+        if len(below) > MAX_PROCESSES:
+            return self._end(CRASHED, f"the run started more than {MAX_PROCESSES} processes")
+        most = self._limits.memory
+        if most is not None and processes.resident_memory(below) > most and processes.own_memory(below) > most:
+            reason = f"the run held more than {show_size(most)} of memory"
+            return self._end(OUT_OF_MEMORY, reason, certain=not self._answers)
+        processes.collect_ended(each for each in below if each != self._runner.pid)
+        return None
+
+    def _find_end(self) -> End:
+        """Return the end of a runner that is gone, or whose link is."""
+        self._runner.join(TRACE_TIME)
+        return self._end(CRASHED, LOST + _describe_exit(self._runner.exitcode), certain=not self._answers)
+
+    def _end(self, status: str, reason: str, *, certain: bool = True) -> End:
+        """End the runner and all below it."""
+        self.end_runner()
+        self._trace.seek(0)
+        return End(Ending(status, reason, self._trace.read(4096).decode(errors="replace").strip()), certain)
+
+    def _is_used_up(self, task: Task) -> bool:
+        """Return whether a runner kept something that its next task should not meet."""
+        most = self._limits.memory
+        if not task.owner and most is None:
+            return False
+        below = processes.descendants(os.getpid())
+        return len(below) > 1 or (most is not None and processes.resident_memory(below) > KEPT_SHARE * most)
+
+    def end_runner(self) -> None:
+        """End the runner and every process that runs have left behind."""
+        if self._below is not None:
+            self._below.close()
+            self._below = None
+        if self._runner is not None:
+            self._runner.kill()
+            self._runner.join(processes.END_TIME)
+            self._runner = None
+        processes.end_descendants()
+
+
+def _be_runner(link: Connection, inherited: Sequence[Connection], parent: int, limits: Limits, trace: int) -> None:
+    """Be a runner: take tasks from the guard until it is gone."""
+    processes.lead_session()
+    processes.end_with(parent)
+    for each in inherited:
+        each.close()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, set())
+    faulthandler.enable(trace, all_threads=False)
+    faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
+    with Path(os.devnull).open() as nothing:
+        os.dup2(nothing.fileno(), 0)  # waiting for the keyboard ends at once
+    processes.limit_resources(limits.memory if limits.addresses else None)
+    own = os.getpid()
+
+    def tell(item: Any) -> None:  # noqa: ANN401 - JSON
+        if os.getpid() != own:
+            os._exit(0)  # a copy of this process, which a plug-in forked and let go on
+        link.send_bytes(ALIVE if item is None else ITEM + json.dumps(item).encode())
+
+    try:
+        while True:
+            task: Task = pickle.loads(link.recv_bytes())
+            task.carry_out(tell)
+            if os.getpid() != own:
+                os._exit(0)
+            link.send_bytes(DONE)
+    except BaseException:  # noqa: BLE001 - the link was cut, or code of users has changed the interpreter
+        with contextlib.suppress(BaseException):
+            os.write(trace, traceback.format_exc().encode())
+    os._exit(1)
+
+
+def _describe_exit(code: int | None) -> str:
+    """Return the addition to a reason that an exit code makes."""
+    if code is None:
+        return ": it cut its link"
+    if code >= 0:
+        return f": exit code {code}"
+    with contextlib.suppress(ValueError):
+        return f": {signal.Signals(-code).name}"
+    return f": signal {-code}"
+
+
+def read_size(text: str) -> float:
+    """Return the number of bytes that a text such as "500MB", "2GB" or "inf" names.
+
+    Raises:
+        ValueError: it names none.
+    """
+    if text.strip().lower() == "inf":
+        return math.inf
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([KMGT]?)i?B\s*", text, re.IGNORECASE)
+    if found is None or not float(found[1]):
+        raise ValueError(f"a memory limit is a size such as 500MB or 2GB, or inf for none; got {text!r}")
+    return int(float(found[1]) * 1000 ** " KMGT".index(found[2].upper() or " "))
+
+
+def show_size(size: int) -> str:
+    """Return a number of bytes as a user writes it."""
+    for unit, one in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if size >= one:
+            return f"{size / one:.3g} {unit}"
+    return f"{size} B"

@@ -1,0 +1,95 @@
+"""Sandboxes: calls with their answers, guards that do not start, and guards that are stopped."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from kit.command import PACKAGE
+from servobench.harness.batch import processes, sandbox
+from servobench.harness.batch.sandbox import Limits, Pool, Task
+from servobench.harness.config.settings import ConfigurationError
+
+
+def test_of_workers_that_start_too_late_none_is_left_for_which_this_process_would_wait(tmp_path, monkeypatch):
+    (tmp_path / "slow_import.py").write_text("import time\n\ntime.sleep(60.0)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sandbox, "GUARD_START", 0.5)
+    before = set(multiprocessing.active_children())
+    workers = Pool(1, Limits(), ("slow_import",))
+    try:
+        for _ in range(2):
+            with pytest.raises(ConfigurationError, match=r"^a worker process has not started within 0\.5 s$"):
+                workers.submit(Task(print, b"")).result(60.0)
+    finally:
+        workers.stop()
+    assert set(multiprocessing.active_children()) == before
+
+
+STOPPED = """
+import os, pickle, signal, time
+from servobench.harness.batch import processes
+from servobench.harness.batch.sandbox import Limits, Pool, Task
+
+def hold(seconds, tell):
+    tell(None)
+    time.sleep(seconds)
+
+if __name__ == "__main__":
+    pool = Pool(1, Limits(time=600.0), ())
+    pool.submit(Task(hold, pickle.dumps(600)))
+    while len(below := processes.descendants(os.getpid())) < 3:  # resource tracker, guard and runner
+        time.sleep(0.05)
+    (guard,) = (each for each in below if processes.descendants(each))
+    print(*below, flush=True)
+    os.kill(guard, signal.SIGSTOP)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(not processes.LINUX, reason="only Linux tells a process that its parent has ended")
+def test_a_guard_that_is_stopped_ends_with_the_process_that_started_it(tmp_path):
+    (tmp_path / "killed.py").write_text(STOPPED)
+    path = {**os.environ, "PYTHONPATH": str(PACKAGE)}
+    done = subprocess.run([sys.executable, str(tmp_path / "killed.py")], capture_output=True, text=True, env=path,
+                          check=False, timeout=120)  # fmt: skip
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    below, deadline = [int(word) for word in done.stdout.split()], time.monotonic() + 5.0
+    while left := [each for each in below if psutil.pid_exists(each) and psutil.Process(each).status() != "zombie"]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.05)
+
+
+def harm(how: str, tell) -> None:
+    tell(["begins", how])
+    if how == "stop":
+        time.sleep(1.0)  # the guard passes the answer on first
+        os.kill(os.getppid(), signal.SIGSTOP)
+    while how in ("hang", "stop"):
+        time.sleep(0.1)
+    if how == "exit":
+        os._exit(3)
+
+
+@pytest.mark.parametrize(
+    ("how", "end"),
+    [
+        ("return", None),
+        ("exit", ("crashed", "the run killed the process that carried it out: exit code 3")),
+        ("hang", ("timed_out", "the run took longer than 3 s")),
+        ("stop", ("crashed", "the run stopped the process that guards it")),
+    ],
+)
+def test_a_call_returns_how_its_function_ended(how, end):
+    told: list[object] = []
+    ended = sandbox.call(harm, how, Limits(time=3.0), told.append)
+    assert told == [["begins", how]]
+    assert (ended and (ended.status, ended.reason)) == end
+    assert multiprocessing.active_children() == []
