@@ -1,4 +1,4 @@
-"""Rules across settings; the bounds of single ones are held against their words in tests/harness/test_description.py."""
+"""Rules across settings; single bounds are held against their words in tests/harness/test_description.py."""
 
 import pytest
 
