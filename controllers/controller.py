@@ -29,7 +29,7 @@ Diagnostics: TypeAlias = Mapping[str, npt.ArrayLike]
 
 @dataclass(frozen=True)
 class Delays:
-    """How late commands and features are.
+    """Delays of commands and features.
 
     Attributes:
         latency: s, of the camera.

@@ -1,4 +1,4 @@
-"""Where the first Jacobian comes from: the nominal model, small probing moves, or a matrix that is given.
+"""Providers of the initial Jacobian: the nominal model, small probing moves, or a given matrix.
 
 Probing needs no model. One joint after the other makes a small move and rests until command delay, joint lag and camera
 latency have died out; the features of a rest are averaged. With the rest-to-rest motions as columns of ΔY (m, n) and
@@ -45,7 +45,7 @@ class InitialConfig:
 
 
 class InitialJacobian(ABC, Generic[State]):
-    """Provides Ĵ₀, at once or after some moves of its own; pure, with leading axes, as estimators are.
+    """Provides Ĵ₀, at once or after probing moves; pure, with leading axes, as estimators are.
 
     Attributes:
         immediate: whether Ĵ₀ is known from the start, so that `step` is never called.
@@ -104,7 +104,7 @@ class KnownJacobian(InitialJacobian[KnownState]):
 
 
 class ProbeState(NamedTuple):
-    """How far the probing has come.
+    """Progress of the probing.
 
     Attributes:
         rests: (...), rests that are over, the start included.
@@ -114,7 +114,7 @@ class ProbeState(NamedTuple):
         positions: (..., a, n) [rad], their joint positions.
         features: (..., a, m), their features.
         phase: (...) [periods] since the present move began.
-        rest_begins: (...) [periods] from its begin to its end.
+        rest_begins: (...) [periods] duration of the present move.
     """
 
     rests: IntArray
@@ -160,7 +160,7 @@ class ProbedJacobian(InitialJacobian[ProbeState]):
             )
 
     def start(self, observation: Observation) -> ProbeState:
-        """Return the state of one that rests: the start is the first rest."""
+        """Return the state at the first rest, which is the start of the run."""
         lead, (m, n), count = observation.feature.shape[:-1], (self._spec.m, self._spec.n), self._config.average_periods
         return ProbeState(
             rests=np.zeros(lead, dtype=np.int_),

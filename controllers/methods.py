@@ -129,7 +129,7 @@ class Method:
         return _find("law", self.law, LAWS), _find("estimator", self.estimator, ESTIMATORS)
 
 
-_OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}  # it brings these
+_OF_MPC = {key: word for key, word in EQUIPPED.items() if key not in {"feedforward", "limit"}}  # which it brings itself
 _GIVEN = {**EQUIPPED, "delay": "given", "response": "given", "model": "own"}
 _PRINTED_MPC = {"mode": "constant", "use_preview": False, "limit_position": False}
 

@@ -59,7 +59,7 @@ class Servo:
 
     Each motion spans the gap between two valid features, so that Δy and Δq belong together when frames are lost.
     Without aids joint positions are taken as read, so under camera latency Δy is that of a motion a little earlier:
-    while the arm speeds up or slows down, an estimator is misled. While the initial Jacobian is probed, the probing
+    while the arm speeds up or slows down, this biases an estimator. While the initial Jacobian is probed, the probing
     moves are the command; estimator and law are not used.
     """
 
@@ -187,7 +187,7 @@ class Servo:
     def _command(
         self, state: ServoState, estimation: EstimationState, ahead: Observation, reference: FloatArray
     ) -> tuple[Any, FloatArray]:
-        """Return the law's new state and the joint velocity that it wants, (..., n), rad/s.
+        """Return the law's new state and its joint velocity, (..., n), rad/s.
 
         A law that was trained on the nominal model works in its frame, into which features are rotated.
         """
@@ -199,7 +199,7 @@ class Servo:
         return self.law.command(state.law, Estimate(J), ahead, reference)
 
     def diagnostics(self, state: ServoState) -> Diagnostics:
-        """Return those of all stages, with `probing`, `saturated`, and `lead` [s] of the predict stage.
+        """Return the diagnostics of all stages, with `probing`, `saturated`, and `lead` [s] of the predict stage.
 
         `probing` is 1 while the initial Jacobian is being measured.
         """
@@ -250,7 +250,7 @@ class ServoController(Controller):
         return Command(u)
 
     def diagnostics(self) -> Diagnostics:
-        """Return those of `Servo.diagnostics`."""
+        """Return the diagnostics of the servo."""
         return {} if self.state is None else self.servo.diagnostics(self.state)
 
     def estimated_jacobian(self) -> FloatArray | None:

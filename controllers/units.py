@@ -1,4 +1,4 @@
-"""Natural units: laws and estimators see features divided by their natural size, so that one set of values serves all.
+"""Natural units: laws and estimators get features divided by their natural size, so that one set of values serves all.
 
     y' = y / s,   J' = J / s          s the scale of the feature's channel: 1 m of a place, pixels per metre of a pixel
 

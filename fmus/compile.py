@@ -162,7 +162,7 @@ def _words(command: str) -> list[str]:
     """Return the words of a command such as "gcc -m64"; a path with spaces that is a file is one word."""
     try:
         return [command] if shutil.which(command) else shlex.split(command) or [command]
-    except ValueError:  # a quotation that does not end
+    except ValueError:  # an unclosed quotation mark
         return [command]
 
 

@@ -67,7 +67,7 @@ class ControllerRun:
 
 @dataclass(frozen=True)
 class ControllerModel:
-    """A controller that is to be exported.
+    """A controller ready for export.
 
     Attributes:
         name: by which it is known.

@@ -52,7 +52,7 @@ LOG_CATEGORIES = {
     "logStatusWarning": "Refused calls.",
     "logEvents": "Joints that meet a stop or leave it.",
 }
-REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard that tells the roles of related files
+REFERENCES = "org.fmi-standard.fmi-ls-ref"  # the layered standard for the roles of related files
 REFERENCES_VERSION = "1.0.0-alpha.1"
 
 

@@ -30,7 +30,7 @@ from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.fmus.sources import layout_header
 from servobench.plant.contract.files import reason
 
-MACHINERY: Final = "fmi"  # folder of the FMI functions, which know no model
+MACHINERY: Final = "fmi"  # folder of the FMI functions, which serve every model
 HEADERS: Final = {
     2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),

@@ -18,7 +18,7 @@ SSD: Final = "http://ssp-standard.org/SSP1/SystemStructureDescription"
 SSC: Final = "http://ssp-standard.org/SSP1/SystemStructureCommon"
 STRUCTURE: Final = "SystemStructure.ssd"
 PLANT, CONTROLLER = "plant", "controller"
-BALL: Final = "ball_position"  # of a plant without a set-up of cameras, in the place of its feature
+BALL: Final = "ball_position"  # name of the feature of a plant without a set-up of cameras
 
 
 def write_loop(path: Path, plant: Product, controller: Product, platforms: tuple[Platform, ...], stop: float) -> Path:
@@ -83,7 +83,7 @@ def structure(products: Mapping[str, Product], stop: float) -> bytes:
 
 
 def _wires(plant: Mapping[str, Group]) -> Iterator[tuple[tuple[str, str], tuple[str, str]]]:
-    """Yield where each connection starts and ends: side and variable."""
+    """Yield the start and the end of each connection: side and variable."""
     feature = BALL if BALL in plant else FEATURE
     for own, wanted in (("encoder_position", POSITION), (feature, FEATURE), (SEEN, SEEN)):
         yield (PLANT, own), (CONTROLLER, wanted)

@@ -88,7 +88,7 @@ class View(NamedTuple):
 
     @property
     def word(self) -> str:
-        """Name of set-up and mount, as a word of C begins."""
+        """Name of set-up and mount, as a word of C."""
         return self.eye.name if self.mount == "fixed" else f"{self.eye.name}_{self.mount}"
 
     @property
@@ -110,7 +110,7 @@ class View(NamedTuple):
         )
 
     def outputs(self, n: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-        """Return the same of the outputs of an arm with `n` joints."""
+        """Return name, shape, unit and description of each output of an arm with `n` joints."""
         m, unit = self.eye.m, self.eye.unit
         names = ", ".join(self.eye.features)
         return (

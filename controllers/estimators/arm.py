@@ -8,8 +8,8 @@ the motion of the feature between two poses that are at least `min_joint_step` a
     Δy = B ∫ J_n dq' from q'₀ to q'₁ + v,   q' = g ⊙ q + δ,   v ~ N(0, (2σ² + c² ‖Δy‖²) I)
     H = B [J_n(q'₁) diag(q₁) − J_n(q'₀) diag(q₀),  J_n(q'₁) − J_n(q'₀)]
 
-B is 1, or where it is known how cameras see points, the change of the features with the places of the points, of which
-J_n is the nominal motion.
+B is 1, or with a camera model the change of the features with the places of the points, of which J_n is the nominal
+motion.
 
 The integral is that of a position, so that it does not depend on the path: Gauss-Legendre quadrature along the straight
 line. A map of the feature cannot correct gear ratios and zeros (`controllers.stages.estimation`).
@@ -30,9 +30,9 @@ from servobench.plant.contract.settings import NonNegative, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
-SHARES = np.concatenate([[0.0], (1.0 + NODES) / 2.0, [1.0]])  # of the way, both ends included
+SHARES = np.concatenate([[0.0], (1.0 + NODES) / 2.0, [1.0]])  # of a segment, both ends included
 HALVES = WEIGHTS / 2.0
-CONTACT_TOLERANCE = 1e-9  # [rad] within which one motion begins where the last one ended
+CONTACT_TOLERANCE = 1e-9  # [rad] largest gap between two motions that join
 
 
 @settings
@@ -50,7 +50,7 @@ class ArmConfig:
     feature_noise: Positive = 0.001
     """[m] standard deviation σ of the feature per axis, unless it is identified."""
     min_joint_step: Positive = 0.1
-    """[rad] of the poses between which is learned: over a longer way noise counts for less."""
+    """[rad] between the two poses of a segment: over a longer one noise counts for less."""
 
 
 class ArmState(NamedTuple):
@@ -59,11 +59,11 @@ class ArmState(NamedTuple):
     Attributes:
         x: [g, δ], (..., 2n), 1 and rad.
         P: its covariance, (..., 2n, 2n).
-        begin: q₀, (..., n), rad, where the present way began; NaN before the first motion.
-        joint_step: the way so far, (..., n), rad.
+        begin: q₀, (..., n), rad, where the present segment began; NaN before the first motion.
+        joint_step: of the segment so far, (..., n), rad.
         feature_step: that of the feature, (..., m).
         duration: (...), s.
-        updated: (...), whether the last motion ended a way.
+        updated: (...), whether the last motion ended a segment.
     """
 
     x: FloatArray
@@ -77,7 +77,7 @@ class ArmState(NamedTuple):
 
 @final
 class ArmEstimator(Estimator[ArmState]):
-    """Ĵ(q) = J_n(g ⊙ q + δ) diag(g) as above; where motions do not join, as after lost frames, a new way begins."""
+    """Ĵ(q) = J_n(g ⊙ q + δ) diag(g) as above; where motions do not join, as after lost frames, a new segment begins."""
 
     brings_model = True
 
@@ -103,13 +103,13 @@ class ArmEstimator(Estimator[ArmState]):
         return ArmState(x, P, np.full((*lead, n), np.nan), none, np.zeros((*lead, m)), np.zeros(lead)[()], no)
 
     def update(self, state: ArmState, motion: Motion) -> ArmState:
-        """Go on with the present way, and learn from it where it is long enough.
+        """Add the motion to the present segment, and learn from the segment once it is long enough.
 
         Raises:
             FilterDiverged: the covariance is no longer positive definite.
         """
         gap = norm(state.begin + state.joint_step - motion.joint_position)
-        state = branch(~(gap < CONTACT_TOLERANCE), _begin_way, state, motion.joint_position)
+        state = branch(~(gap < CONTACT_TOLERANCE), _begin_segment, state, motion.joint_position)
         state = state._replace(
             joint_step=state.joint_step + motion.joint_step,
             feature_step=state.feature_step + motion.feature_step,
@@ -121,16 +121,16 @@ class ArmEstimator(Estimator[ArmState]):
         return branch(long, self._correct, state._replace(updated=long), noise, motion.interaction)
 
     def _correct(self, state: ArmState, noise: FloatArray, interaction: FloatArray | None) -> ArmState:
-        config, n, way = self._config, self._n, state.joint_step
+        config, n, segment = self._config, self._n, state.joint_step
         g, offset = state.x[..., :n], state.x[..., n:]
-        poses = state.begin[..., None, :] + SHARES[:, None] * way[..., None, :]
+        poses = state.begin[..., None, :] + SHARES[:, None] * segment[..., None, :]
         at = g[..., None, :] * poses + offset[..., None, :]
         J = (
             self._nominal(at)
             if interaction is None or self._cameras is None
             else interaction[..., None, :, :] @ self._cameras.motions(at)
         )
-        moved = np.matvec(J[..., 1:-1, :, :], (g * way)[..., None, :])
+        moved = np.matvec(J[..., 1:-1, :, :], (g * segment)[..., None, :])
         predicted = np.vecmat(HALVES, moved)
         first, last = J[..., 0, :, :], J[..., -1, :, :]
         by_gear = last * poses[..., -1, None, :] - first * poses[..., 0, None, :]
@@ -143,7 +143,7 @@ class ArmEstimator(Estimator[ArmState]):
         z = state.feature_step - predicted + np.matvec(H, state.x)
         x, P = kalman_update(state.x, state.P, H, z, Q=Q, R=R)
         cholesky_of(P)
-        return _begin_way(state._replace(x=x, P=P), state.begin + way)
+        return _begin_segment(state._replace(x=x, P=P), state.begin + segment)
 
     def jacobian(self, state: ArmState, joint_position: FloatArray) -> FloatArray:
         """Return Ĵ at `joint_position` (..., n), rad, as (..., m, n) in m/rad."""
@@ -151,14 +151,14 @@ class ArmEstimator(Estimator[ArmState]):
         return np.asarray(self._nominal(g * joint_position + offset) * g[..., None, :])
 
     def motions(self, state: ArmState, joint_position: FloatArray) -> FloatArray | None:
-        """Return how the points that cameras see move, (..., 3p, n) m/rad; None where that is not known."""
+        """Return the motions of the points, (..., 3p, n) m/rad; None without a camera model."""
         if self._cameras is None:
             return None
         g, offset = state.x[..., : self._n], state.x[..., self._n :]
         return np.asarray(self._cameras.motions(g * joint_position + offset) * g[..., None, :])
 
     def diagnostics(self, state: ArmState) -> Diagnostics:
-        """Return whether the last motion ended a way, and the largest gear error (1) and offset (rad)."""
+        """Return whether the last motion ended a segment, and the largest gear error (1) and offset (rad)."""
         return {
             "estimator_updated": state.updated,
             "largest_gear_error": np.abs(state.x[..., : self._n] - 1.0).max(axis=-1),
@@ -166,7 +166,7 @@ class ArmEstimator(Estimator[ArmState]):
         }
 
 
-def _begin_way(state: ArmState, joint_position: FloatArray) -> ArmState:
+def _begin_segment(state: ArmState, joint_position: FloatArray) -> ArmState:
     return state._replace(
         begin=joint_position,
         joint_step=np.zeros_like(state.joint_step),

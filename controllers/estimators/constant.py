@@ -25,10 +25,10 @@ class ConstantState(NamedTuple):
 
 @final
 class ConstantEstimator(Estimator[ConstantState]):
-    """Ĵ(k) = Ĵ₀ for ever."""
+    """Ĵ(k) = Ĵ₀ at all times."""
 
     def __init__(self, config: ConstantConfig | None = None, knowledge: RobotKnowledge | None = None) -> None:
-        """Take nothing: there are no settings, and nothing about the robot is needed."""
+        """Accept the arguments of every estimator; none of them is needed."""
 
     def start(self, jacobian: FloatArray) -> ConstantState:
         """Keep Ĵ₀, (..., m, n), m/rad."""

@@ -27,8 +27,8 @@ from servobench.plant.contract.lanes import branch, norm, outer, transposed
 from servobench.plant.contract.settings import Count, Positive, settings
 from servobench.plant.contract.signals import BoolArray
 
-MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is as good as none, and can be divided by
-MIN_ERROR: Final = 0.1  # [1] in standard deviations
+MAX_EXPONENT: Final = 40.0  # [1] a weight of exp(−40) is practically 0, but can be divided by
+MIN_ERROR: Final = 0.1  # [1] smallest |e| of the generalised kernel, in standard deviations
 
 
 class Correction(Protocol):

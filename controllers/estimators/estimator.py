@@ -73,7 +73,7 @@ class Estimator(ABC, Generic[State]):
         return jacobian
 
     def motions(self, state: State, joint_position: FloatArray) -> FloatArray | None:
-        """Return how points move with the joints, (..., 3p, n) m/rad, where it estimates the arm itself; else None.
+        """Return the motions of points with the joints, (..., 3p, n) m/rad, if it estimates the arm itself; else None.
 
         `Motion.interaction` maps them to features.
         """

@@ -1,4 +1,8 @@
-"""Estimator of the proposed method: a Gaussian Jacobian network, updated from a window of past motions (eqs. 28–39)."""
+"""Estimators with a Gaussian Jacobian network that learns online.
+
+`rbf`, of the proposed method, learns from a window of past motions (eqs. 28–39); `rbf_lyapunov`, of the method RBF +
+PID, by a Lyapunov update (eqs. 40–44).
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,12 @@ from annotated_types import Lt
 from servobench.controllers.controller import Diagnostics, RobotKnowledge
 from servobench.controllers.estimators.estimator import Estimator, Motion
 from servobench.controllers.networks.file import TrainedNetworks
-from servobench.controllers.networks.rbf import JacobianNetwork, LatestFeatures
+from servobench.controllers.networks.rbf import FeatureMemo, JacobianNetwork
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Count, NonNegative, Positive, settings
 
-USUAL_NOISE = 0.001  # [m] at which ε holds
+REFERENCE_NOISE = 0.001  # [m] noise of the feature for which ε is stated
 
 
 @settings
@@ -28,8 +32,8 @@ class RbfConfig:
     k2: Annotated[Positive, Lt(2.0)] = 0.5
     """[1] k₂, step size."""
     epsilon: NonNegative = 1e-3
-    """[rad²] ε, joint motion (squared, summed over the window) below which learning fades. It holds at `USUAL_NOISE`;
-    where the noise is identified it grows with its variance."""
+    """[rad²] ε, joint motion (squared, summed over the window) below which learning fades. It holds at
+    `REFERENCE_NOISE`; where the noise is identified it grows with its variance."""
     leak: NonNegative = 0.0
     """[1/s] rate at which the learned weights fade (σ-modification); 0 as in the paper."""
 
@@ -117,7 +121,7 @@ class RbfEstimator(Estimator[RbfState]):
         """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
         self._network = networks.jacobian
-        self._features = LatestFeatures(self._network)
+        self._features = FeatureMemo(self._network)
 
     def start(self, jacobian: FloatArray) -> RbfState:
         """Start from the offline network; see `started_rows`."""
@@ -138,7 +142,7 @@ class RbfEstimator(Estimator[RbfState]):
         config, network = self._config, self._network
         epsilon: FloatArray | float = config.epsilon
         if motion.noise is not None:
-            ratio = motion.noise / USUAL_NOISE
+            ratio = motion.noise / REFERENCE_NOISE
             epsilon = epsilon * (ratio * ratio)
         theta = self._features.at(motion.joint_position)[..., None, :, :]
         joint_steps, feature_steps = motion.joint_step[..., None, :], motion.feature_step[..., None, :]
@@ -212,7 +216,7 @@ class RbfLyapunovEstimator(Estimator[RbfLyapunovState]):
         """Take the settings and the offline Jacobian network, from which a run starts."""
         self._config = config
         self._network = networks.jacobian
-        self._features = LatestFeatures(self._network)
+        self._features = FeatureMemo(self._network)
 
     def start(self, jacobian: FloatArray) -> RbfLyapunovState:
         """Start from the offline network; see `started_rows`."""

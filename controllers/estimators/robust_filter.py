@@ -1,4 +1,4 @@
-"""A Jacobian that outliers do not spoil: a Kalman filter of the feature and J together, re-weighted frame by frame.
+"""Robust estimation of the Jacobian: a Kalman filter of the feature and J together, re-weighted frame by frame.
 
 An outlier in one frame spoils the two motions that begin and end there: with 40 % outlier frames 64 % of all motions
 are wrong. So the state of each feature i holds the true feature itself beside its row of J, and frames are judged, not
@@ -39,11 +39,11 @@ from servobench.plant.contract.settings import NonNegative, settings
 
 BISQUARE: Final = 4.685  # [1] c_b: 95 % efficiency under normal noise
 NORMAL_MEDIAN: Final = 0.6745  # [1] median of |N(0, 1)|
-IRLS_STEPS: Final = 5  # re-weightings of a measurement
+IRLS_STEPS: Final = 5  # number of re-weightings of a measurement
 SCALE_RATE: Final = 1.0  # [1/s] at which ln s rises or sinks
-MAX_SCALE: Final = 1e3  # [1]
-REJECTED: Final = 0.01  # [1] a smaller weight is a rejection
-MEMORY: Final = 1.0  # [s] of rejections
+MAX_SCALE: Final = 1e3  # [1] largest s
+REJECTION_WEIGHT: Final = 0.01  # [1] a smaller weight is a rejection
+MEMORY: Final = 1.0  # [s] time constant with which rejections are forgotten
 LOST_SHARE: Final = 0.7  # [1] of rejections, above which a feature is reset to its measurement
 
 
@@ -131,7 +131,7 @@ class RobustEstimator(Estimator[RobustState]):
         J = state.J + innovation[..., None] * gain[..., 1:]
         P = P - outer(gain, column)
         keep = np.exp(-duration / MEMORY)[..., None]
-        rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTED)
+        rejected = keep * state.rejected + (1.0 - keep) * (weight < REJECTION_WEIGHT)
         lost = rejected > LOST_SHARE
         P = where(lost, _restarted_at_frame(P, noise), (P + transposed(P)) / 2)
         excess = np.sign(np.abs(innovation) - NORMAL_MEDIAN * np.sqrt(variance + noise)).mean(axis=-1)

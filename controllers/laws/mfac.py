@@ -62,7 +62,7 @@ class MfacLaw(Law[MfacState]):
         self._share, self._weight = 1.0 - math.exp(-config.gain * self._dt), config.step_weight
 
     def start(self, observation: Observation) -> MfacState:
-        """Nothing is remembered."""
+        """Return the empty state."""
         return MfacState()
 
     def command(

@@ -169,7 +169,7 @@ class RbfnnLaw(Law[RbfnnState]):
         }
 
     def _reference_steps(self, reference: FloatArray) -> FloatArray:
-        """Return how the reference is assumed to move in each of the T steps, (..., T, m), m."""
+        """Return the assumed steps of the reference in the T steps of the horizon, (..., T, m), m."""
         horizon = self._config.horizon
         if not self._config.preview:
             return np.zeros((*reference.shape[:-2], horizon, self._network.m))
@@ -177,7 +177,7 @@ class RbfnnLaw(Law[RbfnnState]):
         return np.asarray(rows[..., 1:, :] - rows[..., :-1, :])
 
     def _update(self, direction: FloatArray, ahead: RollOut, valid: bool | BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Return α, (...), and the joint step that the weights want with the update α G, (..., n), rad.
+        """Return α, (...), and the joint step of the weights with the update α G, (..., n), rad.
 
         α is 0 without a valid feature. Anti-windup: where the old weights exceed the limit, an update that exceeds it
         further is dropped.
@@ -216,10 +216,10 @@ def _places(count: int, rate: float) -> FloatArray:
 
 
 def _rows(places: FloatArray) -> int:
-    """Return how many rows a history needs that is sampled at these places."""
+    """Return the number of rows of a history that is sampled at these places."""
     return 1 + math.ceil(float(places[-1]))
 
 
 def _filled_by_first(errors: FloatArray) -> FloatArray:
-    """Return errors (..., rows, m) that are all the first one."""
+    """Return errors (..., rows, m) in which each is the first one."""
     return np.repeat(errors[..., :1, :], errors.shape[-2], axis=-2)

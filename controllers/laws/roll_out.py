@@ -46,7 +46,7 @@ def roll_out(
     reference_steps: FloatArray,
     step_limit: FloatArray,
 ) -> RollOut:
-    """Predict the loop T steps ahead with everything frozen.
+    """Predict the loop T steps ahead with frozen weights and Jacobian.
 
     Args:
         network: structure, centres and widths.

@@ -17,8 +17,8 @@ from servobench.plant.contract.files import write_atomically
 
 FORMAT = "servobench networks"
 FORMAT_VERSION = 2
-MAX_UNPACKED = 256_000_000  # [bytes] of all arrays; trained networks have less than a hundredth of it
-DAMAGES = (  # exceptions of numpy's reader for a damaged file, or one that is no .npz
+MAX_UNPACKED = 256_000_000  # [bytes] sum of all arrays; trained networks have less than a hundredth of it
+READ_ERRORS = (  # exceptions of numpy's reader for a damaged file, or one that is no .npz
     ArithmeticError,
     AttributeError,
     EOFError,
@@ -35,7 +35,7 @@ DAMAGES = (  # exceptions of numpy's reader for a damaged file, or one that is n
     zipfile.BadZipFile,
     zlib.error,
 )
-ARRAYS = ("centres", "widths", "weights")  # of either network
+ARRAYS = ("centres", "widths", "weights")  # names of the arrays of either network
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ def _read_arrays(path: Path) -> dict[str, Any]:
             arrays = {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise ValueError(f"network file {path} does not exist") from error
-    except DAMAGES as error:
+    except READ_ERRORS as error:
         raise ValueError(f"network file {path} is corrupt or not a network file: {error}") from error
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"network file {path} is not a network file of servobench")

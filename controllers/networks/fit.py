@@ -40,11 +40,11 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import PlantSpec
 
 Progress = Callable[[float, str], None]
-JACOBIAN_SHARE = 0.4  # [1] of the work, for the progress bar
-DIGEST_POINTS = 16  # joint positions at which nominal models are compared
+JACOBIAN_SHARE = 0.4  # [1] share of the Jacobian network in the work, for the progress bar
+DIGEST_POINTS = 16  # number of joint positions at which nominal models are compared
 DIGEST_DECIMALS = 9  # rounding, so that the last bits of another machine do not require a new training
-WEAKEST = 0.1  # singular value of J over its largest below which a direction is left out of the inverse
-CLUSTERING_POOL = 20  # samples a centre when centres come from k-means
+MIN_SINGULAR_SHARE = 0.1  # [1] to the largest singular value of J; weaker directions are left out
+CLUSTERING_POOL = 20  # number of samples per centre for k-means
 
 
 def unit_points(count: int, dimension: int, rng: np.random.Generator, sequence: Placement = "halton") -> FloatArray:
@@ -118,7 +118,7 @@ def controller_dimension(config: TrainingConfig, spec: PlantSpec) -> int:
 def controller_samples(
     unit: FloatArray, config: TrainingConfig, spec: PlantSpec, jacobian: JacobianFunction
 ) -> ControllerSamples:
-    """Return samples of ξ that a servo with its target at rest could see, and the ideal controller's parts at them.
+    """Return samples of ξ that a servo meets with its target at rest, and the ideal controller's parts at them.
 
     The joint position is uniform in the box. The error has a uniform magnitude, so that small errors, where the arm
     comes to rest, are as well covered as large ones. Older entries of the histories follow from random joint steps Δq:
@@ -139,7 +139,7 @@ def controller_samples(
     J = jacobian(q)
     errors = error[:, None, :] + back[:, : plan.error_history] @ np.swapaxes(J, -1, -2)
     positions = q[:, None, :] - back[:, : plan.position_history]
-    pinv = np.asarray(np.linalg.pinv(J, rcond=WEAKEST), dtype=np.float64)
+    pinv = np.asarray(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), dtype=np.float64)
     away = (lower + upper)[None, :] / 2.0 - q
     free = away - (pinv @ (J @ away[..., None]))[..., 0]
     posture_gain = plan.posture_gain if plan.fit == "output" else 0.0  # ψ has no entry for a constant
@@ -173,7 +173,7 @@ def train(
 
 
 def obtain_networks(config: TrainingConfig, knowledge: RobotKnowledge) -> TrainedNetworks:
-    """Return networks for a robot, from `knowledge.train` where there is such a source, else trained on the spot.
+    """Return networks for a robot: those of `knowledge.train`, or without it newly trained ones.
 
     Args:
         config: a region that is left empty is the robot's working region.

@@ -131,12 +131,12 @@ class JacobianNetwork:
 
     @property
     def layers(self) -> tuple[int, int]:
-        """How many different hidden layers there are, U, and how many units each has, L."""
+        """Number of different hidden layers, U, and of units in each, L."""
         return self._members.shape[0], self.weights.shape[-1]
 
     @cached_property
     def layer_of(self) -> npt.NDArray[np.int_]:
-        """Which of the U different hidden layers a column has, (n,): columns of equal centres and widths share one."""
+        """Index of the hidden layer of each column, (n,): columns of equal centres and widths share one."""
         layers: dict[bytes, int] = {}
         columns = zip(self.centres, self.widths, strict=True)
         return np.array([layers.setdefault(c.tobytes() + width.tobytes(), len(layers)) for c, width in columns])
@@ -149,7 +149,7 @@ class JacobianNetwork:
         return rows
 
     def features(self, q: FloatArray) -> FloatArray:
-        """Return the different ones of the layers of `jacobian_features`, (..., U, L), at q, (..., n), rad."""
+        """Return the U different layers of `jacobian_features`, (..., U, L), at q, (..., n), rad."""
         centres, ones, decay = self._prepared
         offset = q[..., None, :, None] - centres
         offset *= offset
@@ -166,7 +166,9 @@ class JacobianNetwork:
         """
         lead, (count, layers, units) = theta.shape[:-3], theta.shape[-3:]
         every = theta.reshape(*lead, count * layers, units) @ transposed(rows.reshape(*rows.shape[:-3], -1, units))
-        return every.reshape(*lead, count, -1).take(self._places, axis=-1)  # each layer was multiplied by each column
+        return every.reshape(*lead, count, -1).take(
+            self._places, axis=-1
+        )  # of the products of each layer with each column
 
     def gradient(self, errors: FloatArray, joint_steps: FloatArray, theta: FloatArray) -> FloatArray:
         """Return Σ_t e_t Δq_{i,t} θ_i(q_t)ᵀ by rows of the Jacobian, (..., m, n, L): −½ ∂/∂W Σ_t ‖e_t‖² (eqs. 31, 32).
@@ -256,7 +258,7 @@ class ControllerNetwork:
         return int(self.weights.shape[1] - self.n * self.position_history) // self.error_history
 
     def features(self, xi: FloatArray) -> FloatArray:
-        """Return h, (..., N_h), at ξ (..., p): the numbers of `hidden_features`, sooner."""
+        """Return h, (..., N_h), at ξ (..., p), as `hidden_features` does, in less time; last bits may differ."""
         centres, ones, decay = self._prepared
         offset = xi[..., :, None] - centres
         offset *= offset
@@ -292,15 +294,14 @@ def _freeze(network: JacobianNetwork | ControllerNetwork, **shapes: tuple[int, .
 
 
 @final
-class LatestFeatures:
-    """θ and Ĵ at the joint positions that were asked for last.
+class FeatureMemo:
+    """Keeps θ and Ĵ of the last joint positions, which an estimator needs in `jacobian` and in the next `update`.
 
-    An estimator asks for the same ones in `estimate` and in the next `update`. This saves time only: it is a memo of
-    pure functions, and rows of weights never change.
+    It saves time only: it is a memo of pure functions, and rows of weights never change.
     """
 
     def __init__(self, network: JacobianNetwork) -> None:
-        """Take the network; nothing is known yet."""
+        """Take the network, with an empty memo."""
         self._network = network
         self._position, self._shape = b"", (-1,)
         self._theta, self._rows, self._jacobian = (np.empty(0),) * 3

@@ -20,7 +20,7 @@ Bank = TypeVar("Bank")
 
 
 class Step(NamedTuple):
-    """A motion as a map is to explain it.
+    """A motion, and the prediction of it that a map corrects.
 
     Attributes:
         x: prediction of the model under each candidate delay, (..., D, columns).
@@ -74,7 +74,7 @@ class CameraMap(ABC, Generic[Bank]):
 
     @abstractmethod
     def interrupted(self, bank: Bank, frame: FloatArray) -> Bank:
-        """Return a bank that knows nothing of the noise of the last frame; σ² is (...)."""
+        """Return a bank without information about the noise of the last frame; σ² is (...)."""
 
     @abstractmethod
     def lengths(self, step: Step) -> FloatArray:
@@ -90,7 +90,7 @@ class CameraMap(ABC, Generic[Bank]):
 
     @abstractmethod
     def completed(self, bank: Bank, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the map of one delay, completed by the belief that it is nearly a rotation, and that rotation.
+        """Return the map of one delay, regularised towards a rotation, and that rotation.
 
         Args:
             bank: of one delay, without the axis of candidates.
@@ -99,15 +99,15 @@ class CameraMap(ABC, Generic[Bank]):
 
     @abstractmethod
     def deviation(self, bank: Bank, rotation: FloatArray) -> FloatArray:
-        """Return how uncertain the map of one delay is, (...)."""
+        """Return the uncertainty of the map of one delay, (...)."""
 
     @abstractmethod
     def explained(self, map_: FloatArray, x: FloatArray, rates: FloatArray) -> FloatArray:
-        """Return the step of the features, (..., m), that the map makes of x (..., columns)."""
+        """Return the step of the features, (..., m), that the map predicts for x (..., columns)."""
 
     @abstractmethod
     def jacobian(self, map_: FloatArray, base: FloatArray, rates: FloatArray) -> FloatArray:
-        """Return Ĵ, (..., m, n), that the map makes of a base (..., columns, n)."""
+        """Return Ĵ, (..., m, n), of the map and a base (..., columns, n)."""
 
 
 def of_delay(tree: Any, candidate: npt.NDArray[Any]) -> Any:  # noqa: ANN401 - any tree

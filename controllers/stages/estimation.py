@@ -83,7 +83,7 @@ class EstimationState(NamedTuple):
 
 @final
 class Estimation:
-    """Ĵ(q) as above. A motion lasts `MOTION_TIME` at least, so that as much is learned per second at every rate.
+    """Estimates Ĵ(q) as above from motions of at least `MOTION_TIME`: it learns as fast at every control period.
 
     Attributes:
         estimator: E.
@@ -140,7 +140,9 @@ class Estimation:
         if pairing is not None:
             learned = learned._replace(pair=pairing.advance(learned.pair, q, depth))
         duration, both = observation.time - last.time, observation.valid & last.valid
-        due = np.logical_or.reduce(observation.valid, axis=-1) & ~(duration < self._shortest)  # also the first one
+        due = np.logical_or.reduce(observation.valid, axis=-1) & ~(
+            duration < self._shortest
+        )  # true at the first frame: its duration is NaN
         known = due & np.logical_or.reduce(both, axis=-1) & (duration > 0.0) & (duration < self._longest)
         learned = branch(known, self._learn, learned, last, observation, desired, both)
         if pairing is not None:
@@ -221,7 +223,7 @@ class Estimation:
         return Learned(branch(known, self.estimator.update, learned.estimator, motion), pair, norm(dy - predicted))
 
     def _own_motion(self, pair: PairState, paired: Paired, motion: Motion) -> Motion:
-        """Return the motion as the estimator is to explain it."""
+        """Return the motion without the part that the model explains, for the estimator."""
         if self._cameras is not None:
             return self._point_motion(pair, paired, motion)
         dy, error = motion.feature_step, motion.error
@@ -246,7 +248,7 @@ class Estimation:
         return replace(motion, feature_step=motion.feature_step - explained)
 
     def diagnostics(self, state: EstimationState) -> Diagnostics:
-        """Return those of both stages, with ‖Δy − ĴΔq‖ of the last motion as `jacobian_prediction_error`."""
+        """Return the diagnostics of both stages, with ‖Δy − ĴΔq‖ of the last motion as `jacobian_prediction_error`."""
         learned = state.learned
         found = {"jacobian_prediction_error": learned.unexplained, **self.estimator.diagnostics(learned.estimator)}
         return found if self.pairing is None else {**found, **self.pairing.diagnostics(learned.pair)}

@@ -39,7 +39,7 @@ from servobench.plant.contract.lanes import norm, outer, plus_diagonal
 
 
 def fresh_bank(M: FloatArray, P_M: FloatArray, frame: FloatArray | float) -> FloatArray:
-    """Return a bank, [M e] above P, in which nothing is known of the last frame.
+    """Return a bank, [M e] above P, without information about the last frame.
 
     Args:
         M: (..., m, m).
@@ -87,7 +87,7 @@ def map_update(
 
 
 def near_rotation(M: FloatArray, P: FloatArray, deviation: float) -> tuple[FloatArray, FloatArray]:
-    """Complete a map by the belief that it is nearly a rotation: where P is large, M says little.
+    """Regularise a map towards the nearest rotation, the more the larger P is.
 
     With the prior belief that an entry of the map is N(R, ς²), the estimate is M ~ N(R, P + ς² I) by rows, so that
 
@@ -157,7 +157,7 @@ class FeatureMap(CameraMap[FloatArray]):
         P = walked[..., m:, :]
         P[..., :-1, :-1] += (aids.map_walk**2 * lengths)[..., None, None] * self._eye
         larger = np.maximum(P[..., :-1, :-1].trace(axis1=-2, axis2=-1) / (m * aids.map_deviation**2), 1.0)
-        shrink = 1.0 / np.sqrt(larger)[..., None, None]  # of M in P = E[M; e][M; e]ᵀ
+        shrink = 1.0 / np.sqrt(larger)[..., None, None]  # acts on rows and columns of P
         P[..., :-1, :] *= shrink
         P[..., :-1] *= shrink
         return walked

@@ -39,7 +39,7 @@ def step_with_posture(
 
 @final
 class Finish:
-    """The stages above, as far as the aids ask for them; they have no state."""
+    """Applies those of the stages above whose aids are on; they have no state."""
 
     def __init__(self, aids: AidsConfig, knowledge: RobotKnowledge, law: str, owns: Collection[str]) -> None:
         """Take settings, limits and the working region.

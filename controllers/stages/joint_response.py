@@ -124,7 +124,7 @@ def _learned(state: JointResponse, joint_step: FloatArray, steps: FloatArray) ->
     kept = np.minimum(1.0, most / A.trace(axis1=-2, axis2=-1))[..., None]
     A, b = kept[..., None] * A, kept * b
     response = np.linalg.solve(A, b[..., None])[..., 0]
-    if state.window == 1:  # in a longer one entries are not found one by one, and limits would move their sum
+    if state.window == 1:  # in longer windows single entries are not identified, and limits would shift their sum
         response = np.minimum(np.maximum(response, 0.0), MAX_RESPONSE)
     return with_response(state._replace(A=A, b=b), response)
 

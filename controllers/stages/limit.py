@@ -95,7 +95,7 @@ def redistribute(
         wanted = np.matvec(jacobian, joint_step)
         down, up = np.minimum(limit, down), np.minimum(limit, up)
         state = _Shared(dq, 1.0 - 1.0 / excess, free, jacobian, wanted, down, up)
-        # Each time a joint is left out, or comes to its limit and is left out the next time, or all is done.
+        # Each pass excludes a joint, brings one to its limit, or finishes: two passes for each joint are enough.
         state = repeat(_is_unfinished, take_over, state, 2 * joint_step.shape[-1] + 1)
         return np.minimum(np.maximum(state.joint_step, -limit), limit)
 
@@ -109,7 +109,7 @@ def _is_unfinished(state: _Shared) -> BoolArray:
 
 
 def _take_over(state: _Shared, limit: FloatArray, damping: float) -> _Shared:
-    """Let the free joints go on until one of them has no room left; where one has none now, only leave it out."""
+    """Move the free joints until one reaches its limit; a joint that is at its limit already is only excluded."""
     dq, free = state.joint_step, state.free
     J = np.where(free[..., None, :], state.jacobian, 0.0)
     more = state.left[..., None] * np.matvec(damped_inverse(J, damping), state.wanted)

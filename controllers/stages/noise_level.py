@@ -18,9 +18,9 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch
 
 GUESS_SAMPLES = 1.0  # [samples] weight of the initial guess
-WARM_UP_SAMPLES = 10.0  # [samples] the guess included
-FORGETTING = 0.99  # [1] of the sums, per sample
-MAX_SAMPLE_RATIO = 9.0  # [1] of a sample to σ²
+WARM_UP_SAMPLES = 10.0  # [samples] length of the warm-up, with the guess
+FORGETTING = 0.99  # [1] factor of the sums per sample
+MAX_SAMPLE_RATIO = 9.0  # [1] cap of a sample relative to σ²
 MIN_VARIANCE_RATIO = 1e-2  # [1] floor of σ² relative to the initial guess
 
 
@@ -41,7 +41,7 @@ class NoiseLevel(NamedTuple):
 
     @classmethod
     def guess(cls, deviation: float, lead: tuple[int, ...] = ()) -> NoiseLevel:
-        """Return the state that holds nothing but an initial guess of σ, m, with leading axes of the shape `lead`."""
+        """Return the state of an initial guess of σ, m, with leading axes of the shape `lead`."""
         variance = np.full(lead, deviation**2)
         return cls(variance, np.full(lead, GUESS_SAMPLES), GUESS_SAMPLES * variance, MIN_VARIANCE_RATIO * variance)
 
@@ -66,7 +66,7 @@ def _learned(level: NoiseLevel, square: FloatArray, multiple: float | FloatArray
     variance, weight_sum, sample_sum, floor = level
     own = multiple * variance
     share = own / (own + other)
-    weight = share * share  # a power of a number has other bits than that of an array
+    weight = share * share  # not share**2: its bits differ between a number and an array
     cap = MAX_SAMPLE_RATIO * np.maximum(1.0, WARM_UP_SAMPLES / weight_sum) * variance
     sample_sum = FORGETTING * sample_sum + weight * np.minimum((square - other) / multiple, cap)
     weight_sum = FORGETTING * weight_sum + weight

@@ -38,24 +38,24 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import branch, norm, pick
 from servobench.plant.contract.signals import BoolArray, Observation, PlantSpec
 
-MAX_GAP = 16  # motions of the least length that one over lost frames may span; from a longer one nothing is learned
+MAX_GAP = 16  # longest motion over lost frames from which is learned, in motions of the least length
 MIN_JUMP_RATIO = 2.0  # [1] to the longest predicted step; a longer step of the feature is no motion of the arm
-MIN_JUMP_DEVIATIONS = 10.0  # [σ] above which it is no noise either
-UNSTEADY = 0.8  # [1] change of a motion from one candidate to the next over noise, above which delays differ
-BIASED = 0.25  # [1] error of the model over noise, above which it decides between delays that explain a motion alike
+MIN_JUMP_DEVIATIONS = 10.0  # [σ] a longer step is no noise either
+MIN_CHANGE_RATIO = 0.8  # [1] of a motion's change between candidates to noise, above which delays differ
+MAX_BIAS_RATIO = 0.25  # [1] of the model's error to noise, above which a steady motion would favour a wrong delay
 NIS_CAP = 50.0  # [1] of ‖ν‖²/s, the normalised innovation squared (NIS), of one motion in the score of a delay
 CUSUM_DRIFT = 3.0  # [1] NIS per feature that is subtracted at each motion; 1 is its expectation
 CUSUM_CAP = 10.0  # [1] NIS per feature of one motion, so that one outlier cannot reach the gate
-RESOLUTION = 0.0125  # [s] between candidate delays, about
+RESOLUTION = 0.0125  # [s] approximate distance between candidate delays
 LAST_THREE = np.array([0, 1, 2])
 NO_DEPTH = np.zeros(0)
 IntArray: TypeAlias = npt.NDArray[np.int_]
-Bank: TypeAlias = Any  # of either form of map
+Bank: TypeAlias = Any  # the state of either form of map
 
 
 @final
 class Candidates:
-    """Candidate delays and rows of the past at them; between two rows the arm is taken to have moved evenly.
+    """Candidate delays and rows of the past at them; between two rows the motion is interpolated linearly.
 
     Attributes:
         delays: (D,), periods.
@@ -148,7 +148,7 @@ class Paired(NamedTuple):
 
 @final
 class Pairing:
-    """Identifies delay, map and noise, as far as the aids ask for it, and pairs motions by the delay.
+    """Identifies delay, map and noise, each if its aid is on, and pairs motions by the delay.
 
     Attributes:
         delays: the candidates, (D,), periods.
@@ -264,7 +264,7 @@ class Pairing:
         return rates if self._cameras is None else pick(rates, candidate)
 
     def interrupt(self, state: PairState) -> PairState:
-        """Return the state after a frame in which no motion ended: nothing is known of its noise."""
+        """Return the state after a frame at which no motion ended, without information about its noise."""
         return state._replace(bank=self.maps.interrupted(state.bank, state.noise.variance))
 
     def is_known(self, state: PairState) -> bool | BoolArray:
@@ -272,7 +272,7 @@ class Pairing:
         return not self._aligns or self.deviation(state) < self._aids.confidence
 
     def deviation(self, state: PairState) -> FloatArray:
-        """Return how uncertain the map is, (...); see `CameraMap.deviation`."""
+        """Return the uncertainty of the map, (...); see `CameraMap.deviation`."""
         return self.maps.deviation(of_delay(state.bank, state.candidate), state.rotation)
 
     def diagnostics(self, state: PairState) -> dict[str, npt.ArrayLike]:
@@ -340,7 +340,7 @@ class Pairing:
         changes = self.maps.lengths(step._replace(x=step.x - step.x[..., self._candidates.beside, :]))
         change, length = (np.maximum.reduce(each, axis=-1) for each in (changes, lengths))
         error = self._aids.map_error * length
-        return np.asarray((change >= UNSTEADY * noise.deviation) | (error < BIASED * noise.deviation))
+        return np.asarray((change >= MIN_CHANGE_RATIO * noise.deviation) | (error < MAX_BIAS_RATIO * noise.deviation))
 
     def _learn_any_map(self, bank: Bank, before: Bank, step: Step, lengths: FloatArray, frame: FloatArray) -> Bank:
         return self.maps.update(self.maps.unknown(before, frame), step, lengths, frame)[0]

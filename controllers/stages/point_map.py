@@ -31,8 +31,8 @@ from servobench.plant.contract.lanes import norm, plus_diagonal, transposed, whe
 from servobench.plant.contract.signals import BoolArray
 
 Scalar = TypeVar("Scalar", bound=np.generic)
-ENTRIES: Final = 9  # of M
-REFINEMENTS: Final = 3  # Gauss-Newton steps of the nearest rotation
+ENTRIES: Final = 9  # number of entries of M
+REFINEMENTS: Final = 3  # number of Gauss-Newton steps to the nearest rotation
 TURNS: Final = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
                          [[0, -1, 0], [1, 0, 0], [0, 0, 0]]], dtype=np.float64)  # fmt: skip
 """[e_i]× of the three axes."""
@@ -101,7 +101,7 @@ def point_update(
 
 
 def near_turn(M: FloatArray, P: FloatArray, deviation: float, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Complete a map by the belief that it is nearly a rotation; see `feature_map.near_rotation`.
+    """Regularise a map towards the nearest rotation; see `feature_map.near_rotation`.
 
     The covariance of the entries is not that of rows, so that the nearest rotation has no closed form: it is the better
     one of two that Gauss-Newton steps reach, from the closed form of the weighted map and from the one before.

@@ -138,7 +138,7 @@ class PredictorState(NamedTuple):
 
 @final
 class Predictor:
-    """ŷ, q̂ and lead as above, as far as the aids ask for it.
+    """Predicts ŷ, q̂ and lead as above, each part if its aid is on.
 
     Attributes:
         window: w, periods, of the response.

@@ -78,7 +78,7 @@ def loss(slow: pd.DataFrame, fast: pd.DataFrame) -> str:
 
 
 def long_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return the errors of the second and the last lap of half an hour, and what came of the runs."""
+    """Return the errors of the second and the last lap of half an hour, and the outcomes of the runs."""
     rows = []
     for curve in CURVES:
         for name, own in by_method(load_runs(folder / curve)):
@@ -96,7 +96,7 @@ def long_table(folder: Path) -> dict[str, pd.DataFrame]:
 
 
 def ends_table(folder: Path) -> dict[str, pd.DataFrame]:
-    """Return what came of targets out of reach and of starts with the arm stretched."""
+    """Return the outcomes for targets out of reach and for starts with the arm stretched."""
     unreachable, singular = (load_runs(folder / part) for part in ("unreachable", "singular_start"))
     rows = []
     for name, own in by_method(unreachable):

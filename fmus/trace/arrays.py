@@ -35,7 +35,7 @@ class Buffer:
     """
 
     def __init__(self, content: Any) -> None:  # noqa: ANN401 - numbers or an expression
-        """Hold a content."""
+        """Store the content."""
         self.content = content
 
     @property
@@ -58,7 +58,7 @@ class Traced(NDArrayOperatorsMixin):
     flags: ClassVar[SimpleNamespace] = SimpleNamespace(writeable=True)
 
     def __init__(self, buffer: Buffer, places: Places, kind: str = "f") -> None:
-        """Show a part of a buffer."""
+        """Make an array of entries of a buffer."""
         self.buffer, self.places, self.kind = buffer, places, kind
 
     @classmethod
@@ -204,7 +204,7 @@ class Traced(NDArrayOperatorsMixin):
         return Traced.plain(self.numbers()) if self.constant else Traced.of(self.flat(), self.shape, self.kind)
 
     def astype(self, dtype: npt.DTypeLike) -> Traced:
-        """Return the numbers as another type; whole ones are cut off."""
+        """Return the numbers as another type; numbers are truncated to whole ones."""
         kind = np.dtype(dtype).kind
         if kind == "i" and self.kind == "f":
             cut: Traced = np.where(self < 0.0, np.ceil(self), np.floor(self))  # type: ignore[assignment]
@@ -266,7 +266,7 @@ def spread(array: Traced, shape: tuple[int, ...]) -> Traced:
 
 
 def as_traced(value: Any) -> Traced:  # noqa: ANN401 - anything array-like
-    """Return an array as one of these."""
+    """Return anything array-like as an array of expressions."""
     return value if isinstance(value, Traced) else Traced.plain(np.asarray(value))
 
 
@@ -294,7 +294,7 @@ LARGEST = float(np.finfo(np.float64).max)
 
 
 def _rounded(x: Expression) -> Expression:
-    """Return the nearest whole number; of two the even one."""
+    """Return the nearest whole number; ties go to the even one."""
     nearest = casadi.floor(x + 0.5)
     tie = casadi.logic_and(nearest - x == 0.5, casadi.fmod(nearest, 2.0) != 0.0)
     return nearest - tie
@@ -353,7 +353,7 @@ def _carry_out(ufunc: np.ufunc, method: str, inputs: Sequence[Any], options: Map
 
 
 def _plain_options(options: Mapping[str, Any], outputs: Any) -> dict[str, Any]:  # noqa: ANN401 - as numpy's
-    """Return the options of a ufunc of numbers; where it writes only to some entries, those before are numbers too."""
+    """Return the options of a ufunc of numbers; with `where`, the entries that stay are numbers too."""
     plain = {name: value.numbers() if isinstance(value, Traced) else value for name, value in options.items()}
     if "where" in plain and outputs is not None:
         plain["out"] = np.array(outputs[0].numbers())

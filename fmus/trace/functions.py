@@ -1,4 +1,4 @@
-"""Numpy's functions that are no ufuncs over arrays of expressions: arrangement, choice, sums, linear algebra.
+"""Numpy's functions other than ufuncs over arrays of expressions: arrangement, choice, sums, linear algebra.
 
 Linear algebra works matrix by matrix; a matrix that LAPACK would refuse is noted as a fault.
 """
@@ -24,7 +24,7 @@ from servobench.fmus.trace.arrays import (
 )
 from servobench.fmus.trace.branches import NOT_DEFINITE, note_fault
 
-SWEEPS: Final = 10  # of Jacobi rotations, which converge quadratically: six are enough for rounding errors to remain
+SWEEPS: Final = 10  # sweeps of Jacobi rotations, which converge quadratically: six reach rounding errors
 
 
 ARRANGES: Final = frozenset(
@@ -180,7 +180,7 @@ def _count_nonzero(array: Any, axis: Any = None) -> Traced:  # noqa: ANN401 - as
 
 
 def each_matrix(function: Callable[..., tuple[Any, ...]], *arrays: Traced) -> list[Traced]:
-    """Return the results of a function of matrices, given and returned as CasADi has them, for each of stacks of them.
+    """Apply a function of CasADi's matrices to each matrix of stacks, and return the stacks of its results.
 
     Args:
         function: of expressions (m, n), which returns some.
@@ -316,7 +316,7 @@ def _sorted(rows: int, columns: int) -> Any:  # noqa: ANN401 - a function of Cas
                 one, other = part[p], part[q]
                 part[p], part[q] = casadi.if_else(swapped, other, one), casadi.if_else(swapped, one, other)
     left = [casadi.if_else(size > 0.0, column / size, 0.0) for column, size in zip(own, sizes, strict=True)]
-    if rows == columns == 3:  # also where the least value is nothing but a rounding error
+    if rows == columns == 3:  # a rotation also where the least value is only a rounding error
         across = casadi.cross(left[0], left[1])
         left[2] = casadi.if_else(casadi.dot(across, left[2]) < 0.0, -across, across)
     outputs = [casadi.horzcat(*left), casadi.vertcat(*sizes), casadi.horzcat(*turned)]

@@ -101,7 +101,7 @@ _MEANINGS: Final[tuple[tuple[Any, Any], ...]] = (
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """Let numpy code of this package compute with expressions within."""
+    """Record numpy code of this package within the context: it computes with expressions."""
     changed: list[tuple[dict[str, Any], str, Any]] = []
     meanings = {id(old): new for old, new in _MEANINGS}
     with _LOCK:
@@ -171,7 +171,7 @@ def record(
             advance = _recorded_step(own, step, inputs, first)
     except NotTraceable as error:
         raise NotTraceable(f"{_where_it_failed(error)}: {error}") from error
-    except RuntimeError as error:  # of CasADi
+    except RuntimeError as error:  # raised by CasADi
         said = str(error).partition("\n")[0]
         raise NotTraceable(f"{_where_it_failed(error)}: CasADi cannot express it ({said})") from error
     return Recorded(begin, advance)

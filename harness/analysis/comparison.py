@@ -1,14 +1,14 @@
 """The table of runs read: how runs ended, which of them are compared, and paired differences between controllers.
 
-What a run without a settling time counts as:
+A run without a settling time counts differently in each function:
 
 | function | a run that never settled |
 |---|---|
 | `settled_share` | is not settled |
 | `compare_pairs` | counts as `never`, the duration of the run: a bound from below, as ranks need finite numbers |
-| `outcomes` | is what the table says came of it, such as `not_settled` or `target_unreachable` |
+| `outcomes` | has the outcome of the table, such as `not_settled` or `target_unreachable` |
 
-A run that did not complete never settled, whatever its error was before: see `settling_times`.
+A run that did not complete never settled, even if its error was small before: see `settling_times`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from servobench.harness.run.result import COMPLETED
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 
-KEYS: Final = ("plant", "task", "mismatch", "seed")  # what two runs must share to be a pair
+KEYS: Final = ("plant", "task", "mismatch", "seed")  # columns that two runs of a pair share
 CONDITION: Final = ("plant", "sensing", "task", "mismatch", "noise_factor", "latency_s", "period_s")
 HANDY_UNITS: Final = {"m": ("mm", 1000.0)}
 POINT_TO_POINT, CURVE = TASK_KINDS = ("point_to_point", "curve")
@@ -120,7 +120,7 @@ def achieved_share(runs: pd.DataFrame, confidence: float = CONFIDENCE) -> Estima
 
 
 def outcomes(runs: pd.DataFrame) -> pd.Series[str]:
-    """Return what came of each run; in a table that does not tell it, without the reasons of a run that completed."""
+    """Return the outcome of each run; in a table without it, `not_settled` or `not_followed` give no reason."""
     curve = runs.reindex(columns=["task_kind"])["task_kind"] == CURVE
     follows = column_of(runs, "rms_error_evaluated") <= FOLLOWING_BANDS * column_of(runs, "settling_band")
     on_curve, moved = (
@@ -197,7 +197,7 @@ def compare_pairs(
     Args:
         runs: the table of runs.
         pairs: names of controllers, two and two.
-        never: what a run counts as that has no value or did not complete; for settling times the duration, s.
+        never: the value of a run that has none or did not complete; for settling times the duration [s].
         metric: the column compared, less is better.
         keys: columns that two runs of a pair share.
         seed: of the bootstrap interval of the median difference.

@@ -107,7 +107,7 @@ def write_mcap(path: Path, steps: pd.DataFrame, run: Mapping[Hashable, Any]) -> 
 
 
 def _topics(steps: pd.DataFrame) -> dict[str, dict[str, str]]:
-    """Return the columns of each topic with their names there; what belongs to no group is in `run`."""
+    """Return the columns of each topic with their names there; columns of no group are in `run`."""
     grouped: dict[str, dict[str, str]] = {topic: {} for topic in (*TOPICS, "run")}
     for column in map(str, steps.columns):
         if column not in KEYS:
@@ -129,7 +129,7 @@ def _schema(topic: str, columns: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - a cell of a table
-    """Return a cell for JSON, which has no word for what is not a number."""
+    """Return a cell for JSON; None where it is not finite."""
     if isinstance(value, bool | np.bool_):
         return bool(value)
     number = float(value)

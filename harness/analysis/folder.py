@@ -1,4 +1,4 @@
-"""What a results folder holds, in words, and the tables that it has beside its runs and steps."""
+"""Describes a results folder in words, and reads its tables beside the runs and steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_LISTED: Final = 15  # values of a column
 
 
 def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
-    """Return what was run and with what, as names and texts.
+    """Return the facts of a folder: runs, controllers, plants, tasks, seeds and versions, as names and texts.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -81,7 +81,7 @@ def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
         yield path.stem, table
 
 
-def _setting(value: Any) -> str:  # noqa: ANN401 - whatever JSON holds
+def _setting(value: Any) -> str:  # noqa: ANN401 - a value of JSON
     if isinstance(value, list):
         return ", ".join(map(_setting, value))
     if isinstance(value, bool):

@@ -66,7 +66,7 @@ Row = dict[tuple[str, str], Any]
 
 
 def overview(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return how often each controller did what was asked and how well, a group of columns for each place.
+    """Return the success rate and score of each controller, a group of columns for each place.
 
     Where there are many conditions, a group is a task with all its conditions.
     """
@@ -103,7 +103,7 @@ def curve_tables(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each condition, task and controller what came of its runs, in percent, where not all was as asked."""
+    """Return the shares of outcomes [%] of each condition, task and controller of which a run failed."""
     named = runs.assign(outcome=outcomes(runs))
     rows = [(key, own["outcome"].value_counts(), len(own)) for key, own in _rows(named, "task")]
     mixed = [row for row in rows if not set(row[1].index) <= set(ACHIEVED)]
@@ -119,13 +119,13 @@ def outcome_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def meanings(table: pd.DataFrame) -> dict[str, str]:
-    """Return what the outcomes mean that are columns of an outcome table; the words of faults say it themselves."""
+    """Return the meaning of each outcome in an outcome table; the words of faults explain themselves."""
     shown = {str(name[1]).removesuffix(" [%]") for name in list(table) if isinstance(name, tuple)}
     return {word: meaning for word, meaning in MEANINGS.items() if word in shown}
 
 
 def cost_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return for each plant and controller what a step costs, as far as known, and how much the joints are used."""
+    """Return computing times, as far as known, and use of the joints for each plant and controller."""
     return _table(runs, "cost", ["plant"] if runs["plant"].nunique() > 1 else [], counted=False)
 
 
@@ -150,7 +150,7 @@ def failure_table(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def runs_table(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return every run as a row: which it is, how it ended and what came of it, and its main measures."""
+    """Return one row per run: identity, status, outcome and main metrics."""
     runs = in_handy_units(runs)
     named = runs.assign(outcome=outcomes(runs))
     table: dict[tuple[str, str], list[str]] = {}

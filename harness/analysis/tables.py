@@ -58,7 +58,7 @@ SWEEP_COLUMNS: Final = (
     "task_kind",
     "rms_error_evaluated",
     *BAND,
-)  # what `sweep_tables` and `outcome_legend` read
+)  # columns that `sweep_tables` and `outcome_legend` read
 STEP_TIME: Final = "controller_time_median_us"
 LATE: Final = "*"  # mark of a controller of which a step took longer than the period
 SWEEP_KEYS: Final = ["plant", "task", "mismatch", "noise", "latency", "period", "controller"]
@@ -170,7 +170,7 @@ def _median(values: pd.Series[float]) -> Estimate:
 
 
 def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return what the good outcomes of runs mean, whose table comes in pieces."""
+    """Return the meaning of the good outcomes; the table of runs comes in pieces."""
     bands = pd.concat([part.reindex(columns=list(BAND)).drop_duplicates() for part in parts])
     return (
         f"{SETTLED}: came within {settling_band(bands)} and stayed; "
@@ -179,19 +179,19 @@ def outcome_legend(parts: Iterable[pd.DataFrame]) -> str:
 
 
 def summary_legend(runs: pd.DataFrame) -> str:
-    """Return what the words in `summary_tables` mean."""
+    """Return the meaning of the words in `summary_tables`."""
     late = f"; {LATE} some steps took longer than the period" if _is_late(runs) else ""
     switches = "switches: joint commands that change sign between large values within two periods"
     return f"{outcome_legend([runs])}; over: overshoot; {switches}; numbers are medians over runs{late}"
 
 
 def sweep_legend(parts: Iterable[pd.DataFrame]) -> str:
-    """Return what the words in `sweep_tables` mean."""
+    """Return the meaning of the words in `sweep_tables`."""
     return f"{outcome_legend(parts)}; noise: factor; latency, period: ms, – as configured"
 
 
 def summary_tables(runs: pd.DataFrame) -> Tables:
-    """Yield what a comparison ends with: a table for each plant, mismatch and task, a row for each controller."""
+    """Yield the summary of a comparison: a table for each plant, mismatch and task, a row for each controller."""
     for (plant, mismatch, task), place in with_places(runs).groupby(["plant", "mismatch", "task"], sort=False):
         kind = CURVE if achievement(place) == FOLLOWED else POINT_TO_POINT
         rows = []
@@ -220,7 +220,7 @@ def _shares(runs: pd.DataFrame) -> str:
 
 
 def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
-    """Yield what a sweep ends with, for each plant and task.
+    """Yield the summary of a sweep, for each plant and task.
 
     That is the share of settled runs, or of those that followed their curve, a row for each condition; and where there
     are others, the share of each outcome over all conditions.
@@ -246,7 +246,7 @@ def sweep_tables(parts: Iterable[pd.DataFrame]) -> Tables:
         if good.sum() < place["runs"].sum():
             kinds = place.pivot_table(values="runs", index="controller", columns="outcome", aggfunc="sum", sort=False)
             table = (100.0 * kinds.div(kinds.sum(axis=1), axis=0)).map(_percent)
-            yield f"{task} on {plant}: what came of the runs, %", table.rename_axis(columns=None).reset_index()
+            yield f"{task} on {plant}: outcomes of the runs, %", table.rename_axis(columns=None).reset_index()
 
 
 def _percent(value: float) -> str:

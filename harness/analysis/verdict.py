@@ -43,11 +43,11 @@ Place = tuple[str, pd.DataFrame]  # words, runs
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader should know first. Names of controllers stand between backticks.
+    """The result of a results folder, for its first line. Names of controllers stand between backticks.
 
     Attributes:
         result: one sentence.
-        cautions: what the runs do not show, a sentence each.
+        cautions: limits of the evidence, a sentence each.
     """
 
     result: str
@@ -90,7 +90,7 @@ def knows_truth(name: str) -> bool:
 
 
 def asked_of(runs: pd.DataFrame) -> str:
-    """Return what runs should have done, in the past tense."""
+    """Return the goal of these runs as a verb in the past tense."""
     moves, curves = (len(part) for part in split_tasks(runs))
     return {(True, False): "settled", (False, True): "followed the curve"}.get(
         (moves > 0, curves > 0), "settled or followed the curve"
@@ -100,8 +100,8 @@ def asked_of(runs: pd.DataFrame) -> str:
 def leaders(runs: pd.DataFrame) -> pd.DataFrame:
     """Return who came first in each plant, task and condition, and how sure that is; empty without a competition.
 
-    First is who did what was asked most often, then who has the smallest median settling time, on a curve the
-    smallest median error.
+    First is the controller with the highest success rate, then the one that has the smallest median settling time, on
+    a curve the smallest median error.
     """
     places = split_conditions(runs[runs["controller"].isin(ranked_controllers(runs))])
     if len(places) > MOST_PLACES:
@@ -117,7 +117,7 @@ def seeds_needed(controllers: int) -> int:
 
 
 def scores(place: pd.DataFrame) -> tuple[pd.DataFrame, str, int]:
-    """Return what is compared in a place, seeds × controllers, with its unit and digits; infinite where a run failed.
+    """Return the scores of a place, seeds × controllers, with their unit and digits; infinite where a run failed.
 
     That is the settling time of a move, and the error of the judged part of a curve.
     """

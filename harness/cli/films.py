@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from servobench.harness.cli import selection
-from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, Option, RunIdOption, Value
+from servobench.harness.cli.options import CONTROLLER, MISMATCH, PLANT, ROBOT, TASK, RunIdOption, Value, option
 from servobench.harness.cli.terminal import cleaning_up_when_terminated, console, refuse, say
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ RECORDED = {
 RECORDINGS = "recordings"
 
 
-def _new(name: str, value: Value | str) -> Option:
-    return Option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.")
+def _new(name: str, value: Value | str) -> Any:  # noqa: ANN401 - typer's own word for it
+    return option(f"--{name}", value, f"New run: {name}, default {RECORDED[name]}.")
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class NewRun:
 
     plant: Annotated[
         str | None,
-        Option("--plant", PLANT, "New run: plant, default bullet, or mujoco without PyBullet."),
+        option("--plant", PLANT, "New run: plant, default bullet, or mujoco without PyBullet."),
     ] = None
     controller: Annotated[str | None, _new("controller", CONTROLLER)] = None
     task: Annotated[str | None, _new("task", TASK)] = None
@@ -45,9 +45,9 @@ class NewRun:
     robot: Annotated[str | None, _new("robot", ROBOT)] = None
     seed: Annotated[int | None, _new("seed", "INTEGER")] = None
     set_: Annotated[
-        list[str] | None, Option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
+        list[str] | None, option("--set", "KEY=VALUE", "New run: one setting, such as bullet.latency=0.05.")
     ] = None
-    config: Annotated[Path | None, Option("--config", "FILE", "New run: TOML file with settings.")] = None
+    config: Annotated[Path | None, option("--config", "FILE", "New run: TOML file with settings.")] = None
 
     def given(self) -> list[str]:
         """Return the options of it that were given."""
@@ -68,16 +68,16 @@ def record(
     *,
     run: RunIdOption = None,
     new: NewRun,
-    kinds: Annotated[str, Option("--kinds", "NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
+    kinds: Annotated[str, option("--kinds", "NAMES", "Comma-separated kinds: mp4, gif, snapshots; or 'all'.")] = "all",
     begin: Annotated[
-        float, Option("--begin", "SECONDS", "Time in the run at which the film begins [s].", least=0.0)
+        float, option("--begin", "SECONDS", "Time in the run at which the film begins [s].", min=0.0)
     ] = 0.0,
     length: Annotated[
         float | None,
-        Option("--length", "SECONDS", "Length of the film [s]; default: to the end of the run.", least=0.001),
+        option("--length", "SECONDS", "Length of the film [s]; default: to the end of the run.", min=0.001),
     ] = None,
     out: Annotated[
-        Path | None, Option("--out", "FOLDER", "Folder for the films; default: recordings in the results folder.")
+        Path | None, option("--out", "FOLDER", "Folder for the films; default: recordings in the results folder.")
     ] = None,
 ) -> None:
     """Make a film (MP4, GIF) and snapshots of a run.

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options
-from servobench.harness.cli.options import CONTROLLER, Option, command
-from servobench.harness.cli.terminal import FAILED, console, refuse
+from servobench.harness.cli.options import CONTROLLER, command, option
+from servobench.harness.cli.terminal import FAILED, console, refuse, say
 
 if TYPE_CHECKING:
     from servobench.fmus.compile import Platform
@@ -32,10 +32,10 @@ class Export:
     mismatch: options.MismatchOption = "none"
     robot: options.RobotOption = "ur5"
     sensing: options.SensingOption = "position"
-    seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the run whose robot this is.")] = 0
+    seed: Annotated[int, option("--seed", "INTEGER", "Seed of the run whose robot this is.")] = 0
     platforms: Annotated[
         str | None,
-        Option(
+        option(
             "--platforms",
             "NAMES",
             "Comma-separated, such as x86_64-linux,aarch64-darwin, or 'all'; default: this machine.",
@@ -80,17 +80,17 @@ class Export:
 @command
 def export(
     *,
-    output: Annotated[Path, Option("--output -o", "FILE", "The .fmu file to write.", folder_okay=False)],
+    output: Annotated[Path, option("--output -o", "FILE", "The .fmu file to write.", dir_okay=False)],
     fmi: Annotated[
         int,
-        Option(
+        option(
             "--fmi",
             "INTEGER",
             "Version of FMI, 2 or 3. An arm has co-simulation and model exchange, a controller co-simulation.",
         ),
     ] = 2,
     controller: Annotated[
-        str | None, Option("--controller", CONTROLLER, "Name or file of a controller to export instead of the arm.")
+        str | None, option("--controller", CONTROLLER, "Name or file of a controller to export instead of the arm.")
     ] = None,
     exported: Export,
     overrides: options.Overrides,
@@ -110,15 +110,15 @@ def export(
             product = controller_model(exported.request(controller, settings), settings).product(fmi)
         product.write(output, platforms)
     names = ", ".join(platform.name for platform in platforms)
-    console.print(f"{output}: FMI {fmi}, {output.stat().st_size / 1024:.0f} kB, for {names}", soft_wrap=True)
+    say(f"{output}: FMI {fmi}, {output.stat().st_size / 1024:.0f} kB, for {names}")
 
 
 @fmu_app.command()
 @command
 def ssp(
     *,
-    output: Annotated[Path, Option("--output -o", "FILE", "The .ssp file to write.", folder_okay=False)],
-    controller: Annotated[str, Option("--controller", CONTROLLER, "Name or file of the controller.")],
+    output: Annotated[Path, option("--output -o", "FILE", "The .ssp file to write.", dir_okay=False)],
+    controller: Annotated[str, option("--controller", CONTROLLER, "Name or file of the controller.")],
     exported: Export,
     overrides: options.Overrides,
 ) -> None:
@@ -134,7 +134,7 @@ def ssp(
     with exported.compiling() as platforms:
         plant, regulator, stop = loop_products(request, settings)
         write_loop(output, plant, regulator, platforms, stop)
-    console.print(f"{output}: SSP 1.0, {output.stat().st_size / 1024:.0f} kB, plant and controller", soft_wrap=True)
+    say(f"{output}: SSP 1.0, {output.stat().st_size / 1024:.0f} kB, plant and controller")
 
 
 @fmu_app.command()
@@ -147,14 +147,14 @@ def validate(file: FileArgument) -> None:
 
     found = validate(file)
     for problem in found.problems:
-        console.print(f"problem: {problem}", soft_wrap=True, markup=False)
+        say(f"problem: {problem}")
     if found.deviation is None:
-        console.print("no reference run inside")
+        say("no reference run inside")
     else:
-        console.print(f"reference run: largest difference {found.deviation:.2g}")
+        say(f"reference run: largest difference {found.deviation:.2g}")
     if found.problems:
         raise typer.Exit(FAILED)
-    console.print("no problem found")
+    say("no problem found")
 
 
 @fmu_app.command()
@@ -168,12 +168,12 @@ def info(file: FileArgument) -> None:
         information = read_information(file)
     except ValueError as error:
         refuse(str(error))
-    console.print(f"{information.model_name}: FMI {information.fmi_version}, {', '.join(information.interfaces)}")
-    console.print(f"made by {information.tool}; token {information.token}")
+    say(f"{information.model_name}: FMI {information.fmi_version}, {', '.join(information.interfaces)}")
+    say(f"made by {information.tool}; token {information.token}")
     sources = "; with sources" if information.has_sources else ""
-    console.print(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
+    say(f"platforms: {', '.join(information.platforms) or 'none'}{sources}")
     for name, capabilities in information.interfaces.items():
-        console.print(f"capabilities in {name}: {', '.join(capabilities) or 'none'}", soft_wrap=True)
+        say(f"capabilities in {name}: {', '.join(capabilities) or 'none'}")
     table = Table("name", "causality", "size", "unit", "start")
     for variable in information.variables:
         size = " × ".join(map(str, variable.shape)) or "1"

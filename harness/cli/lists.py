@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -62,15 +61,17 @@ def controllers(
 
 def tasks(
     name: Annotated[str | None, typer.Argument(help=HELP, autocompletion=selection.complete_tasks)] = None,
-    robot: Annotated[str, replace(options.ROBOT_OPTION, value=replace(options.ROBOT, check=None))] = DEFAULT_ROBOT,
+    robot: Annotated[
+        str, options.option("--robot", options.ROBOT._replace(check=None), options.ROBOT_WORDS)
+    ] = DEFAULT_ROBOT,
     as_json: JsonOption = False,
 ) -> None:
     """List the tasks, or show the settings of one."""
     from servobench.harness.config.robots import find_robot
-    from servobench.harness.run.tasks import TASKS, find_task, taught
+    from servobench.harness.run.tasks import TASKS, fitted
 
     if name:
-        _show_settings(name, taught(find_task(name), find_robot(robot)), as_json=as_json)
+        _show_settings(name, fitted(name, find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
         refuse("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
@@ -184,7 +185,7 @@ def _show_settings(section: str, config: object, *, as_json: bool) -> None:
         )
         return
     if not found:
-        console.print(f"{section} has no settings", markup=False, highlight=False)
+        say(f"{section} has no settings")
     for each in found:
         line = Text(f"{section}.{each.key}", style="bold").append(f" = {toml(each.value) or 'unset'}", style="not bold")
         console.print(line, soft_wrap=True)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import Option
-from servobench.harness.cli.terminal import console, print_tables, refuse, writing
+from servobench.harness.cli.options import option
+from servobench.harness.cli.terminal import console, print_tables, refuse, say, writing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,20 +26,20 @@ def analyse(
     controllers: Annotated[list[str], typer.Argument(metavar="CONTROLLER", help="Names of controllers.")],
     *,
     mismatch: options.MismatchOption = "none",
-    seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
+    seed: Annotated[int, option("--seed", "INTEGER", "Seed of the warm-up move and of the robot.")] = 0,
     robot: options.RobotOption = "ur5",
     jacobian: Annotated[
-        str, Option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated.")
+        str, option("--jacobian", "NAME", "Jacobian that estimators are fixed at: true, nominal or estimated.")
     ] = "true",
     identify: Annotated[
         bool,
-        Option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning."),
+        option("--identify", "", "Identify all loops from logged small motions, while estimators go on learning."),
     ] = False,
     simulate: Annotated[
-        bool, Option("--simulate", "", "Also find the limits of gain and latency by simulation.")
+        bool, option("--simulate", "", "Also find the limits of gain and latency by simulation.")
     ] = False,
     overrides: options.Overrides,
-    out: Annotated[Path, Option("--out", "FOLDER", "Folder for table, pictures and page.")] = Path("results")
+    out: Annotated[Path, option("--out", "FOLDER", "Folder for table, pictures and page.")] = Path("results")
     / "analyse",
 ) -> None:
     """Analyse the loop at rest: margins, Bode, Nyquist, step.
@@ -58,7 +58,7 @@ def analyse(
             try:
                 loops.append(analyse_loop(run, source, identify=identify))
             except RunFault as fault:
-                console.print(f"{run.request.controller}: {fault}", soft_wrap=True, markup=False)
+                say(f"{run.request.controller}: {fault}")
     if not loops:
         refuse("no loop is left to analyse")
     table = loop_table(loops)
@@ -73,7 +73,7 @@ def analyse(
     page = write_pictures(out, loops, text, LEGEND)[0]
     title = f"Loops at rest, estimators frozen at the {source} Jacobian"
     print_tables([("Loops identified in small motions" if identify else title, text)], LEGEND)
-    console.print(f"table in {out / TABLE}, pictures in {page}", soft_wrap=True, markup=False)
+    say(f"table in {out / TABLE}, pictures in {page}")
 
 
 def _source(jacobian: str) -> Source:

@@ -19,7 +19,7 @@ from servobench.harness.cli import authoring, lists, results, runs, studies
 from servobench.harness.cli.films import record
 from servobench.harness.cli.fmu import fmu_app
 from servobench.harness.cli.loops import analyse
-from servobench.harness.cli.options import command, reason_without
+from servobench.harness.cli.options import ABSENT, command
 from servobench.harness.cli.terminal import FAILED, INPUT_ERROR, INTERRUPTED
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.ESTALE)
@@ -43,9 +43,9 @@ app.add_typer(fmu_app, name="fmu", rich_help_panel="Tools")
 
 
 def _print_version(wanted: bool) -> None:
-    from servobench.harness.config.installation import version_line
-
     if wanted:
+        from servobench.harness.config.installation import version_line
+
         typer.echo(version_line())
         raise typer.Exit
 
@@ -134,7 +134,7 @@ def _usage_line(error: typer.TyperException) -> str:
     """Return the one-line usage error; empty if the help page was printed."""
     context = getattr(error, "ctx", None)
     option = getattr(error, "option_name", None)
-    if context and (reason := reason_without(context.info_name, option)):
+    if context and (reason := ABSENT.get((context.info_name, option))):
         return f"{context.info_name} has no {option}: {reason}"
     help_ = f"; see {context.command_path} --help" if context else ""
     words = " ".join(error.format_message().split())

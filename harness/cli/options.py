@@ -1,18 +1,18 @@
 """Options of the command line, each declared once, and commands made of them.
 
-The type of a parameter declares its option: `seed: Annotated[int, Option("--seed", "INTEGER", "Seed of the run.")]`.
+The type of a parameter declares its option: `seed: Annotated[int, option("--seed", "INTEGER", "Seed of the run.")]`.
 Help pages, completion by shells, checks and the table in docs/commands.md are made from this one row. A parameter whose
 type is a dataclass stands for its fields, each of which is an option.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import wraps
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, get_type_hints
 
 import typer
 
@@ -25,22 +25,15 @@ if TYPE_CHECKING:
     from servobench.harness.batch.sandbox import Bounds
     from servobench.harness.config.settings import Settings
 
-EXECUTION = "Execution"  # panel of the options for workers, limits and resuming
+ABSENT: Final[dict[tuple[Any, Any], str]] = {}  # command and option -> why it does not have this option of others
 
 
-@dataclass(frozen=True)
-class Value:
-    """A kind of value that options take.
-
-    Attributes:
-        word: its name in help pages.
-        complete: values that a shell offers for an incomplete one.
-        check: returns the value of a text that was given or is the default, or refuses it.
-    """
+class Value(NamedTuple):
+    """A kind of value that options take: its word in help pages, values that a shell offers, and its check."""
 
     word: str
     complete: Callable[[str], list[str]] | None = None
-    check: Callable[[str], str] | None = None
+    check: Callable[[str], str] | None = None  # returns the value of a text, or refuses it
 
     def several(self) -> Value:
         """Return the value of an option that takes a comma-separated list of these."""
@@ -56,142 +49,109 @@ ROBOT = Value("NAME", selection.complete_robots, selection.known_robot)
 SENSING = Value("NAME", selection.complete_sensings, selection.known_sensing)
 
 
-@dataclass(frozen=True)
-class Option:
-    """An option of the command line.
+def option(name: str, value: Value | str, words: str, absent: Mapping[str, str] | None = None, **further: Any) -> Any:  # noqa: ANN401 - typer's own word for it
+    """Declare an option.
 
-    Attributes:
+    Args:
         name: with its dashes; `--on/--off` for a switch with two names, `--output -o` for a short one.
         value: kind of its value, or only the word for it; empty for a switch.
-        help: meaning, unit in brackets.
-        least: smallest number that is allowed.
-        panel: title under which help pages show it.
+        words: meaning, for help pages; unit in brackets.
         absent: command without this option -> the reason.
-        folder_okay: whether a path may be that of a folder.
+        further: arguments of `typer.Option`, such as `min` and `rich_help_panel`.
     """
+    kind = value if isinstance(value, Value) else Value(value)
+    ABSENT.update(((command, name), reason) for command, reason in (absent or {}).items())
 
-    name: str
-    value: Value | str
-    help: str
-    least: float | None = None
-    panel: str | None = None
-    absent: Mapping[str, str] = field(default_factory=dict)
-    folder_okay: bool = True
+    def check(context: typer.Context, text: Any) -> Any:  # noqa: ANN401 - typer's own word for it
+        return text if kind.check is None or text is None or context.resilient_parsing else kind.check(text)
 
-    @property
-    def kind(self) -> Value:
-        """The kind of its value."""
-        return self.value if isinstance(self.value, Value) else Value(self.value)
-
-    def typed(self) -> Any:  # noqa: ANN401 - typer's own word for it
-        """Return the option as typer declares it."""
-        return typer.Option(
-            *self.name.split(),
-            metavar=self.kind.word,
-            help=self.help,
-            autocompletion=self.kind.complete,
-            min=self.least,
-            rich_help_panel=self.panel,
-            dir_okay=self.folder_okay,
-        )
+    return typer.Option(
+        *name.split(), metavar=kind.word, help=words, autocompletion=kind.complete,
+        callback=check if kind.check else None, **further,
+    )  # fmt: skip
 
 
-def option_of(hint: Any) -> Option | None:  # noqa: ANN401 - any type
-    """Return the option that the type of a parameter declares; None for an argument."""
-    return next((each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Option)), None)
+execution_option = partial(option, rich_help_panel="Execution")  # of workers, limits and resuming
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function as a command that typer can read, with its dataclasses taken apart into options."""
     hints = get_type_hints(function, include_extras=True)
     groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
-    rows = list(_rows(function, hints, groups))
-    declared = {name: option for name, _, hint in rows if (option := option_of(hint)) is not None}
+    rows: list[tuple[str, Any, Any]] = []
+    for name, parameter in signature(function).parameters.items():
+        if name not in groups:
+            rows.append((name, parameter.default, hints[name]))
+            continue
+        types = get_type_hints(groups[name], include_extras=True)
+        given = {} if parameter.default is Parameter.empty else vars(parameter.default)
+        rows += [(each.name, given.get(each.name, each.default), types[each.name]) for each in fields(groups[name])]
 
     @wraps(function)
     def call(**values: Any) -> None:  # noqa: ANN401 - those of the options
         from servobench.harness.config.registry import offering
 
-        for name, option in declared.items():
-            if option.kind.check is not None and values[name] is not None:
-                values[name] = option.kind.check(values[name])
         for name, group in groups.items():
             values[name] = group(**{each.name: values.pop(each.name) for each in fields(group)})
         with offering():  # a user's own controllers have their names for as long as the command takes
             function(**values)
 
-    parameters = []
-    for name, default, hint in rows:
-        shown = Annotated[hint.__origin__, declared[name].typed()] if name in declared else hint
-        parameters.append(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=shown))
+    parameters = [
+        Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=hint) for name, default, hint in rows
+    ]
     vars(call).update(
         __signature__=Signature(parameters), __annotations__={each.name: each.annotation for each in parameters}
     )
     return call
 
 
-def _rows(
-    function: Callable[..., None], hints: Mapping[str, Any], groups: Mapping[str, Any]
-) -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, default and type of each option and argument of a command."""
-    for name, parameter in signature(function).parameters.items():
-        if name not in groups:
-            yield name, parameter.default, hints[name]
-            continue
-        types = get_type_hints(groups[name], include_extras=True)
-        for each in fields(groups[name]):
-            default = each.default if parameter.default is Parameter.empty else getattr(parameter.default, each.name)
-            yield each.name, default, types[each.name]
-
-
-def reason_without(command_name: object, option_name: object) -> str:
-    """Return why a command does not have an option that others have; empty if no reason is declared."""
-    declared = (option_of(each) for each in globals().values())
-    reasons = (each.absent.get(str(command_name), "") for each in declared if each and each.name == option_name)
-    return next(reasons, "")
-
-
 AXES = "none, factory, moderate, severe, or axes, such as links=10%+tool=20mm"
 LISTED = "Comma-separated names or files, or 'all'; servobench {} lists them."
-ROBOT_OPTION = Option(
-    "--robot",
-    ROBOT,
-    "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf.",
-    absent={
-        "claims": "the claims are those of the paper, which are about a UR5",
-        "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
-    },
-)
-SENSING_OPTION = Option(
-    "--sensing",
-    SENSING,
-    "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
-    absent={
-        "claims": "the claims are those of the paper, which are about the ball in 3-D",
-        "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
-        "compare shows how they do",
-        "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
-        "record": "films show the ball's way through space; figures of run --sensing show pixels",
-        "controllers": "settings of a controller are the same under all sensing",
-    },
-)
-RobotOption = Annotated[str, ROBOT_OPTION]
-SensingOption = Annotated[str, SENSING_OPTION]
-PlantsOption = Annotated[str, Option("--plants", PLANT.several(), LISTED.format("plants"))]
-ControllersOption = Annotated[str, Option("--controllers", CONTROLLER.several(), LISTED.format("controllers"))]
+ROBOT_WORDS = "ur3, ur5, ur10, ur3e, ur5e, ur10e, panda, or a file: a UR calibration (.yaml), DH table (.toml), .urdf."
+RobotOption = Annotated[
+    str,
+    option(
+        "--robot",
+        ROBOT,
+        ROBOT_WORDS,
+        absent={
+            "claims": "the claims are those of the paper, which are about a UR5",
+            "tune": "methods are tuned on the UR5 alone, and other arms take these settings; compare shows how they do",
+        },
+    ),
+]
+SensingOption = Annotated[
+    str,
+    option(
+        "--sensing",
+        SENSING,
+        "position, pixel, stereo, plate or a file; pixel:hand for a camera on the hand.",
+        absent={
+            "claims": "the claims are those of the paper, which are about the ball in 3-D",
+            "tune": "methods are tuned on the ball in 3-D, and other sensing takes these settings in natural units; "
+            "compare shows how they do",
+            "analyse": "its loops are those of the ball in 3-D; compare shows how a method does by pixels",
+            "record": "films show the ball's way through space; figures of run --sensing show pixels",
+            "controllers": "settings of a controller are the same under all sensing",
+        },
+    ),
+]
+PlantsOption = Annotated[str, option("--plants", PLANT.several(), LISTED.format("plants"))]
+ControllersOption = Annotated[str, option("--controllers", CONTROLLER.several(), LISTED.format("controllers"))]
 TasksOption = Annotated[
-    str, Option("--tasks", TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")
+    str, option("--tasks", TASK.several(), "Comma-separated names, or 'all'; servobench tasks lists them.")
 ]
-TaskOption = Annotated[str, Option("--task", TASK, "Name of the task; servobench tasks lists them.")]
+TaskOption = Annotated[str, option("--task", TASK, "Name of the task; servobench tasks lists them.")]
 MismatchOption = Annotated[
-    str, Option("--mismatch", MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")
+    str, option("--mismatch", MISMATCH, f"Difference of the true robot from the nominal one: {AXES}.")
 ]
-SeedsOption = Annotated[str, Option("--seeds", "SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
-FolderOption = Annotated[Path, Option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")]
-RunIdOption = Annotated[str | None, Option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")]
-JsonOption = Annotated[bool, Option("--json", "", "Print JSON, for other programs.")]
+SeedsOption = Annotated[str, option("--seeds", "SEEDS", "A count (5), a list (3,1,4) or a range (100:120).")]
+FolderOption = Annotated[Path, option("--out", "FOLDER", "Folder for the results; with --resume the one to continue.")]
+RunIdOption = Annotated[str | None, option("--run", "RUN_ID", "The run_id, where the folder has more than one run.")]
+JsonOption = Annotated[bool, option("--json", "", "Print JSON, for other programs.")]
 DebugOption = Annotated[
-    bool, Option("--debug", "", "Run in this process, and stop at the first crash with its trace.", panel=EXECUTION)
+    bool,
+    execution_option("--debug", "", "Run in this process, and stop at the first crash with its trace."),
 ]
 
 
@@ -202,15 +162,14 @@ class Combinations:
     plants: PlantsOption = "kinematic"
     controllers: ControllersOption = "all"
     tasks: TasksOption = "exp1,exp2,exp3,exp4,circle"
-    mismatch: Annotated[str, Option("--mismatch", MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
+    mismatch: Annotated[str, option("--mismatch", MISMATCH.several(), f"Comma-separated: {AXES}.")] = "moderate"
     robot: RobotOption = "ur5"
     sensing: Annotated[
         str,
-        replace(
-            SENSING_OPTION,
-            value=SENSING.several(),
-            help="Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the "
-            "hand.",
+        option(
+            "--sensing",
+            SENSING.several(),
+            "Comma-separated: position, pixel, stereo, plate or files, or 'all'; pixel:hand for a camera on the hand.",
         ),
     ] = "position"
     seeds: SeedsOption = "1"
@@ -240,31 +199,26 @@ class Limited:
 
     run_timeout: Annotated[
         float | None,
-        Option(
+        execution_option(
             "--run-timeout",
             "SECONDS",
             "Time limit of a run [s], or inf; default: 600 for code that is not servobench's.",
-            least=0.001,
-            panel=EXECUTION,
+            min=0.001,
         ),
     ] = None
     run_memory: Annotated[
         str | None,
-        Option(
+        execution_option(
             "--run-memory",
             "SIZE",
             "Memory limit of a run, such as 2GB, or inf; default: a share of the machine's for code that is not "
             "servobench's.",
-            panel=EXECUTION,
         ),
     ] = None
     isolate: Annotated[
         bool,
-        Option(
-            "--isolate/--no-isolate",
-            "",
-            "Keep plug-ins and foreign FMUs in processes of their own, with limits.",
-            panel=EXECUTION,
+        execution_option(
+            "--isolate/--no-isolate", "", "Keep plug-ins and foreign FMUs in processes of their own, with limits."
         ),
     ] = True
 
@@ -289,11 +243,11 @@ class Place(Limited):
 
     workers: Annotated[
         int | None,
-        Option("--workers", "COUNT", "Worker processes; default: one for each processor.", least=1, panel=EXECUTION),
+        execution_option("--workers", "COUNT", "Worker processes; default: one for each processor.", min=1),
     ] = None
     scheduler: Annotated[
         str | None,
-        Option("--scheduler", "ADDRESS", "Address of a Dask scheduler to which runs are sent.", panel=EXECUTION),
+        execution_option("--scheduler", "ADDRESS", "Address of a Dask scheduler to which runs are sent."),
     ] = None
 
 
@@ -301,9 +255,9 @@ class Place(Limited):
 class Running(Place):
     """Execution of runs that can be resumed."""
 
-    resume: Annotated[
-        bool, Option("--resume", "", "Continue in a folder whose runs were interrupted.", panel=EXECUTION)
-    ] = False
+    resume: Annotated[bool, execution_option("--resume", "", "Continue in a folder whose runs were interrupted.")] = (
+        False
+    )
 
     def execution(self, observer: Observer | None = None) -> Execution:
         """Return it as the driver takes it."""
@@ -317,7 +271,7 @@ class Judging:
     """Treatment of runs that fail."""
 
     debug: DebugOption = False
-    strict: Annotated[bool, Option("--strict", "", "End with exit code 1 if a run failed.", panel=EXECUTION)] = False
+    strict: Annotated[bool, execution_option("--strict", "", "End with exit code 1 if a run failed.")] = False
 
     def execution(self, running: Running) -> Execution:
         """Return the execution of runs; one by one in this process if they are debugged.
@@ -346,11 +300,11 @@ class Overrides:
 
     set_: Annotated[
         list[str] | None,
-        Option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated."),
+        option("--set", "KEY=VALUE", "One setting, such as kinematic.lag=0.1; may be repeated."),
     ] = None
     config: Annotated[
         Path | None,
-        Option("--config", "FILE", "TOML file with settings; a [section] for each plant, controller or task."),
+        option("--config", "FILE", "TOML file with settings; a [section] for each plant, controller or task."),
     ] = None
 
     def settings(self, *further: str) -> Settings:

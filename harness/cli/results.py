@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from servobench.harness.cli.options import JsonOption, Option
+from servobench.harness.cli.options import JsonOption, option
 from servobench.harness.cli.terminal import FAILED, console, print_json, print_markdown, print_tables, refuse, say
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import pandas as pd
 
 SLOW_REPORT: Final = 20.0  # [s], beyond which the time that a report took is printed
@@ -23,7 +25,7 @@ def statistics(
     folder: Annotated[Path, typer.Argument(help="Results folder of a run, comparison or sweep.")],
     metric: Annotated[
         str | None,
-        Option(
+        option(
             "--metric",
             "COLUMN",
             "Column of the table of runs by which pairs are compared; default: settling time, on curves RMS error.",
@@ -31,13 +33,13 @@ def statistics(
     ] = None,
     never: Annotated[
         float | None,
-        Option(
+        option(
             "--never",
             "NUMBER",
             "Value for a run that has none, such as one that never settled; default: twice the largest.",
         ),
     ] = None,
-    markdown: Annotated[bool, Option("--markdown", "", "Print the tables as Markdown.")] = False,
+    markdown: Annotated[bool, option("--markdown", "", "Print the tables as Markdown.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Judge the controllers of a folder, with 95 % intervals.
@@ -68,7 +70,7 @@ def statistics(
 
 def report(
     folder: Annotated[Path, typer.Argument(help="Results folder of run, compare, sweep or claims.")],
-    out: Annotated[Path | None, Option("--out", "FILE", "The page; default: report.html in the folder.")] = None,
+    out: Annotated[Path | None, option("--out", "FILE", "The page; default: report.html in the folder.")] = None,
 ) -> None:
     """Write one page about a results folder.
 
@@ -89,7 +91,7 @@ def make_report(folder: Path, out: Path | None = None) -> None:
         path = write_report(folder, out)
     seconds = time.monotonic() - began
     took = f", made in {seconds:.0f} s" if seconds > SLOW_REPORT else ""
-    console.print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})", soft_wrap=True, markup=False)
+    say(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB{took})")
 
 
 def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a batch that was killed.")]) -> None:
@@ -100,7 +102,7 @@ def collect(folder: Annotated[Path, typer.Argument(help="Results folder of a bat
     results.check_folder(folder)
     with locked(folder):
         count = results.collect(folder)
-    console.print(f"{count} runs in {folder / results.RUNS}")
+    say(f"{count} runs in {folder / results.RUNS}")
 
 
 def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> None:
@@ -117,20 +119,19 @@ def verify(folder: Annotated[Path, typer.Argument(help="Results folder.")]) -> N
         say(f"{folder} is being written by {holder}")
     found = examine(folder)
     for finding in found.findings:
-        line = f"{folder / finding.name} {finding.what}: {finding.remedy}"
-        say(line)
+        say(f"{folder / finding.name} {finding.what}: {finding.remedy}")
     if line := missing_line(found.runs, found.wanted):
         say(line)
     if found.findings:
         sys.exit(FAILED)
-    console.print(f"{found.files} files are as they were written, {found.runs} runs", markup=False, highlight=False)
+    say(f"{found.files} files are as they were written, {found.runs} runs")
 
 
 def export(
     folder: Annotated[Path, typer.Argument(help="Results folder of run or compare, which keep steps.")],
-    out: Annotated[Path, Option("--out", "FOLDER", "New folder for the files.")],
+    out: Annotated[Path, option("--out", "FOLDER", "New folder for the files.")],
     format_: Annotated[
-        str, Option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
+        str, option("--format", "NAME", "csv, or mcap (Foxglove, readers of MCAP; extra mcap).")
     ] = "csv",
 ) -> None:
     """Write the steps of runs for other tools, a file a run."""
@@ -140,7 +141,7 @@ def export(
     if missing := results.describe_missing(folder):
         say(missing)
     files = export_folder(folder, out, format_)
-    console.print(f"{len(files)} files in {out}", markup=False, highlight=False)
+    say(f"{len(files)} files in {out}")
 
 
 def print_faults(runs: pd.DataFrame) -> None:
@@ -148,25 +149,24 @@ def print_faults(runs: pd.DataFrame) -> None:
     from servobench.harness.run.result import COMPLETED
 
     for row in runs[runs["status"] != COMPLETED].head(MAX_FAULTS).to_dict("records"):
-        line = f"{row['run_id']}: {row['status']}: {row['reason']}"
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
+        say(f"{row['run_id']}: {row['status']}: {row['reason']}")
 
 
-def judge(folder: Path, *, strict: bool) -> None:
+def judge(folder: Path, tables: Iterable[pd.DataFrame], *, strict: bool) -> None:
     """Say how many runs of a finished batch failed and where their traces are; end with exit code 1 if that counts.
 
     Args:
         folder: its results.
+        tables: its runs, in parts.
         strict: whether a run that failed makes the command fail.
     """
     from servobench.harness.batch import results
     from servobench.harness.run.result import COMPLETED
 
-    statuses = [table["status"] for table in results.iterate_runs(folder, ("status",))]
-    count, failed = sum(map(len, statuses)), sum(int((status != COMPLETED).sum()) for status in statuses)
+    completed = [table["status"] == COMPLETED for table in tables]
+    count, failed = sum(map(len, completed)), sum(int((~each).sum()) for each in completed)
     if not failed:
         return
-    line = f"{failed} of {count} run{'s' if count > 1 else ''} failed; why, with traces: {folder / results.FAILURES}"
-    console.print(line, soft_wrap=True, markup=False, highlight=False)
+    say(f"{failed} of {count} run{'s' if count > 1 else ''} failed; why, with traces: {folder / results.FAILURES}")
     if strict:
         sys.exit(FAILED)

@@ -12,21 +12,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, Option
+from servobench.harness.cli.options import CONTROLLER, ESTIMATOR, PLANT, option
 from servobench.harness.cli.results import judge, make_report, print_faults
 from servobench.harness.cli.terminal import INTERRUPTED, console, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    import pandas as pd
+
     from servobench.harness.batch.campaign import Campaign, Execution
 
 DEFAULT_CONTROLLER = "ukf_mfac"  # of a run for which none is named
 
 OutOption = Annotated[
-    Path | None, Option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
+    Path | None, option("--out", "FOLDER", "New folder for the results; default: results/<date-time>.")
 ]
-ReportOption = Annotated[bool, Option("--report/--no-report", "", "Also make the page report.html.")]
+ReportOption = Annotated[bool, option("--report/--no-report", "", "Also make the page report.html.")]
 
 
 def run(
@@ -42,7 +44,7 @@ def run(
     *,
     plant: Annotated[
         str | None,
-        Option(
+        option(
             "--plant",
             PLANT,
             "Name or file of the plant; default: the first of bullet, mujoco and kinematic that is installed.",
@@ -50,7 +52,7 @@ def run(
     ] = None,
     controller: Annotated[
         str | None,
-        Option(
+        option(
             "--controller",
             CONTROLLER,
             f"Name or file of the controller, or a law with --estimator; default: {DEFAULT_CONTROLLER}.",
@@ -58,15 +60,15 @@ def run(
     ] = None,
     estimator: Annotated[
         str | None,
-        Option("--estimator", ESTIMATOR, "Compose the law --controller with this estimator."),
+        option("--estimator", ESTIMATOR, "Compose the law --controller with this estimator."),
     ] = None,
     task: options.TaskOption = "exp2",
     mismatch: options.MismatchOption = "moderate",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
-    seed: Annotated[int, Option("--seed", "INTEGER", "Seed of everything random in the run.")] = 0,
+    seed: Annotated[int, option("--seed", "INTEGER", "Seed of everything random in the run.")] = 0,
     overrides: options.Overrides,
-    view: Annotated[bool, Option("--view", "", "Watch the bullet plant in a window.")] = False,
+    view: Annotated[bool, option("--view", "", "Watch the bullet plant in a window.")] = False,
     out: OutOption = None,
     with_report: ReportOption = False,
     limited: options.Limited,
@@ -90,7 +92,7 @@ def run(
     batch = Batch((plant,), (name,), (task,), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
-    judge(_carry_out(campaign, out, how, with_report=with_report), strict=True)
+    _carry_out(campaign, out, how, with_report=with_report, strict=True)
 
 
 def compare(
@@ -109,15 +111,14 @@ def compare(
     if running.resume and out is None:
         refuse("--resume needs --out, the folder to continue in")
     campaign = comparison(batch, overrides.settings())
-    folder = _carry_out(campaign, out, judging.execution(running), with_report=with_report)
-    judge(folder, strict=judging.strict)
+    _carry_out(campaign, out, judging.execution(running), with_report=with_report, strict=judging.strict)
 
 
 def train(
     *,
     controller: Annotated[
         str,
-        Option("--controller", CONTROLLER, "Name of the controller whose networks to train."),
+        option("--controller", CONTROLLER, "Name of the controller whose networks to train."),
     ] = "rbfnn_mfac",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
@@ -144,7 +145,7 @@ def train(
     table.add_row("Jacobian: RMS of its error over RMS of itself", f"{100 * trained.jacobian_error:.2f} %")
     table.add_row("controller: RMS error of the commanded joint position", f"{trained.controller_error:.2e} rad")
     console.print(table)
-    console.print(f"kept in {cache_folder(NETWORKS)}", soft_wrap=True)
+    say(f"kept in {cache_folder(NETWORKS)}")
 
 
 @contextlib.contextmanager
@@ -160,13 +161,12 @@ def _ending_at_once(folder: Path, wanted: int) -> Iterator[None]:
         if not count:
             raise
         line = f"interrupted: {count} of {wanted} runs were finished and kept in {folder}; "
-        line += "the same call with --resume and this --out continues"
-        say(line)
+        say(line + "the same call with --resume and this --out continues")
         sys.exit(INTERRUPTED)
 
 
-def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool) -> Path:
-    """Check everything, run everything, leave tables, figures and a report behind, and return the folder."""
+def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_report: bool, strict: bool) -> None:
+    """Check everything, run everything, leave tables, figures and a report behind, and judge failed runs."""
     from servobench.harness.batch.campaign import carry_out
     from servobench.harness.cli.progress import ConsoleObserver
 
@@ -174,12 +174,12 @@ def _carry_out(campaign: Campaign, out: Path | None, how: Execution, *, with_rep
     with _ending_at_once(folder, len(campaign.cells)):
         with contextlib.closing(ConsoleObserver(console, bar=not how.debug)) as observer:
             carry_out(campaign, folder, replace(how, observer=observer))
-        _show(folder, latest=out is None, with_report=with_report)
-    return folder
+        runs = _show(folder, latest=out is None, with_report=with_report)
+    judge(folder, [runs], strict=strict)
 
 
-def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
-    """Print the tables of a folder whose runs are finished, and draw its figures and its report."""
+def _show(folder: Path, *, latest: bool, with_report: bool) -> pd.DataFrame:
+    """Print the tables of a folder whose runs are finished, draw its figures and its report, and return its runs."""
     from servobench.harness.analysis.tables import summary_legend, summary_tables
     from servobench.harness.batch import results
     from servobench.harness.config.installation import missing_extra
@@ -194,10 +194,11 @@ def _show(folder: Path, *, latest: bool, with_report: bool) -> None:
         point_latest(folder)
     with console.status("drawing the figures"):
         figures = draw_figures(folder)
-    console.print(f"tables and {len(figures)} figure files in {folder}", soft_wrap=True)
+    say(f"tables and {len(figures)} figure files in {folder}")
     if with_report:
         try:
             make_report(folder)
         except (ConfigurationError, ImportError) as error:  # the runs are safe; `servobench report` can be called again
             missing = missing_extra(error, "the page") if isinstance(error, ImportError) else None
-            console.print(f"no report: {missing or error}", soft_wrap=True, markup=False)
+            say(f"no report: {missing or error}")
+    return runs

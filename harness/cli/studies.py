@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from servobench.harness.cli import options, selection
-from servobench.harness.cli.options import CONTROLLER, PLANT, Option
+from servobench.harness.cli.options import CONTROLLER, PLANT, option
 from servobench.harness.cli.results import judge
-from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse
+from servobench.harness.cli.terminal import FAILED, INTERRUPTED, console, print_tables, refuse, say
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,18 +31,18 @@ def sweep(
     combinations: options.Combinations = SWEPT,
     vary: Annotated[
         list[str] | None,
-        Option(
+        option(
             "--vary",
             "AXIS=VALUES",
             "Axis and magnitudes put on top of the mismatch, such as camera_rotation=0:180:30deg.",
         ),
     ] = None,
-    noise: Annotated[str, Option("--noise", "NUMBERS", "Comma-separated factors on the plants' sensor noise.")] = "1",
+    noise: Annotated[str, option("--noise", "NUMBERS", "Comma-separated factors on the plants' sensor noise.")] = "1",
     latency: Annotated[
-        str, Option("--latency", "SECONDS", "Comma-separated camera latencies [s]; default: the plant's.")
+        str, option("--latency", "SECONDS", "Comma-separated camera latencies [s]; default: the plant's.")
     ] = "",
     period: Annotated[
-        str, Option("--period", "SECONDS", "Comma-separated control periods [s]; default: run.period.")
+        str, option("--period", "SECONDS", "Comma-separated control periods [s]; default: run.period.")
     ] = "",
     running: options.Running,
     overrides: options.Overrides,
@@ -71,8 +71,8 @@ def sweep(
         carry_out(campaign, out, replace(how, observer=observer))
     legend = sweep_legend(results.iterate_runs(out, SWEEP_COLUMNS))
     print_tables(sweep_tables(results.iterate_runs(out, SWEEP_COLUMNS)), legend)
-    console.print(f"table in {out / results.RUNS}", soft_wrap=True)
-    judge(out, strict=judging.strict)
+    say(f"table in {out / results.RUNS}")
+    judge(out, results.iterate_runs(out, ("status",)), strict=judging.strict)
 
 
 def _times(option: str, text: str) -> tuple[float | None, ...]:
@@ -98,14 +98,14 @@ def _numbers(option: str, text: str) -> list[float]:
 def robustness(
     *,
     out: options.FolderOption,
-    plant: Annotated[str, Option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
+    plant: Annotated[str, option("--plant", PLANT, "Name or file of the plant.")] = "fmu",
     controllers: options.ControllersOption = DEFAULT_CONTROLLERS,
     seeds: options.SeedsOption = "40",
     robot: options.RobotOption = "ur5",
     sensing: options.SensingOption = "position",
     axes: Annotated[
         str,
-        Option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
+        option("--axes", "NAMES", "Comma-separated axes, such as outliers,jitter; default: the seven of the map."),
     ] = "",
     running: options.Running,
     overrides: options.Overrides,
@@ -125,24 +125,24 @@ def robustness(
     with watching(console, out) as observer:
         how = running.execution(observer)
         files = make_map(out, where, names, parse_seeds(seeds), settings, how, robot, lines, sensing)
-    console.print(f"the map is in {files[0]}; its runs are in {out}", soft_wrap=True)
+    say(f"the map is in {files[0]}; its runs are in {out}")
 
 
 def claims(
     *,
     out: options.FolderOption,
     plants: options.PlantsOption = "kinematic,fmu",
-    seeds: Annotated[int, Option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
+    seeds: Annotated[int, option("--seeds", "COUNT", "Robots for each move; two fifths of them for the circle.")] = 500,
     division: Annotated[
         str,
-        Option(
+        option(
             "--division", "NAME", "Form of the methods: equipped (all aids), published (the law as printed) or both."
         ),
     ] = "both",
     running: options.Running,
     check: Annotated[
         Path | None,
-        Option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
+        option("--check", "FILE", "Table of answers that must come out the same; the exit code is 1 if they differ."),
     ] = None,
 ) -> None:
     """Answer the paper's seven claims with statistics.
@@ -170,10 +170,10 @@ def claims(
         verdict = answer.verdict + elsewhere(answer, answers)
         console.print(f"[bold]{title}: {verdict}[/bold]", soft_wrap=True, highlight=False)
         console.print(answer.evidence, markup=False, highlight=False)
-    console.print(f"answers in {out / ANSWERS}, figures in {out / FIGURES}", soft_wrap=True)
+    say(f"answers in {out / ANSWERS}, figures in {out / FIGURES}")
     if wanted is not None:
         lines = differences(answers, wanted)
-        console.print("\n".join(lines) or f"the same answers as in {check}", soft_wrap=True, markup=False)
+        say("\n".join(lines) or f"the same answers as in {check}")
         if lines:
             sys.exit(FAILED)
 
@@ -182,30 +182,30 @@ def tune(
     *,
     controllers: Annotated[
         str,
-        Option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
+        option("--controllers", CONTROLLER.several(), "Comma-separated names, or all that have a search space."),
     ] = "all",
     studies: Annotated[
         int,
-        Option(
+        option(
             "--studies", "COUNT", "Studies of each method; the one that is best on a second set of robots is taken."
         ),
     ] = 3,
-    trials: Annotated[int, Option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
+    trials: Annotated[int, option("--trials", "COUNT", "Trials of each study, known settings included.")] = 100,
     search: Annotated[
-        int, Option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
+        int, option("--search", "COUNT", "Upper limit on the points of the coordinate search that ends a study.")
     ] = 100,
-    robots: Annotated[int, Option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
+    robots: Annotated[int, option("--robots", "COUNT", "Robots under each condition of a trial.")] = 4,
     plants: options.PlantsOption = "kinematic",
     place: options.Place,
     offset: Annotated[
-        int, Option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
+        int, option("--offset", "INTEGER", "First seed, counted from the beginning of the range kept for tuning.")
     ] = 0,
-    study_seed: Annotated[int, Option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
+    study_seed: Annotated[int, option("--study-seed", "INTEGER", "Seed of the first study's sampler.")] = 0,
     check: Annotated[
         bool,
-        Option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
+        option("--check", "", "Change each tuned value in use one by one instead, and name changes that are better."),
     ] = False,
-    out: Annotated[Path, Option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
+    out: Annotated[Path, option("--out", "FOLDER", "Folder of the studies; interrupted ones are continued.")] = (
         Path("results") / "tuning"
     ),
 ) -> None:
@@ -236,13 +236,13 @@ def tune(
     results = write_results(out, methods)
     if results:
         console.print(_tuned_table(results))
-        console.print(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned", soft_wrap=True)
+        say(f"studies and tuned values in {out}; copy its .toml files to controllers/tuned")
     if interrupted:
         _say_interrupted()
 
 
 def _say_interrupted() -> None:
-    console.print("interrupted; the same call continues where it stopped")
+    say("interrupted; the same call continues where it stopped")
     sys.exit(INTERRUPTED)
 
 

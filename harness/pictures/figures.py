@@ -52,7 +52,7 @@ HEADINGS = {
     "effort": "Control effort and saturation of each run",
     "smoothness": "How smoothly each run drives the joints",
     "step_times": "Time of a controller's step",
-    "joint_speeds": "What is commanded of the joints",
+    "joint_speeds": "Commanded motion of the joints",
 }
 OVER_SEEDS = ("errors", "jacobian", "tracking")  # kinds that show a median and a band
 OF_FIRST_SEED = ("features", "paths", "tracking_path", "joint_speeds")
@@ -60,11 +60,11 @@ T = TypeVar("T")
 
 
 class NamedFigure(NamedTuple):
-    """A figure and what it is called."""
+    """A figure with its name and heading."""
 
-    kind: str  # what it shows, one of HEADINGS
+    kind: str  # one of HEADINGS
     stem: str  # name of its file without ending
-    title: str  # the heading and what its runs have in common
+    title: str  # the heading, and the place and seeds of its runs
     tasks: tuple[str, ...]  # that it shows
     figure: Figure
 
@@ -86,22 +86,25 @@ def folder_figures(folder: Path) -> Iterator[NamedFigure]:
     Raises:
         ConfigurationError: not a results folder.
     """
-    for place, plan in _plans(folder, moves=MOVES_A_FIGURE, tasks=TASKS_A_FIGURE, blocks=BLOCKS_A_FIGURE):
+    for place, plan in _plans(
+        folder, results.load_runs(folder), moves=MOVES_A_FIGURE, tasks=TASKS_A_FIGURE, blocks=BLOCKS_A_FIGURE
+    ):
         if (named := _carry_out(place, plan, WIDE)) is not None:
             yield named
 
 
-def page_figures(folder: Path, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
-    """Yield figures of a results folder for a page, of each the wide and the narrow form; of tasks, one by one.
+def page_figures(folder: Path, runs: pd.DataFrame, kinds: Collection[str]) -> Iterator[tuple[NamedFigure, NamedFigure]]:
+    """Yield figures of a results folder for a page, each in the wide and the narrow form; tasks one by one.
 
     Args:
         folder: the results folder.
+        runs: its table of runs.
         kinds: those that are wanted, keys of `HEADINGS`.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    for place, plan in _plans(folder, moves=1, tasks=1, blocks=1):
+    for place, plan in _plans(folder, runs, moves=1, tasks=1, blocks=1):
         if plan.kind in kinds:
             wide, narrow = (_carry_out(place, plan, layout) for layout in (WIDE, NARROW))
             if wide is not None and narrow is not None:
@@ -112,7 +115,7 @@ class _Plan(NamedTuple):
     """A figure that can be drawn."""
 
     kind: str
-    what: str  # of the tasks the group has, where they need more than one figure
+    part: str  # names of its tasks, where those of a group need more than one figure
     tasks: tuple[str, ...]
     draw: Callable[[Layout], Figure | None]
 
@@ -124,11 +127,11 @@ class _Place(NamedTuple):
     runs: pd.DataFrame
 
 
-def _plans(folder: Path, *, moves: int, tasks: int, blocks: int) -> Iterator[tuple[_Place, _Plan]]:
+def _plans(folder: Path, runs: pd.DataFrame, *, moves: int, tasks: int, blocks: int) -> Iterator[tuple[_Place, _Plan]]:
     """Yield the figures of a folder, which at most so many moves, tasks and blocks of paths share."""
-    runs = with_places(results.load_runs(folder))
+    runs = with_places(runs)
     styles = method_styles(runs["controller"].tolist())
-    for group in load_groups(folder):
+    for group in load_groups(folder, runs):
         chosen = runs[(runs["plant"] == group.plant) & (runs["mismatch"] == group.mismatch)]
         ensembles = load_ensembles(folder, chosen)
         for plan in (
@@ -145,11 +148,11 @@ def _carry_out(place: _Place, plan: _Plan, layout: Layout) -> NamedFigure | None
         figure = plan.draw(layout)
     if figure is None:
         return None
-    kind, what, plant, mismatch = plan.kind, plan.what, place.group.plant, place.group.mismatch
-    details = ", ".join(filter(None, (what, f"{plant}, mismatch {mismatch}", _sample(kind, place.group, place.runs))))
+    kind, part, plant, mismatch = plan.kind, plan.part, place.group.plant, place.group.mismatch
+    details = ", ".join(filter(None, (part, f"{plant}, mismatch {mismatch}", _sample(kind, place.group, place.runs))))
     wrapped = textwrap.fill(details, round(LETTERS * figure.get_figwidth()))
     figure.suptitle(f"{HEADINGS[kind]}\n{wrapped}", fontsize=TEXT + 1.0)
-    words = "_".join(part for part in (kind, what, plant, mismatch) if part)
+    words = "_".join(word for word in (kind, part, plant, mismatch) if word)
     stem = re.sub(r"[^A-Za-z0-9.=+_-]", "_", words)
     return NamedFigure(kind, stem, f"{HEADINGS[kind]}: {details}", plan.tasks, figure)
 
@@ -169,14 +172,14 @@ def _move_plans(
     group: Group, ensembles: Mapping[str, Ensembles], styles: Styles, size: int, blocks: int
 ) -> Iterator[_Plan]:
     moves = group.select(point_to_point=True)
-    for what, part in _parts(moves, size):
+    for words, part in _parts(moves, size):
         own = {task: ensembles[task] for task in part}
         until = {task: shown_until(own[task]) for task in part}
-        yield _Plan("errors", what, tuple(part), partial(draw_moves, own, styles))
-        yield _Plan("features", what, tuple(part), partial(draw_features, part, until, styles))
+        yield _Plan("errors", words, tuple(part), partial(draw_moves, own, styles))
+        yield _Plan("features", words, tuple(part), partial(draw_features, part, until, styles))
     heads = divisions(name for tracks in moves.values() for name in tracks)
-    for what, part in _parts(moves, max(1, blocks // len(heads))):
-        yield _Plan("paths", what, tuple(part), partial(draw_paths, part, styles))
+    for words, part in _parts(moves, max(1, blocks // len(heads))):
+        yield _Plan("paths", words, tuple(part), partial(draw_paths, part, styles))
 
 
 def _curve_plans(group: Group, ensembles: Mapping[str, Ensembles], styles: Styles) -> Iterator[_Plan]:
@@ -191,10 +194,10 @@ def _cost_plans(
     everything = tuple(group.tasks)
     yield _Plan("jacobian", "", everything, partial(draw_jacobians, ensembles, styles))
     several = len(runs) > 1  # of a single run, its row in the table of runs says it all
-    for what, measured in _parts(dict.fromkeys(runs["task"] if several else ()), size):
+    for words, measured in _parts(dict.fromkeys(runs["task"] if several else ()), size):
         chosen = runs[runs["task"].isin(list(measured))]
         for kind in FIGURES:
-            yield _Plan(kind, what, tuple(measured), partial(draw_measures, chosen, kind, styles))
+            yield _Plan(kind, words, tuple(measured), partial(draw_measures, chosen, kind, styles))
     yield _Plan("step_times", "", everything, partial(draw_step_times, ensembles, styles))
     for task, tracks in group.tasks.items():
         until = shown_until(ensembles[task])

@@ -71,7 +71,7 @@ def write_recording(run: LoggedRun, stem: Path, kinds: tuple[str, ...], progress
         run: a logged run.
         stem: path of the files without ending.
         kinds: some of KINDS.
-        progress: called with the share that is done and what is being drawn.
+        progress: called with the share that is done and the name of the current step.
 
     Raises:
         ConfigurationError: the extra `animation` is missing, or ffmpeg cannot write.
@@ -105,7 +105,7 @@ def find_ffmpeg(alternative: str) -> str:
     """Return the path of ffmpeg.
 
     Args:
-        alternative: what the user can do without it, the end of the message.
+        alternative: a remedy without it, the end of the message.
 
     Raises:
         ConfigurationError: there is none.
@@ -121,7 +121,7 @@ def find_ffmpeg(alternative: str) -> str:
 
 @contextmanager
 def encoding(ffmpeg: str, path: Path, size: tuple[int, int], rate: float) -> Iterator[Write]:
-    """Yield what appends a frame to the film `path`, which is there when the context ends without an exception.
+    """Yield a function that appends a frame to the film `path`; the film is complete when the context ends.
 
     Args:
         ffmpeg: the program.
@@ -186,7 +186,7 @@ def _options(kind: str, rate: float) -> list[str]:
 
 
 def _failure(path: Path, process: subprocess.Popen[bytes], complaints: IO[bytes]) -> ConfigurationError:
-    """Return what the user is told when ffmpeg has ended with a complaint."""
+    """Return the error of a failed call of ffmpeg, with the last line of its output."""
     code = process.wait()
     complaints.seek(0)
     lines = complaints.read().decode(errors="replace").split("\n")
@@ -305,7 +305,7 @@ def _desired(run: LoggedRun) -> str:
 def snapshot_instants(ball: FloatArray, count: int) -> list[int]:
     """Return up to `count` different periods, in order, between which the ball goes equally far.
 
-    The first is that of the start, the last that in which the ball arrives: what it does in a place counts as no way.
+    The first is that of the start, the last that in which the ball arrives: jitter in a place adds no length.
 
     Args:
         ball: its path (k, 3) [m].

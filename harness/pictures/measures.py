@@ -370,7 +370,7 @@ def draw_conditions(runs: pd.DataFrame, styles: Styles, layout: Layout = WIDE) -
         draw_curves(axes, sizes, values, styles, top=104.0)
         axes.set_xlabel(label)
     label_rows(panels, "settled runs [%]")
-    figure.suptitle("How many moves settle over what is varied; bands are 95 % intervals", fontsize=TEXT + 1.0)
+    figure.suptitle("Settled moves over each varied condition; bands are 95 % intervals", fontsize=TEXT + 1.0)
     add_legend(figure, panels)
     return figure
 

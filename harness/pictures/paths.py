@@ -1,4 +1,4 @@
-"""Paths of the feature in space, in two views to scale: what the camera sees, and the same from above."""
+"""Paths of the feature in space, in two views to scale: along the optical axis of the camera, and from above."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Trail(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LoggedRun:
-    """What is needed to show a run again.
+    """A logged run with all that its pictures need.
 
     Attributes:
         track: its row in the table of runs, and its steps.
@@ -146,7 +146,7 @@ class Replay:
         """Open a world with the run's robot.
 
         Args:
-            run: what to show.
+            run: the logged run.
             fineness: pixels rendered for one pixel of the overview, along each side; above 1 edges become smooth.
         """
         self._run, self._fineness = run, fineness

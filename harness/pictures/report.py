@@ -9,10 +9,9 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -76,38 +75,22 @@ DASHES = {"-": [], "--": [7, 4], "-.": [8, 3, 2, 3], ":": [2, 3]}  # px, of the 
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """A figure as a file.
+class Drawing(NamedTuple):
+    """A figure as a file, with the size [px] at which its type is as large as that of the page."""
 
-    Attributes:
-        data: the PNG file, base64.
-        width: [px] at which its type has the size of the page's.
-        height: [px], likewise.
-    """
-
-    data: str
+    data: str  # the PNG file, base64
     width: int
     height: int
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A figure as it stands in the page.
+class Picture(NamedTuple):
+    """A figure of the page."""
 
-    Attributes:
-        kind: what it shows; a key of `servobench.harness.pictures.figures.HEADINGS`.
-        title: alternative text.
-        tasks: that it shows; none if it is of all.
-        wide: for a sheet of paper, a notebook and most screens.
-        narrow: for a phone.
-    """
-
-    kind: str
-    title: str
-    tasks: tuple[str, ...]
-    wide: Drawing
-    narrow: Drawing
+    kind: str  # a key of `servobench.harness.pictures.figures.HEADINGS`
+    title: str  # alternative text
+    tasks: tuple[str, ...]  # that it shows; none if it is of all
+    wide: Drawing  # for a sheet of paper, a notebook and most screens
+    narrow: Drawing  # for a phone
 
 
 def write_report(folder: Path, path: Path | None = None) -> Path:
@@ -153,7 +136,7 @@ def _drawn(folder: Path, runs: pd.DataFrame) -> Iterator[Picture]:
     if wide is not None and narrow is not None:
         title = "Share of moves that settle over each condition, all others together; bands are 95 % intervals"
         yield Picture("conditions", title, (), _drawing(wide, WIDE), _drawing(narrow, NARROW))
-    for named, slim in page_figures(folder, KINDS):
+    for named, slim in page_figures(folder, runs, KINDS):
         drawings = _drawing(named.figure, WIDE), _drawing(slim.figure, NARROW)
         yield Picture(named.kind, named.title, named.tasks, *drawings)
 
@@ -165,8 +148,10 @@ def _drawing(figure: Figure, layout: Layout) -> Drawing:
 
 
 def _page(folder: Path, runs: pd.DataFrame) -> str:
-    views = path_views(folder)
+    views = path_views(folder, runs)
     shown = _shown(runs)
+    numbered = groups.runs_table(shown)
+    numbered.insert(0, (groups.WHICH, "run"), shown.index.to_list())
     style, scripts = _asset("report.css"), [_asset("report.js"), *([_asset("space.js")] if views else [])]
     pictures = report_pictures(folder, runs)
     moves, curves, ended = groups.move_tables(runs), groups.curve_tables(runs), groups.outcome_table(runs)
@@ -201,7 +186,7 @@ def _page(folder: Path, runs: pd.DataFrame) -> str:
         views=views,
         estimates=estimates,
         costs=groups.cost_table(runs),
-        runs=_numbered(groups.runs_table(shown), shown),
+        runs=numbered,
         shown=len(shown),
         hidden=len(runs) - len(shown),
         others=others,
@@ -242,7 +227,7 @@ def _digests(texts: list[str]) -> str:
 
 
 def _scope(runs: pd.DataFrame, facts: dict[str, str]) -> str:
-    """Return in a line what was compared on what."""
+    """Return one line that names the controllers, tasks, plants and conditions compared."""
     words = [f"{runs[name].nunique()} {many}" if runs[name].nunique() > 1 else str(runs[name].iloc[0])
              for name, many in COUNTED.items()]  # fmt: skip
     words += [f"{name} {' and '.join(Path(str(each)).name for each in runs[name].unique())}"
@@ -262,13 +247,8 @@ def _shown(runs: pd.DataFrame) -> pd.DataFrame:
     return known.loc[wrong.sort_values(ascending=False, kind="stable").index[:SHOWN_RUNS]].sort_index()
 
 
-def _numbered(table: pd.DataFrame, shown: pd.DataFrame) -> pd.DataFrame:
-    table.insert(0, (groups.WHICH, "run"), shown.index.to_list())
-    return table
-
-
 def _data(folder: Path, shown: pd.DataFrame, views: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return what the scripts draw: runs by their number, with the error over time of those whose steps are kept."""
+    """Return the data of the scripts: runs by their number, with the error over time of those whose steps are kept."""
     curves = error_curves(folder, shown)
     shown = in_handy_units(shown)
     known = [name for name in METRICS if name in shown and shown[name].notna().any()]
@@ -302,7 +282,7 @@ def swatches(names: list[str]) -> dict[str, Json]:
     return {name: {"colour": style.colour, "dash": _dash(style)} for name, style in method_styles(names).items()}
 
 
-def path_views(folder: Path) -> list[Json]:
+def path_views(folder: Path, runs: pd.DataFrame) -> list[Json]:
     """Return the paths in space of each plant, mismatch and task; none where no run has one.
 
     Raises:
@@ -310,7 +290,7 @@ def path_views(folder: Path) -> list[Json]:
     """
     views = (
         _view(f"{task} on {group.plant}, mismatch {group.mismatch}, seed {group.seed}", tracks)
-        for group in load_groups(folder)
+        for group in load_groups(folder, runs)
         for task, tracks in group.tasks.items()
         if all(len(track.features) >= 3 for track in tracks.values())
     )
@@ -344,7 +324,7 @@ def error_curves(folder: Path, runs: pd.DataFrame) -> dict[str, Json]:
 
 
 def rounded(value: float, digits: int = DIGITS) -> float | None:
-    """Return a number with few digits, None where it is not finite: what JSON can hold."""
+    """Return a number with few digits for JSON, None where it is not finite."""
     return float(f"{value:.{digits}g}") if np.isfinite(value) else None
 
 

@@ -302,7 +302,7 @@ def _mark_settling_times(axes: Axes, ensembles: Mapping[str, Ensemble], styles: 
 
 
 def draw_joint_motion(tracks: Tracks, until: float, layout: Layout = WIDE) -> Figure | None:
-    """Draw what one run of each controller asks of the joints; None without commands.
+    """Draw the commanded joint motion of one run of each controller; None without commands.
 
     Args:
         tracks: controller -> run.
@@ -348,7 +348,7 @@ def _draw_joint(line: np.ndarray, track: Track, column: str, number: int) -> Non
 
 
 def _words(track: Track) -> list[str]:
-    """Return what stands in each panel of a run."""
+    """Return the text in each panel of a run."""
     numbers = [
         track.row.get(name) for name in ("command_switches", "joint_acceleration_rms_rad_s2", "joint_jerk_rms_rad_s3")
     ]

@@ -1,12 +1,11 @@
-"""A table as the report's template writes it: cells with their interval apart, headings in groups, methods in pairs."""
+"""Tables for the template of the report: intervals apart from values, headings in groups, methods in pairs."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import groupby
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pandas as pd
 from markupsafe import Markup, escape
@@ -25,21 +24,13 @@ LENGTHY: Final = 24  # letters of a word that may be broken anywhere
 FEW, SOME = 4, 8  # columns: up to FEW fit on a phone, up to SOME on a tablet
 
 
-@dataclass(frozen=True)
-class Cell:
-    """What stands in a cell.
-
-    Attributes:
-        text: a word or a number.
-        interval: of the number; empty without one.
-        number: whether it is to be read as a number.
-        link: address within the page; empty without one.
-    """
+class Cell(NamedTuple):
+    """A cell of a table."""
 
     text: str
-    interval: str = ""
-    number: bool = False
-    link: str = ""
+    interval: str = ""  # of the number; empty without one
+    number: bool = False  # whether it is to be read as a number
+    link: str = ""  # address within the page; empty without one
 
     @property
     def lengthy(self) -> bool:
@@ -47,40 +38,23 @@ class Cell:
         return any(len(word) > LENGTHY for word in BREAKS.sub(" ", self.text).split())
 
 
-@dataclass(frozen=True)
-class SheetRow:
-    """A row of cells.
+class SheetRow(NamedTuple):
+    """A row of cells."""
 
-    Attributes:
-        cells: one a column.
-        begins: whether another method begins with it.
-        published: whether it is a method as published.
-        name: identifier of the row in the page; empty without one.
-    """
-
-    cells: list[Cell]
-    begins: bool
-    published: bool
-    name: str = ""
+    cells: list[Cell]  # one a column
+    begins: bool  # whether another method begins with it
+    published: bool  # whether it is a method as published
+    name: str = ""  # identifier of the row in the page; empty without one
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """A table.
+class Sheet(NamedTuple):
+    """A table."""
 
-    Attributes:
-        groups: title and number of columns of each group of columns; empty where there are no groups.
-        headings: of each column, with its unit apart.
-        rows: in order.
-        size: `few`, `some` or `many` columns, for the width at which rows become cards.
-        pairs: whether every group has two columns, which stay beside each other in a card.
-    """
-
-    groups: list[tuple[str, int]]
-    headings: list[tuple[str, str]]
+    groups: list[tuple[str, int]]  # title and number of columns of each group of columns; empty without groups
+    headings: list[tuple[str, str]]  # of each column, with its unit apart
     rows: list[SheetRow]
-    size: str
-    pairs: bool
+    size: str  # `few`, `some` or `many` columns, for the width at which rows become cards
+    pairs: bool  # whether every group has two columns, which stay beside each other in a card
 
 
 def sheet(table: pd.DataFrame, *, linked: bool = False) -> Sheet:
@@ -112,7 +86,7 @@ def marked(text: object) -> Markup:
     )
 
 
-def plain(value: Any) -> str:  # noqa: ANN401 - whatever a table beside the runs holds
+def plain(value: Any) -> str:  # noqa: ANN401 - a cell of any table
     """Return a value as a reader wants it: no name of Python's for nothing, infinity or truth."""
     if isinstance(value, list | tuple | set | dict):
         return str(value)

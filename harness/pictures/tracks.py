@@ -147,14 +147,17 @@ class Group:
         }
 
 
-def load_groups(folder: Path) -> Iterator[Group]:
+def load_groups(folder: Path, runs: pd.DataFrame) -> Iterator[Group]:
     """Yield a group for each plant and mismatch, with the runs of its smallest seed.
+
+    Args:
+        folder: the results folder.
+        runs: its table of runs.
 
     Raises:
         ConfigurationError: not a results folder.
     """
-    runs = with_places(results.load_runs(folder))
-    for (plant, mismatch), group in runs.groupby(["plant", "mismatch"], sort=False):
+    for (plant, mismatch), group in with_places(runs).groupby(["plant", "mismatch"], sort=False):
         chosen = group[group["seed"] == group["seed"].min()].drop_duplicates(["task", "controller"])
         try:
             steps = results.load_steps(folder, chosen["run_id"].tolist())

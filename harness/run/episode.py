@@ -24,7 +24,7 @@ from servobench.harness.run.pose_error import final_pose_error, pose_errors
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
-from servobench.harness.run.tasks import Scenario
+from servobench.harness.run.scenario import Scenario
 from servobench.plant.contract.checks import FloatArray
 
 ROWS_AT_ONCE = 2**18  # of the logs of runs side by side, half a kilobyte each

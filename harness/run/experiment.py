@@ -21,7 +21,8 @@ from servobench.harness.run.plausibility import check_joints, check_reach, check
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import ends_batch
-from servobench.harness.run.tasks import Scenario, TaskSetting, find_task
+from servobench.harness.run.scenario import Scenario, TaskSetting
+from servobench.harness.run.tasks import TASKS
 from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, TrueModel
 from servobench.plant.cameras.placement import CameraDraws
 from servobench.plant.cameras.registry import DEFAULT_SENSING
@@ -79,9 +80,13 @@ def build_scenario(resolved: ResolvedRun, setting: TaskSetting) -> Scenario:
     Raises:
         ConfigurationError: a task that cannot be used there, or times that do not fit.
     """
-    name = resolved.request.task
+    name, task = resolved.request.task, resolved.task
+    if setting.model is None and not task.any_robot:
+        others = ", ".join(name for name, entry in TASKS.items() if entry.default.any_robot)
+        why = f"it is taught on a known robot, and this plant brings a robot of its own; use one of {others}"
+        raise ConfigurationError(f"task {name}: {why}")
     try:
-        scenario = find_task(name).build(resolved.task, setting)
+        scenario = task.scenario(setting)
     except ValueError as error:
         raise ConfigurationError(f"task {name}: {error}") from error
     check_times(resolved, scenario.duration)

@@ -1,4 +1,4 @@
-"""What came of a run, in one word; `status` says how it ended.
+"""The outcome of a run in one word; `status` says how it ended.
 
 | outcome | of | meaning |
 |---|---|---|
@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from servobench.harness.run.log import Steps
-from servobench.harness.run.tasks import Scenario
+from servobench.harness.run.scenario import Scenario
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
 from servobench.plant.robot.inverse import closest_distance
@@ -42,7 +42,7 @@ CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
 def find_outcome(
     steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: SensedArm | None
 ) -> str:
-    """Return what came of a run that completed.
+    """Return the outcome of a run that completed.
 
     Args:
         steps: its rows.

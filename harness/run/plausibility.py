@@ -15,7 +15,8 @@ import numpy as np
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.run.request import RunSettings
 from servobench.harness.run.resolution import ResolvedRun
-from servobench.harness.run.tasks import TASKS, PointTask, Scenario, find_task
+from servobench.harness.run.scenario import Scenario
+from servobench.harness.run.tasks import TASKS, find_task
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.sensing import SensingConfig
@@ -64,7 +65,7 @@ def check_reach(resolved: ResolvedRun, scenario: Scenario, robot: Robot, spec: P
         ConfigurationError: names the point that is farthest out of reach, and by how much.
     """
     task = resolved.request.task
-    if find_task(task).out_of_reach or not find_task(task).any_robot:  # other targets are taught on the true robot
+    if find_task(task).out_of_reach or not resolved.task.any_robot:  # other targets are taught on the true robot
         return
     if resolved.request.sensing != DEFAULT_SENSING:  # the features are no places
         return
@@ -90,8 +91,7 @@ def check_joints(resolved: ResolvedRun, scenario: Scenario, spec: PlantSpec) -> 
     Raises:
         ConfigurationError: names the first joint that is outside.
     """
-    taught = resolved.task.target if isinstance(resolved.task, PointTask) else None
-    for what, values in (("start", scenario.start), ("target", taught)):
+    for what, values in (("start", scenario.start), ("target", resolved.task.taught_at)):
         if values is None:
             continue
         for joint, value, lower, upper in zip(

@@ -19,7 +19,8 @@ from servobench.harness.config.registry import (
 from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
-from servobench.harness.run.tasks import TASKS, find_task, taught
+from servobench.harness.run.scenario import Task
+from servobench.harness.run.tasks import TASKS, find_task, fitted
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.sensing import change_sensing, vary_sensing
 from servobench.plant.robot.robot import Robot
@@ -33,7 +34,7 @@ class ResolvedRun:
     run: RunSettings
     plant: Any
     controller: Any
-    task: Any
+    task: Task
 
 
 def resolve(request: RunRequest, settings: Settings) -> ResolvedRun:
@@ -73,7 +74,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
         name: default_config(find_controller(name), model_known=robot.known)
         for name in dict.fromkeys(each.controller for each in requests)
     }
-    defaults |= {name: taught(find_task(name), robot) for name in dict.fromkeys(each.task for each in requests)}
+    defaults |= {name: fitted(name, robot) for name in dict.fromkeys(each.task for each in requests)}
     return {name: settings.resolve(name, default) for name, default in defaults.items()}
 
 

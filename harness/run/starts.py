@@ -31,6 +31,7 @@ import numpy.typing as npt
 from annotated_types import Gt, Le
 from scipy.spatial.transform import Rotation
 
+from servobench.harness.run.scenario import Scenario, Task, TaskSetting
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
@@ -131,7 +132,7 @@ def _in_view(postures: FloatArray, nominal: EyeModel, true: EyeModel) -> npt.NDA
 
 
 @settings
-class PoseTask:
+class PoseTask(Task):
     """A move of a target with a pose, or of cameras before one, from a displaced start to home."""
 
     displacement: Literal["axis_turn", "retreat", "camera_turn", "plane_turn"] = "axis_turn"
@@ -142,6 +143,14 @@ class PoseTask:
     """[1] share of the distance by which the start is nearer, of a retreat"""
     duration: Positive = 10.0
     """[s] length of the run"""
+
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        robot, true = setting.taught_on()
+        if not (isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel) and true.eye.judges_pose):
+            raise ValueError("it needs a target with a pose; use --sensing plate or plate:hand")
+        start = pose_start(self, robot, setting.nominal)
+        return setting.move(start, setting.taught(robot.workspace.home), self.duration)
 
 
 def displaced(config: PoseTask, middle: FloatArray) -> FloatArray:

@@ -1,53 +1,41 @@
-"""The tasks: the start of a run, the desired feature over time, and the duration.
+"""The tasks by name, as rows of a few classes that make the start, the desired feature and the duration of a run.
 
 Targets are taught as a user would teach them: the ball is put somewhere and the camera's reading becomes the desired
 feature. A target given as joint positions is therefore observed on the true robot, and is always in reach. Curves are
 given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch; where cameras
-see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.references`). The
-defaults are those of the UR5's bench; `taught` moves them to the same places in another arm's workspace.
+see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.references`).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeAlias
+from dataclasses import replace
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
-from servobench.harness.run.references import (
-    FixedPoint,
-    Laps,
-    Reference,
-    TaskKind,
-    TaughtView,
-    in_space,
-    line,
-    read_waypoints,
-)
-from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together, pose_start
+from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
+from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, enlarged, numbers
+from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
 from servobench.plant.cameras.model import EyeModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.settings import Count, NonNegative, Number, Positive, settings, suggest
-from servobench.plant.contract.signals import Channel
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import HandEyeModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import HOME, MOVES, STRETCHED, TRAINING_LOWER, TRAINING_UPPER
 from servobench.plant.robot.workspace import Workspace
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
-
-Vector: TypeAlias = tuple[float, ...]
+RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] of the curves on a UR5
+STRETCHED_START: Final = "singular_start"
 
 
 @settings
-class PointTask:
+class PointTask(Task):
     """A move from rest to a fixed target that was taught at given joint positions."""
 
     start: Vector = HOME
@@ -59,9 +47,54 @@ class PointTask:
     into_view: bool = True
     """where cameras see pixels, draw start and target together towards the arm's home until both are in view"""
 
+    @property
+    def taught_at(self) -> Vector:
+        """See `Task.taught_at`."""
+        return self.target
+
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        start, target = (as_vector(name, getattr(self, name), setting.n) for name in ("start", "target"))
+        robot, true = setting.taught_on()
+        if self.into_view and isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+            start, target = drawn_together(start, target, robot, setting.nominal, true)
+        return setting.move(start, setting.taught(target), self.duration)
+
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """Return the move of this name that was found for the arm; see `Task.scaled`."""
+        moves = {**work.moves, STRETCHED_START: (work.stretched, work.home)}
+        if name not in moves:
+            return self
+        start, target = moves[name]
+        return replace(self, start=numbers(start), target=numbers(target))
+
 
 @settings
-class RandomTask:
+class TargetTask(Task):
+    """A move from rest to a fixed target that is given as a feature."""
+
+    start: Vector = HOME
+    """[rad] joint positions at time 0"""
+    target: Vector = (0.1, -0.1, 1.2)
+    """[m] camera frame"""
+    duration: Positive = 10.0
+    """[s] length of the run"""
+
+    any_robot: ClassVar[bool] = True
+
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        target = as_vector("target", self.target, setting.m)
+        return setting.move(self.start, setting.followed(FixedPoint(target)), self.duration)
+
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """See `Task.scaled`."""
+        del name
+        return replace(self, start=numbers(work.home), target=enlarged(work, self.target))
+
+
+@settings
+class RandomTask(Task):
     """A move whose start and target are drawn by the run's seed from a box of joint positions.
 
     Where the camera is moved during the run, the target is drawn such that the arm reaches it afterwards, too.
@@ -78,47 +111,78 @@ class RandomTask:
     duration: Positive = 10.0
     """[s] length of the run"""
 
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        robot, true = setting.taught_on()
+        n, clear = robot.n, robot.workspace.clear
+        lower, upper = as_vector("lower", self.lower, n), as_vector("upper", self.upper, n)
+        if not (lower < upper).all():
+            raise ValueError("lower must be below upper for every joint")
+        generator = named_generator(setting.seed, "start_and_target")
+        if isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+            box = Box(lower, upper, self.shortest, self.lowest)
+            start, target = draw_in_view(box, robot, setting.nominal, true, generator)
+            return setting.move(start, setting.taught(target), self.duration)
+        for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
+            pairs = generator.uniform(lower, upper, (DRAWN_AT_ONCE, 2, n))
+            balls = robot.arm.ball_position(pairs)
+            apart = norm(balls[:, 1] - balls[:, 0]) >= self.shortest
+            fit = apart & (balls[:, :, 2] >= self.lowest).all(axis=-1)
+            if clear is not None:
+                fit &= clear(pairs).all(axis=-1)
+            for start, target in pairs[fit]:
+                point = true.feature(target)
+                if _stays_in_reach(point, self.lowest, setting, robot):
+                    return setting.move(start, FixedPoint(point), self.duration)
+        raise ValueError("no start and target in the box are far enough apart and above the table")
+
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """See `Task.scaled`."""
+        del name
+        lower, upper = numbers(work.lower), numbers(work.upper)
+        shortest, lowest = work.scale * self.shortest, work.scale * self.lowest
+        return replace(self, lower=lower, upper=upper, shortest=shortest, lowest=lowest)
+
 
 @settings
-class CircleTask:
-    """A horizontal circle in the camera frame, entered from its centre: a large initial error."""
+class CurveTask(Task):
+    """Laps on a curve in the plane of the camera's image, entered from its centre: a large initial error."""
 
+    curve: Literal["circle", "lemniscate"] = "circle"
+    """a circle, or a figure of eight"""
     start: Vector = HOME
     """[rad] joint positions at time 0"""
     centre: Vector = (0.0, 0.0, 1.25)
     """[m] camera frame; (0.5, 0, 0.3) m in the base frame of the nominal robot"""
-    radius: Positive = 0.3
-    """[m] of the circle"""
+    radius: Positive | None = None
+    """[m] of the circle, or half the length of the lemniscate; by default 0.3 m and 0.25 m on a UR5"""
     lap_time: Positive = 10.0
     """[s] 200 points a lap at the default period"""
     laps: Count = 2
     """laps in the run; the last one is judged"""
 
+    any_robot: ClassVar[bool] = True
 
-@settings
-class LemniscateTask(CircleTask):
-    """A figure of eight in the plane of the camera's image."""
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        centre, scale = as_vector("centre", self.centre, setting.m), 1.0
+        if setting.robot is not None:
+            scale = setting.robot.workspace.scale
+        radius = scale * RADII[self.curve] if self.radius is None else self.radius
+        laps = setting.followed(Laps(centre, radius, self.lap_time, self.curve == "lemniscate"))
+        judged_from = (self.laps - 1) * self.lap_time
+        start = setting.start(self.start)
+        return Scenario(start, laps, self.laps * self.lap_time, judged_from, lap_time=self.lap_time)
 
-    radius: Positive = 0.25
-    """[m] half of its length"""
-
-
-@settings
-class EnduranceTask:
-    """Many laps on the curve of the task `circle` or `lemniscate`: whether a method stays as good as it was."""
-
-    curve: Literal["circle", "lemniscate"] = "circle"
-    """the task whose centre and radius the curve has"""
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    lap_time: Positive = 10.0
-    """[s] 200 points a lap at the default period"""
-    laps: Count = 180
-    """laps in the run, half an hour; the first one is the entry, the last one is judged"""
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """See `Task.scaled`."""
+        del name
+        radius = None if self.radius is None else work.scale * self.radius
+        return replace(self, start=numbers(work.home), centre=enlarged(work, self.centre), radius=radius)
 
 
 @settings
-class LineTask:
+class LineTask(Task):
     """A straight line at constant speed, then rest at its end."""
 
     start: Vector = HOME
@@ -132,9 +196,23 @@ class LineTask:
     duration: Positive = 10.0
     """[s] length of the run"""
 
+    any_robot: ClassVar[bool] = True
+
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        begin, end = (as_vector(name, getattr(self, name), setting.m) for name in ("begin", "end"))
+        reference = setting.followed(line(begin, end, self.moving))
+        return Scenario(setting.start(self.start), reference, self.duration, 0.5 * self.duration)
+
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """See `Task.scaled`."""
+        del name
+        begin, end = enlarged(work, self.begin), enlarged(work, self.end)
+        return replace(self, start=numbers(work.home), begin=begin, end=end)
+
 
 @settings
-class WaypointTask:
+class WaypointTask(Task):
     """Waypoints from a CSV file, in the camera frame; its columns are time_s, x_m, y_m, z_m on a UR5."""
 
     start: Vector = HOME
@@ -144,133 +222,21 @@ class WaypointTask:
     settle: NonNegative = 2.0
     """[s] rest after the last waypoint"""
 
+    any_robot: ClassVar[bool] = True
 
-@settings
-class TargetTask:
-    """A move from rest to a fixed target that is given as a feature."""
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """See `Task.scenario`."""
+        if not self.file:
+            raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
+        reference = read_waypoints(user_path(self.file), setting.feature)
+        duration = float(reference.times[-1]) + self.settle
+        check_number("last waypoint's time plus settle", duration, above=0.0)
+        return Scenario(setting.start(self.start), reference, duration, 0.5 * duration)
 
-    start: Vector = HOME
-    """[rad] joint positions at time 0"""
-    target: Vector = (0.1, -0.1, 1.2)
-    """[m] camera frame"""
-    duration: Positive = 10.0
-    """[s] length of the run"""
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """A task made concrete for one true robot."""
-
-    start: FloatArray | None  # (n,), joint positions at time 0; None for a plant that brings its own [rad]
-    reference: Reference  # the desired feature over time
-    duration: float  # [s]
-    evaluate_from: float  # where the evaluated part begins [s]
-    kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
-    lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
-
-
-@dataclass(frozen=True)
-class TaskSetting:
-    """Where a task is to be done."""
-
-    model: SensedArm | None  # the true robot, or None for a plant that brings its own
-    n: int  # number of joints
-    feature: Channel  # names and unit of the m features
-    seed: int  # for tasks that draw random numbers
-    moved: SensedArm | None = None  # the true robot once its camera was moved; None if it is not
-    robot: Robot | None = None  # by its maker's description; None for a plant that brings its own
-    nominal: SensedArm | None = None  # the same with its cameras as planned
-
-    @property
-    def m(self) -> int:
-        """How many numbers a place has, in which tasks give targets and curves."""
-        return len(self.feature.names) if self.model is None else 3
-
-    def followed(self, curve: Reference) -> Reference:
-        """Return what the features should be for a ball on a curve of places."""
-        return in_space(curve, self.model, self.robot)
-
-    def taught(self, joint_position: FloatArray) -> Reference:
-        """Return the target that is taught with the arm at a joint position, (n,) rad.
-
-        Raises:
-            ValueError: the plant brings a robot of its own.
-        """
-        model = self.taught_on()[1]
-        return (
-            TaughtView(model, joint_position)
-            if isinstance(model, EyeModel)
-            else FixedPoint(model.feature(joint_position))
-        )
-
-    def taught_on(self) -> tuple[Robot, SensedArm]:
-        """Return the robot and the true one, for a target that is taught on it.
-
-        Raises:
-            ValueError: the plant brings a robot of its own.
-        """
-        if self.model is None or self.robot is None:
-            raise ValueError("it is taught on a known robot, and this plant brings a robot of its own; use one of "
-                             f"{', '.join(name for name in TASKS if TASKS[name].any_robot)}")  # fmt: skip
-        return self.robot, self.model
-
-    def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
-        """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
-        return None if self.model is None else as_vector("start", joint_position, self.n)
-
-
-@dataclass(frozen=True)
-class TaskEntry:
-    """A task as the command line knows it."""
-
-    name: str  # the word on the command line
-    summary: str  # one line for `servobench tasks`
-    default: Any  # its settings
-    build: Callable[[Any, TaskSetting], Scenario]  # makes a scenario from settings and the setting of the run
-    any_robot: bool = False  # it needs no known robot: no target is given as its joint positions
-    out_of_reach: bool = False  # its target is out of the arm's reach on purpose
-
-
-def _build_point(config: PointTask, setting: TaskSetting) -> Scenario:
-    start, target = (as_vector(name, getattr(config, name), setting.n) for name in ("start", "target"))
-    robot, true = setting.taught_on()
-    if config.into_view and isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
-        start, target = drawn_together(start, target, robot, setting.nominal, true)
-    return _move(start, setting.taught(target), config.duration, setting)
-
-
-def _build_target(config: TargetTask, setting: TaskSetting) -> Scenario:
-    target = as_vector("target", config.target, setting.m)
-    return _move(config.start, setting.followed(FixedPoint(target)), config.duration, setting)
-
-
-def _move(start: Vector | FloatArray, reference: Reference, duration: float, setting: TaskSetting) -> Scenario:
-    return Scenario(setting.start(start), reference, duration, 0.75 * duration, "point_to_point")
-
-
-def _build_random(config: RandomTask, setting: TaskSetting) -> Scenario:
-    robot, true = setting.taught_on()
-    n, clear = robot.n, robot.workspace.clear
-    lower, upper = as_vector("lower", config.lower, n), as_vector("upper", config.upper, n)
-    if not (lower < upper).all():
-        raise ValueError("lower must be below upper for every joint")
-    generator = named_generator(setting.seed, "start_and_target")
-    if isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
-        box = Box(lower, upper, config.shortest, config.lowest)
-        start, target = draw_in_view(box, robot, setting.nominal, true, generator)
-        return _move(start, setting.taught(target), config.duration, setting)
-    for _ in range(MAX_DRAWS // DRAWN_AT_ONCE):
-        pairs = generator.uniform(lower, upper, (DRAWN_AT_ONCE, 2, n))
-        balls = robot.arm.ball_position(pairs)
-        apart = norm(balls[:, 1] - balls[:, 0]) >= config.shortest
-        fit = apart & (balls[:, :, 2] >= config.lowest).all(axis=-1)
-        if clear is not None:
-            fit &= clear(pairs).all(axis=-1)
-        for start, target in pairs[fit]:
-            point = true.feature(target)
-            if _stays_in_reach(point, config.lowest, setting, robot):
-                return _move(start, FixedPoint(point), config.duration, setting)
-    raise ValueError("no start and target in the box are far enough apart and above the table")
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """See `Task.scaled`."""
+        del name
+        return replace(self, start=numbers(work.home))
 
 
 def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, robot: Robot) -> bool:
@@ -281,82 +247,27 @@ def _stays_in_reach(target: FloatArray, lowest: float, setting: TaskSetting, rob
     return bool(point[2] >= lowest and nearest <= np.linalg.norm(point - robot.workspace.shoulder) <= farthest)
 
 
-def _build_pose(config: PoseTask, setting: TaskSetting) -> Scenario:
-    robot, true = setting.taught_on()
-    if not (isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel) and true.eye.judges_pose):
-        raise ValueError("it needs a target with a pose; use --sensing plate or plate:hand")
-    start = pose_start(config, robot, setting.nominal)
-    return _move(start, setting.taught(robot.workspace.home), config.duration, setting)
-
-
-def _build_laps(config: CircleTask, setting: TaskSetting) -> Scenario:
-    centre, eight = as_vector("centre", config.centre, setting.m), isinstance(config, LemniscateTask)
-    reference = setting.followed(Laps(centre, config.radius, config.lap_time, eight))
-    laps, lap_time = config.laps, config.lap_time
-    start, judged_from = setting.start(config.start), (laps - 1) * lap_time
-    return Scenario(start, reference, laps * lap_time, judged_from, lap_time=lap_time)
-
-
-def _build_endurance(config: EnduranceTask, setting: TaskSetting) -> Scenario:
-    shape = LemniscateTask() if config.curve == "lemniscate" else CircleTask()
-    scale = 1.0 if setting.robot is None else setting.robot.workspace.scale
-    centre = tuple(scale * value for value in shape.centre)
-    laps = replace(shape, start=config.start, centre=centre, radius=scale * shape.radius, lap_time=config.lap_time,
-                   laps=config.laps)  # fmt: skip
-    return _build_laps(laps, setting)
-
-
-def _build_line(config: LineTask, setting: TaskSetting) -> Scenario:
-    m = setting.m
-    straight = line(as_vector("begin", config.begin, m), as_vector("end", config.end, m), config.moving)
-    reference = setting.followed(straight)
-    return Scenario(setting.start(config.start), reference, config.duration, 0.5 * config.duration)
-
-
-def _build_waypoints(config: WaypointTask, setting: TaskSetting) -> Scenario:
-    if not config.file:
-        raise ValueError("a CSV file is needed: --set waypoints.file=PATH")
-    reference = read_waypoints(user_path(config.file), setting.feature)
-    duration = float(reference.times[-1]) + config.settle
-    check_number("last waypoint's time plus settle", duration, above=0.0)
-    return Scenario(setting.start(config.start), reference, duration, 0.5 * duration)
-
-
 EXP1, EXP2, EXP3, EXP4 = (PointTask(start=start, target=target) for start, target in MOVES.values())
-SINGULAR = PointTask(start=STRETCHED)
-UNREACHABLE = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)  # 1.5 m straight on from where the ball starts
+UNREACHABLE: Final = TargetTask(target=(0.0, -1.5, 1.25), duration=30.0)  # 1.5 m straight on from the ball's start
 
 _ENTRIES = (
-    TaskEntry("exp1", "a move whose target lies outside the training region", EXP1, _build_point),
-    TaskEntry("exp2", "a move inside the training region, forward and down", EXP2, _build_point),
-    TaskEntry("exp3", "a move inside the training region, across and up", EXP3, _build_point),
-    TaskEntry("exp4", "a move that starts outside the training region", EXP4, _build_point),
-    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CircleTask(), _build_laps, any_robot=True),
-    TaskEntry("line", "a straight line at constant speed", LineTask(), _build_line, any_robot=True),
-    TaskEntry("lemniscate", "two laps on a figure of eight", LemniscateTask(), _build_laps, any_robot=True),
-    TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask(), _build_random),
-    TaskEntry("target", "a move to a given feature (target.target)", TargetTask(), _build_target, any_robot=True),
-    TaskEntry(
-        "endurance", "half an hour on the circle or the lemniscate", EnduranceTask(), _build_endurance, any_robot=True
-    ),
-    TaskEntry(
-        "unreachable",
-        "a target 1.5 m away, out of the arm's reach",
-        UNREACHABLE,
-        _build_target,
-        any_robot=True,
-        out_of_reach=True,
-    ),
-    TaskEntry("singular_start", "a move that starts with the arm stretched", SINGULAR, _build_point),
-    TaskEntry("axis_turn", "of a plate: a turn about the optical axis by 45°", PoseTask("axis_turn"), _build_pose),
-    TaskEntry("retreat", "of a plate: away along the optical axis", PoseTask("retreat"), _build_pose),
-    TaskEntry(
-        "camera_turn", "of a plate: a turn about the camera's y axis by 15°", PoseTask("camera_turn", 15.0), _build_pose
-    ),
-    TaskEntry(
-        "plane_turn", "of a plate: a turn about an axis in its plane by 30°", PoseTask("plane_turn", 30.0), _build_pose
-    ),
-    TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask(), _build_waypoints, any_robot=True),
+    TaskEntry("exp1", "a move whose target lies outside the training region", EXP1),
+    TaskEntry("exp2", "a move inside the training region, forward and down", EXP2),
+    TaskEntry("exp3", "a move inside the training region, across and up", EXP3),
+    TaskEntry("exp4", "a move that starts outside the training region", EXP4),
+    TaskEntry("circle", "two laps on a horizontal circle of 0.3 m radius", CurveTask(radius=RADII["circle"])),
+    TaskEntry("line", "a straight line at constant speed", LineTask()),
+    TaskEntry("lemniscate", "two laps on a figure of eight", CurveTask("lemniscate", radius=RADII["lemniscate"])),
+    TaskEntry("random", "start and target drawn by the seed from the training region", RandomTask()),
+    TaskEntry("target", "a move to a given feature (target.target)", TargetTask()),
+    TaskEntry("endurance", "half an hour on the circle or the lemniscate", CurveTask(laps=180)),
+    TaskEntry("unreachable", "a target 1.5 m away, out of the arm's reach", UNREACHABLE, out_of_reach=True),
+    TaskEntry(STRETCHED_START, "a move that starts with the arm stretched", PointTask(start=STRETCHED)),
+    TaskEntry("axis_turn", "of a plate: a turn about the optical axis by 45°", PoseTask("axis_turn")),
+    TaskEntry("retreat", "of a plate: away along the optical axis", PoseTask("retreat")),
+    TaskEntry("camera_turn", "of a plate: a turn about the camera's y axis by 15°", PoseTask("camera_turn", 15.0)),
+    TaskEntry("plane_turn", "of a plate: a turn about an axis in its plane by 30°", PoseTask("plane_turn", 30.0)),
+    TaskEntry("waypoints", "points of a CSV file (waypoints.file)", WaypointTask()),
 )
 TASKS = {entry.name: entry for entry in _ENTRIES}
 
@@ -372,44 +283,11 @@ def find_task(name: str) -> TaskEntry:
     return TASKS[name]
 
 
-def taught(entry: TaskEntry, robot: Robot) -> Any:  # noqa: ANN401 - the settings of any task
+def fitted(name: str, robot: Robot) -> Task:
     """Return the settings of a task for a robot: on a UR5 those of the entry itself.
 
-    Joint positions are those that were found for the robot, lengths grow with its workspace, times stay.
+    Raises:
+        ConfigurationError: no such task.
     """
-    if robot.name == DEFAULT_ROBOT:
-        return entry.default
-    work, default = robot.workspace, entry.default
-    home = _numbers(work.home)
-    match default:
-        case PoseTask():  # its start and its goal are the arm's own
-            return default
-        case PointTask():
-            start, target = work.moves.get(entry.name, (work.stretched, work.home))
-            return replace(default, start=_numbers(start), target=_numbers(target))
-        case RandomTask():
-            return RandomTask(
-                _numbers(work.lower),
-                _numbers(work.upper),
-                work.scale * default.shortest,
-                work.scale * default.lowest,
-                default.duration,
-            )
-        case CircleTask():
-            return replace(
-                default, start=home, centre=_scaled(work, default.centre), radius=work.scale * default.radius
-            )
-        case LineTask():
-            return replace(default, start=home, begin=_scaled(work, default.begin), end=_scaled(work, default.end))
-        case TargetTask():
-            return replace(default, start=home, target=_scaled(work, default.target))
-        case _:
-            return replace(default, start=home)
-
-
-def _scaled(work: Workspace, point: Vector) -> Vector:
-    return tuple(work.scale * value for value in point)
-
-
-def _numbers(values: FloatArray | Iterable[float]) -> Vector:
-    return tuple(np.asarray(values, dtype=np.float64).tolist())
+    default = find_task(name).default
+    return default if robot.name == DEFAULT_ROBOT else default.scaled(name, robot.workspace)

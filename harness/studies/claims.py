@@ -60,7 +60,7 @@ LEAVING: Final = ("exp1", "exp4")  # start or target lie outside the region in w
 STAYING: Final = ("exp2", "exp3")
 CIRCLE: Final = "circle"
 MISMATCH: Final = "moderate"
-DIVISIONS: Final[Mapping[str, str]] = {  # how the methods are equipped -> what follows their names
+DIVISIONS: Final[Mapping[str, str]] = {  # equipment of the methods -> suffix of their names
     "best equipped": "",
     "as published": PUBLISHED,
 }
@@ -83,12 +83,12 @@ class Measurement:
     """One number behind an answer.
 
     Attributes:
-        panel: what is measured, with its unit.
+        panel: the measured quantity with its unit.
         place: task.
         label: controller, reading or pairing.
         estimate: value and interval.
         holds: whether the claim's rule holds here; None for a number that no rule judges, and where the robots are so
-            few that it could not hold whatever came out.
+            few that it could not hold in any event.
     """
 
     panel: str
@@ -106,7 +106,7 @@ class Answer:
         claim: its number; readings of the paper have a name instead.
         statement: the claim in a few words.
         plant: on which the claim was tested.
-        verdict: reproduced, not reproduced, or depends on what.
+        verdict: reproduced, not reproduced, or the cases on which it depends.
         evidence: one line.
         measurements: the numbers, for the table and the figure.
         division: how the methods were equipped.
@@ -355,7 +355,7 @@ def pairings(
     Args:
         runs: the table of runs.
         metric: column.
-        panel: what is measured, with its unit.
+        panel: the measured quantity with its unit.
         sign: −1 where the claim says less, +1 where it says more.
         never: replaces a missing value; NaN leaves the pair out.
         factor: from the column's unit to the panel's.

@@ -101,7 +101,7 @@ def find_lines(axes: Sequence[str]) -> tuple[Line, ...]:
 
 
 class Scale(NamedTuple):
-    """What a picture of the map shows."""
+    """The quantity that a picture of the map shows."""
 
     measure: Callable[[pd.DataFrame], Estimate]  # of the runs at a place
     label: str
@@ -145,7 +145,7 @@ def make_map(
         The files of the pictures.
 
     Raises:
-        ConfigurationError: a plant with a robot of its own, or what `carry_out` refuses.
+        ConfigurationError: a plant with a robot of its own, or runs that `carry_out` refuses.
     """
     if find_plant(plant).own_robot:
         raise ConfigurationError(f"the map varies the true robot, and plant {plant} brings one of its own")

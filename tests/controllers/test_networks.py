@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from kit.toy import jacobian_network
 from servobench.controllers.networks.rbf import (
     ControllerNetwork,
+    FeatureMemo,
     JacobianNetwork,
-    LatestFeatures,
     hidden_features,
     information_vector,
     jacobian_features,
@@ -75,18 +75,18 @@ def test_the_quick_features_of_the_controller_network_are_those_of_the_plain_for
     np.testing.assert_array_equal(network.features(network.centres[3])[3], 1.0)
 
 
-def test_the_latest_features_are_those_of_the_position_asked_for():
+def test_the_memo_returns_the_features_of_the_given_position():
     network, (first, second) = jacobian_network(), np.random.default_rng(5).normal(size=(2, 3))
-    latest = LatestFeatures(network)
+    memo = FeatureMemo(network)
     for q in (first, first, second, first):
-        np.testing.assert_array_equal(latest.at(q), network.features(q))
+        np.testing.assert_array_equal(memo.at(q), network.features(q))
     q = first.copy()
-    latest.at(q)
+    memo.at(q)
     q[0] += 1.0
-    np.testing.assert_array_equal(latest.at(q), network.features(q))
+    np.testing.assert_array_equal(memo.at(q), network.features(q))
     for rows in (network.rows, 2.0 * network.rows):
         for q in (first, first, second, np.stack([first, second])):
-            np.testing.assert_array_equal(latest.jacobian(rows, q), network.jacobian(q, rows))
+            np.testing.assert_array_equal(memo.jacobian(rows, q), network.jacobian(q, rows))
 
 
 @pytest.mark.parametrize(("kernel", "power"), [("exponential", 1), ("gaussian", 2)])

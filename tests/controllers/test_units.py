@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from servobench.controllers.controller import RobotKnowledge
-from servobench.controllers.networks.fit import WEAKEST
+from servobench.controllers.networks.fit import MIN_SINGULAR_SHARE
 from servobench.controllers.units import in_natural_units
 from servobench.plant.contract.signals import Channel, PlantSpec
 
@@ -53,4 +53,4 @@ def test_the_ideal_controller_keeps_all_directions_of_the_ball_in_3_d(robot):
     work = arm.workspace
     q = np.random.default_rng(0).uniform(work.lower, work.upper, (2000, arm.n))
     J = arm.nominal.jacobian(q)
-    np.testing.assert_array_equal(np.linalg.pinv(J, rcond=WEAKEST), np.linalg.pinv(J))
+    np.testing.assert_array_equal(np.linalg.pinv(J, rcond=MIN_SINGULAR_SHARE), np.linalg.pinv(J))

@@ -99,7 +99,8 @@ def test_more_than_four_moves_go_into_several_figures(tmp_path):
 
 def test_a_page_has_each_task_apart_for_a_screen_and_for_a_phone_and_nothing_is_cut(tmp_path):
     names = ("ukf_mfac", "./a_folder/my_own_controller.py:MyVeryOwnController", *OTHERS[:9])
-    figures = list(page_figures(comparison(tmp_path / "out", controllers=names), ("errors", "paths", "settling")))
+    folder = comparison(tmp_path / "out", controllers=names)
+    figures = list(page_figures(folder, results.load_runs(folder), ("errors", "paths", "settling")))
     assert [wide.tasks for wide, _ in figures if wide.kind == "errors"] == [("exp1",), ("exp2",)]
     assert all(wide.tasks == narrow.tasks and len(wide.tasks) == 1 for wide, narrow in figures)
     for wide, narrow in figures:
@@ -193,7 +194,7 @@ def test_half_an_hour_is_drawn_with_few_points(tmp_path):
     folder = write_folder(tmp_path / "out", [made_up_row(run_id, **kind)], [steps])
     lines = [line for named in folder_figures(folder) for axes in named.figure.axes for line in axes.get_lines()]
     assert 100 < max(len(line.get_xdata()) for line in lines) <= 700
-    assert 100 < str(path_views(folder)).count(",") < 20_000
+    assert 100 < str(path_views(folder, results.load_runs(folder))).count(",") < 20_000
 
 
 def test_an_overview_keeps_the_root_mean_square_of_errors_and_a_closing_the_last_rows():
@@ -256,6 +257,6 @@ def test_a_picture_for_a_page_keeps_the_colour_of_each_method(tmp_path):
 def test_one_seed_of_each_plant_and_mismatch_is_shown(tmp_path):
     rows = [made_up_row(f"run{seed}", seed=seed) for seed in (7, 3, 5)]
     folder = write_folder(tmp_path / "out", rows, [made_up_steps(row["run_id"]) for row in rows])
-    (group,) = load_groups(folder)
+    (group,) = load_groups(folder, results.load_runs(folder))
     assert group.seed == 3
     assert group.tasks["exp1"]["ukf_mfac"].row["run_id"] == "run3"

@@ -11,7 +11,8 @@ from servobench.harness.run.outcome import find_outcome, joint_rests_at_limit
 from servobench.harness.run.references import FixedPoint
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
-from servobench.harness.run.tasks import SINGULAR, Scenario
+from servobench.harness.run.scenario import Scenario
+from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.ur5 import HOME, nominal_ur5
@@ -116,5 +117,5 @@ def test_endurance_is_more_laps_of_the_same_curve(curve):
 
 
 def test_the_stretched_arm_has_lost_a_direction_to_move_in():
-    singular = np.linalg.svd(nominal_ur5().arm.ball_jacobian(SINGULAR.start), compute_uv=False)
+    singular = np.linalg.svd(nominal_ur5().arm.ball_jacobian(TASKS["singular_start"].default.start), compute_uv=False)
     assert singular[-1] < 1e-6 * singular[0]

@@ -241,9 +241,9 @@ def read_steps(folder):
     """Read what figures, paths and curves are drawn of."""
     results.load_steps(folder)
     runs = results.load_runs(folder)
-    for group in load_groups(folder):
+    for group in load_groups(folder, runs):
         load_ensembles(folder, runs[runs["mismatch"] == group.mismatch])
-    path_views(folder)
+    path_views(folder, runs)
     error_curves(folder, runs)
 
 

@@ -18,7 +18,7 @@ from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build_experiment, train_networks
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve, resolve_sections
-from servobench.harness.run.tasks import TASKS, taught
+from servobench.harness.run.tasks import TASKS, fitted
 from servobench.plant.robot.catalogue import find_robot
 
 PANDA = RunRequest("kinematic", "map_mfac", "exp2", "moderate", 3, robot="panda")
@@ -34,7 +34,9 @@ def test_a_run_of_a_panda_settles_and_says_whose_it_is():
 
 def test_the_ur5_is_not_named():
     assert replace(PANDA, robot="ur5").run_id == "kinematic-map_mfac-exp2-moderate-3"
-    assert [taught(entry, find_robot("ur5")) for entry in TASKS.values()] == [each.default for each in TASKS.values()]
+    assert [fitted(entry.name, find_robot("ur5")) for entry in TASKS.values()] == [
+        each.default for each in TASKS.values()
+    ]
 
 
 def test_runs_of_a_panda_side_by_side_have_the_rows_of_single_ones():
@@ -50,12 +52,12 @@ def test_runs_of_a_panda_side_by_side_have_the_rows_of_single_ones():
 @pytest.mark.parametrize("task", ["circle", "lemniscate", "line", "target", "unreachable", "endurance", "random"])
 def test_a_task_is_as_far_away_as_the_arm_is_long(task):
     robot, entry = find_robot("ur3e"), TASKS[task]
-    own, scale = taught(entry, robot), robot.workspace.scale
+    own, scale = fitted(task, robot), robot.workspace.scale
     for name in ("centre", "begin", "end", "target"):
         if hasattr(own, name):
             np.testing.assert_allclose(getattr(own, name), scale * np.array(getattr(entry.default, name)))
     for name in ("radius", "shortest", "lowest"):
-        if hasattr(own, name):
+        if getattr(own, name, None) is not None:
             assert getattr(own, name) == pytest.approx(scale * getattr(entry.default, name))
     for name in ("duration", "lap_time", "laps"):
         assert getattr(own, name, None) == getattr(entry.default, name, None)

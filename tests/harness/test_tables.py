@@ -187,7 +187,7 @@ def test_a_sweep_ends_with_the_share_of_settled_runs_in_each_condition(tmp_path)
     runs = results.load_runs(sweep(tmp_path / "out"))
     wanted = runs[runs["run_id"] != "someone_elses-60-0"].assign(latency_s=None)
     (title, table), (second, kinds) = sweep_tables([wanted.iloc[:7], wanted.iloc[7:]])
-    assert second == "random on kinematic: what came of the runs, %"
+    assert second == "random on kinematic: outcomes of the runs, %"
     assert kinds.columns.tolist() == ["controller", "settled", "feature_lost"]
     assert kinds[["settled", "feature_lost"]].values.tolist() == [["72.2", "27.8"], ["72.2", "27.8"], ["76.5", "23.5"]]
     assert title == "random on kinematic: settled, %"

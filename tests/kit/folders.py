@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +66,7 @@ def comparison(folder: Path, controllers=CONTROLLERS, tasks=("exp1", "exp2", "ci
     rows, steps = [], []
     for task in tasks:
         for controller in controllers:
-            run_id = f"kinematic-{controller}-{task}-moderate-0"
+            run_id = re.sub(r"[^\w.-]", "_", f"kinematic-{controller}-{task}-moderate-0")
             curve = task == "circle"
             judged = {"overshoot": np.nan, "settling_time_s": np.nan, "task_kind": "curve"} if curve else {}
             rows.append(made_up_row(run_id, controller=controller, task=task, **judged))

@@ -9,7 +9,7 @@ import numpy as np
 from servobench.controllers.periods import in_periods
 from servobench.plant.contract.checks import FloatArray
 
-WEIGHED_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
+REFERENCE_BLOCK = 0.05  # [s] length of the blocks for which weights are stated
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class Blocks:
     @property
     def relative_length(self) -> float:
         """Δ / Δ₀."""
-        return in_periods(self.length, WEIGHED_BLOCK)
+        return in_periods(self.length, REFERENCE_BLOCK)
 
     def places(self, delay: float) -> FloatArray:
-        """Return where the begin of the first block and the ends of all lie in a preview, (B + 1,), in rows.
+        """Return the places in a preview of the beginning of the first block and the ends of all, (B + 1,), in rows.
 
         Args:
             delay: from now to the begin of the first block [s].
@@ -57,7 +57,7 @@ class Blocks:
 
 
 def bridging_shares(delay: float, period: float) -> FloatArray:
-    """Return which share of each of the last steps sent is still to come after `delay`, the newest one last.
+    """Return the share of each of the last steps sent that takes effect after `delay`, the newest one last.
 
     Args:
         delay: from a command to its effect [s].

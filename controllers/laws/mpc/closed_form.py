@@ -26,7 +26,7 @@ import numpy as np
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import transposed
 
-_SERIES_BELOW = 0.5  # under it the series of 18 terms is exact to rounding, above it the closed form is
+_SERIES_BELOW = 0.5  # below, the series of 18 terms is exact to rounding; above, the closed form
 _SERIES_TERMS = 18
 _MIN_POWER = 1e-150  # [1] smaller weights count as 0, so that products with them do not underflow
 _NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)

@@ -72,7 +72,7 @@ class MpcConfig:
 
 
 class Plan(NamedTuple):
-    """The moves of the last command and how they were found.
+    """The moves of the last command and the result of the solver.
 
     Attributes:
         moves: dq_1 … dq_H, or the one constant step, (..., moves, n), rad.
@@ -161,7 +161,7 @@ class MpcLaw(Law[MpcState]):
         self._places, self._to_come = blocks.places(config.delay), bridging_shares(config.delay, spec.period)[:, None]
         constant, horizon = config.mode == "constant", blocks.count
         weight = as_vector("joint_weight", config.joint_weight or np.ones(spec.n), spec.n)
-        # One constant velocity is weighed once, not in every block.
+        # One constant velocity is weighted once, not in every block.
         self._Q: FloatArray = config.move_weight / blocks.relative_length ** (3 if constant else 2) * weight
         self._terminal = config.terminal_weight / blocks.relative_length
         rho, alpha = config.decay * blocks.length, math.exp(-config.forgetting * blocks.length)

@@ -232,7 +232,7 @@ class QpProgram:
         self._targets = np.zeros(self._function.numel_in(1))
         self._H, self._g, self._c = np.zeros((count, count)), np.zeros(count), np.zeros(1)
         self._A = np.zeros((self._function.numel_out(3) // count, count))
-        self._buffer, self._evaluate = self._function.buffer()  # the second one does not keep the first one alive
+        self._buffer, self._evaluate = self._function.buffer()  # keep both: the evaluation does not hold the buffer
         for i, array in enumerate((self._J, self._targets)):
             self._buffer.set_arg(i, array.data)
         for i, array in enumerate((self._H, self._g, self._c, self._A)):
@@ -252,7 +252,7 @@ class QpProgram:
         n, lower, upper = self._shape.n, -self._largest, self._largest.copy()
         lower[:n], upper[:n] = bounds.first_lower, bounds.first_upper
         row_lower, row_upper = self._row_bounds(bounds)
-        # Rows that no move within its limits can touch change nothing but the time.
+        # Rows beyond the reach of all moves within their limits cost time only.
         reach = np.abs(self._A) @ self._largest
         near = (row_lower > -reach) | (row_upper < reach)
         lower, upper = np.concatenate([lower, row_lower[near]]), np.concatenate([upper, row_upper[near]])
@@ -288,13 +288,13 @@ def _solve_daqp(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, 
 
 
 def _solve_qpoases(H: FloatArray, g: FloatArray, A: FloatArray, lower: FloatArray, upper: FloatArray) -> _Answer:
-    """Solve with a solver of its own, because qpOASES starts from the working set of the solve before."""
+    """Solve with a new solver each time, because qpOASES starts from the working set of the last solve."""
     import casadi  # noqa: PLC0415 - other methods start without it
 
     n = len(g)
     structure = {"h": casadi.Sparsity.dense(n, n), "a": casadi.Sparsity.dense(len(A), n)}
     options: dict[str, Any] = {"error_on_fail": False, "print_time": False, **_QPOASES_OPTIONS}
-    with contextlib.redirect_stdout(io.StringIO()):  # qpOASES greets when it is made and first used
+    with contextlib.redirect_stdout(io.StringIO()):  # qpOASES prints a banner when it is made and first used
         solver = casadi.conic("mpc", "qpoases", structure, options)
         found = solver(h=H, g=g, a=A, lbx=lower[:n], ubx=upper[:n], lba=lower[n:], uba=upper[n:])
     statistics = solver.stats()

@@ -27,7 +27,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.resolution import ResolvedRun
-from servobench.harness.run.tasks import find_task, taught
+from servobench.harness.run.tasks import fitted
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.kinematic import KinematicConfig
@@ -142,7 +142,7 @@ def delay_margin(
         ConfigurationError: a name or a setting that cannot be used.
     """
     request = RunRequest(PLANT, name, TASK, Mismatch(), seed, robot=robot)
-    task = taught(find_task(TASK), find_robot(robot))
+    task = fitted(TASK, find_robot(robot))
     resolved = ResolvedRun(request, run or RunSettings(), plant or KinematicConfig(), config, task)
     with one_thread():
         try:

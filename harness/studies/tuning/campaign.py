@@ -51,7 +51,7 @@ TOLERANCE: Final = 0.03  # [1] share of the score by which no change may improve
 
 @settings
 class TuningPlan:
-    """What is asked for."""
+    """The settings of a tuning campaign."""
 
     controllers: tuple[str, ...]
     """names with a search space"""
@@ -80,7 +80,7 @@ class RunningStudy:
         seed: of its sampler.
         wanted: the point that it asks for; None once it has ended.
         asked: number of points that it was given the scores of.
-        outcome: what it found, once it has ended.
+        outcome: its result, once it has ended.
     """
 
     def __init__(self, seed: int, course: Generator[Point, float, StudyOutcome]) -> None:
@@ -130,12 +130,12 @@ class Method:
         return sum(each.asked if each.outcome is None else whole for each in self.studies)
 
     def chosen(self) -> list[Point]:
-        """Return the points to be scored on the second set: the defaults and what the studies found; none before."""
+        """Return the points to score on the second set: the defaults and the results of the studies; none before."""
         found = [each.outcome.found.values for each in self.studies if each.outcome is not None]
         return [default_values(find_tunable(self.name)), *found] if len(found) == len(self.studies) else []
 
     def result(self) -> TunedValues | None:
-        """Return what the finished studies found; None while one is not finished or not scored on the second set."""
+        """Return the tuned values; None while a study is not finished or not scored on the second set."""
         records = [record for each in self.studies if (record := self._record(each)) is not None]
         if len(records) < len(self.studies):
             return None
@@ -224,7 +224,7 @@ def make_folder(folder: Path) -> None:
 
 
 def advance(methods: Sequence[Method], plan: TuningPlan, workers: Workers) -> Iterator[Method]:
-    """Carry the studies out, and score what those of a method found on the second set as soon as all have ended.
+    """Carry the studies out, and score those of a method on the second set as soon as all of them have ended.
 
     Yields:
         A method after each of its points.
@@ -276,7 +276,7 @@ class StudyRecord:
 
 @dataclass(frozen=True)
 class TunedValues:
-    """What the studies of a method found, all of it in the file; the best one on the second set is in use."""
+    """The results of all studies of a method; the best one on the second set is in use."""
 
     controller: str
     plants: tuple[str, ...]  # on which the runs took place
@@ -330,7 +330,7 @@ def _value(value: object) -> str:
 
 @dataclass(frozen=True)
 class Change:
-    """A change of one value of a method's settings in use, and what came of it."""
+    """A change of one value of a method's settings in use, and its effect on the score."""
 
     controller: str
     key: str
@@ -390,7 +390,7 @@ class Check:
         return [(ledger, name, point) for ledger, name, _, *points in self._changes for point in points]
 
     def carry_out(self, workers: Workers) -> Iterator[str]:
-        """Score what the ledgers lack, and yield the controller of each point."""
+        """Score the points that the ledgers lack, and yield the controller of each point."""
         yield from fill(self._points(), self._runs, workers)
 
     def changes(self) -> list[Change]:

@@ -1,4 +1,4 @@
-"""What tuning minimises, and the runs that it is measured on.
+"""The objective of tuning, and the runs on which it is measured.
 
 For each plant, `robots` runs under each of seven conditions: latencies of 0 to 150 ms, usual and fourfold noise, four
 times moves (the task `random`, cut to 6 s), twice a circle and once a figure of eight, both smaller and shorter than
@@ -44,7 +44,7 @@ from servobench.plant.contract.settings import Periods, settings
 
 @dataclass(frozen=True)
 class Condition:
-    """What the runs of a block share."""
+    """The condition that the runs of a block share."""
 
     task: str
     latency: float  # [s] of the camera
@@ -82,7 +82,7 @@ TASKS: Final[Mapping[str, Mapping[str, Any]]] = {
     MOVE: {"duration": MOVE_DURATION},
     "circle": {"radius": 0.2, "lap_time": 6.0},  # at 0.21 m/s, the whole task at 0.19 m/s
     "lemniscate": {"radius": 0.17, "lap_time": 6.0},
-}  # settings of the tasks: what is settled needs no more time
+}  # settings of the tasks, short because a settled run needs no more time
 ERROR_SCALE: Final = 0.05  # [m] error at which half of the worst cost of errors is reached
 WORST: Final = 2.0  # cost of a run that did not complete, and most of any run
 MIN_DELAY_MARGIN: Final = 0.05  # [s] of the loop at the usual latency; settings with less are refused without a run
@@ -189,8 +189,8 @@ def evaluate(trials: Sequence[Trial], runs: Sequence[TuningRun], workers: Worker
     """Carry out every run of every trial and yield each cost as it is known, in any order.
 
     Args:
-        trials: what to score.
-        runs: on what.
+        trials: the trials to score.
+        runs: the runs of each.
         workers: where.
 
     Raises:

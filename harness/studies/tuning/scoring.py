@@ -137,7 +137,7 @@ def fingerprint(controller: str, runs: TuningSet) -> dict[str, Any]:
 
 
 def refuse_broken_defaults(controller: str, runs: TuningSet) -> None:
-    """Build the first run with the settings in use, so that what no setting can cure is said before any run.
+    """Build the first run with the settings in use: an error that no setting can cure is reported before any run.
 
     Raises:
         ConfigurationError: a name or setting that cannot be used.
@@ -182,7 +182,7 @@ def fill(wanted: Sequence[Wanted], runs: TuningSet, workers: Workers) -> Iterato
 def refusal(trial: Trial, runs: TuningSet) -> str | None:
     """Return why a run with these settings cannot be built, or None; networks are trained before workers need them.
 
-    Whatever else fails is left to the runs, whose cost says so.
+    Any other failure is left to the runs, whose cost says so.
     """
     try:
         build_once(trial.resolved(runs.runs()[:1])[0])

@@ -52,7 +52,7 @@ class Found:
 
 @dataclass(frozen=True)
 class StudyOutcome:
-    """What a study found."""
+    """The result of a study."""
 
     trials: int  # trials of the sampler, the first points included
     best_trial: int  # number of the best one, from 0; the first is that of the defaults
@@ -66,7 +66,7 @@ def study(
     """Search for the best point of a space.
 
     Args:
-        name: of the controller; with the seed it decides what the sampler draws.
+        name: of the controller; with the seed it decides the draws of the sampler.
         space: where.
         first: points that are tried before the sampler is asked, the defaults first.
         trials: number of trials, the first points included; at least 1.
@@ -100,7 +100,7 @@ def coordinate_search(space: Space, values: Point, score: float, budget: int) ->
     """Improve a point: a generator that yields the points whose scores it needs, and returns the last one kept.
 
     Args:
-        space: what may be changed, in the order in which it is tried.
+        space: the values that may be changed, in the order in which it is tried.
         values: where to begin.
         score: of that point.
         budget: most points to ask for.
@@ -152,7 +152,7 @@ def first_points(name: str) -> list[Point]:
     """Return the points that every study of a controller tries first, each once.
 
     They are the defaults of its class, the tuned values in use, the defaults with each value of each switch, and the
-    tuned values with what other methods' tuned values say of the keys that both have.
+    tuned values with those of other methods for the keys that both have.
     """
     entry, space = find_tunable(name), find_space(name)
     default = default_values(entry)
@@ -176,7 +176,7 @@ def tuned_point(entry: ControllerEntry) -> Point | None:
 
 
 def _borrowed(name: str, own: Point) -> Iterator[Point]:
-    """Yield `own` with the tuned values of each other method for the keys that both have."""
+    """Yield starting points that reuse another method's tuned values for shared settings."""
     space = find_space(name)
     for other in SPACES:
         settings = {} if other == name else tuned_settings(other)
@@ -194,7 +194,7 @@ def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa
 
 
 def inside(space: Space, values: Point, otherwise: Point) -> Point:
-    """Return `values` where they lie in the space; what a number is outside of its range becomes the range's end."""
+    """Return `values` where they lie in the space; a number outside its range becomes the nearest end of the range."""
     return {key: _within(space[key], values[key], otherwise[key]) for key in space}
 
 

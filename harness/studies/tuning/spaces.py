@@ -1,4 +1,4 @@
-"""What may be tuned: for each controller its switches and its numbers with their ranges.
+"""The search spaces: for each controller its switches and its numbers with their ranges.
 
 Ranges reach about a factor of ten around the defaults, or as far as a method allows; `log` ones are searched by factor.
 Everything else keeps the default of its class, and is the same for all: limits, delays, period and the preview.

@@ -1,0 +1,141 @@
+"""The contract of a task: settings that make the scenario of a run from the robot and the cameras.
+
+A task is a frozen dataclass below `Task` with a default for every field. The defaults are those of the UR5's bench;
+`scaled` moves them to the same places in another arm's workspace.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Self, TypeAlias
+
+import numpy as np
+
+from servobench.harness.run.references import FixedPoint, Reference, TaskKind, TaughtView, in_space
+from servobench.plant.cameras.model import EyeModel
+from servobench.plant.contract.checks import FloatArray, as_vector
+from servobench.plant.contract.signals import Channel
+from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.robot import Robot
+from servobench.plant.robot.workspace import Workspace
+
+Vector: TypeAlias = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A task made concrete for one true robot."""
+
+    start: FloatArray | None  # (n,), joint positions at time 0; None for a plant that brings its own [rad]
+    reference: Reference  # the desired feature over time
+    duration: float  # [s]
+    evaluate_from: float  # where the evaluated part begins [s]
+    kind: TaskKind = "curve"  # whether the reference is a fixed target or moves
+    lap_time: float = math.nan  # of a curve that is repeated [s]; NaN of any other
+
+
+@dataclass(frozen=True)
+class TaskSetting:
+    """Where a task is to be done."""
+
+    model: SensedArm | None  # the true robot, or None for a plant that brings its own
+    n: int  # number of joints
+    feature: Channel  # names and unit of the m features
+    seed: int  # for tasks that draw random numbers
+    moved: SensedArm | None = None  # the true robot once its camera was moved; None if it is not
+    robot: Robot | None = None  # by its maker's description; None for a plant that brings its own
+    nominal: SensedArm | None = None  # the same with its cameras as planned
+
+    @property
+    def m(self) -> int:
+        """Size of a place, in which tasks give targets and curves."""
+        return len(self.feature.names) if self.model is None else 3
+
+    def followed(self, curve: Reference) -> Reference:
+        """Return the desired features of a ball on a curve of places."""
+        return in_space(curve, self.model, self.robot)
+
+    def taught(self, joint_position: FloatArray) -> Reference:
+        """Return the target that is taught with the arm at a joint position, (n,) rad.
+
+        Raises:
+            ValueError: the plant brings a robot of its own.
+        """
+        model = self.taught_on()[1]
+        return (
+            TaughtView(model, joint_position)
+            if isinstance(model, EyeModel)
+            else FixedPoint(model.feature(joint_position))
+        )
+
+    def taught_on(self) -> tuple[Robot, SensedArm]:
+        """Return the robot and the true one, for a target that is taught on it.
+
+        Raises:
+            ValueError: the plant brings a robot of its own.
+        """
+        if self.model is None or self.robot is None:
+            raise ValueError("it is taught on a known robot, and this plant brings a robot of its own")
+        return self.robot, self.model
+
+    def start(self, joint_position: Vector | FloatArray) -> FloatArray | None:
+        """Return the start of a run, (n,) rad, or None for a plant that brings its own."""
+        return None if self.model is None else as_vector("start", joint_position, self.n)
+
+    def move(self, start: Vector | FloatArray, target: Reference, duration: float) -> Scenario:
+        """Return a move to a fixed target, of which the last quarter is judged."""
+        return Scenario(self.start(start), target, duration, 0.75 * duration, "point_to_point")
+
+
+class Task(ABC):
+    """The settings of a task, which make the scenario of a run."""
+
+    any_robot: ClassVar[bool] = False
+    """Whether it also runs on a plant with a robot of its own: no target is given as joint positions."""
+
+    @property
+    def taught_at(self) -> Vector | None:
+        """Joint positions [rad] at which the target was taught; None for other targets."""
+        return None
+
+    @abstractmethod
+    def scenario(self, setting: TaskSetting) -> Scenario:
+        """Return start, reference and duration of a run.
+
+        Raises:
+            ValueError: the task cannot be done there; says why.
+        """
+
+    def scaled(self, name: str, work: Workspace) -> Self:
+        """Return the settings for another arm than the UR5's; by default the same.
+
+        Joint positions are those found for the robot, lengths grow with its workspace, times stay.
+
+        Args:
+            name: of the task.
+            work: the workspace of the robot.
+        """
+        del name, work
+        return self
+
+
+@dataclass(frozen=True)
+class TaskEntry:
+    """A task as the command line knows it: a row of a class of tasks."""
+
+    name: str  # the word on the command line
+    summary: str  # one line for `servobench tasks`
+    default: Task  # its settings
+    out_of_reach: bool = False  # its target is out of the arm's reach on purpose
+
+
+def numbers(values: FloatArray) -> Vector:
+    """Return joint positions as a setting."""
+    return tuple(np.asarray(values, dtype=np.float64).tolist())
+
+
+def enlarged(work: Workspace, point: Vector) -> Vector:
+    """Return a point of the camera frame [m] in the workspace of another arm."""
+    return tuple(work.scale * value for value in point)
