@@ -29,8 +29,10 @@ from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.workspace import BALL_RADIUS
 
-HOME, MODEL, ROBOT = np.array(ur5.HOME), ur5.nominal_ur5(), find_robot("ur5")
+ROBOT = find_robot("ur5")
+HOME, MODEL = np.array(ur5.HOME), ROBOT.nominal
 PERIOD = 0.05  # [s]
 STEPS = whole_steps(PERIOD, PHYSICS_STEP)
 Calls = dict[str, Callable[[FloatArray], object]]  # of joint velocities [rad/s], by name; the bare calls first
@@ -102,7 +104,7 @@ def mujoco_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     simulation.start(HOME)
     scene.place(HOME)
     camera, world = config.camera(), plant.world
-    around = window_around(MODEL.to_camera(scene.ball_position()), ur5.BALL_RADIUS, camera)
+    around = window_around(MODEL.to_camera(scene.ball_position()), BALL_RADIUS, camera)
     if around is None:
         raise RuntimeError("the ball is not in the image")
 

@@ -25,7 +25,7 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
-from servobench.plant.robot.hand_eye import SensedArm, hand_eye_spec
+from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
 
 
 @settings
@@ -70,7 +70,7 @@ class KinematicState(NamedTuple):
         v: (..., n), rad/s.
     """
 
-    model: SensedArm
+    model: RobotModel
     q: FloatArray
     v: FloatArray
 
@@ -123,7 +123,7 @@ class KinematicWorld(World):
     def truth(self) -> Truth:
         """Return feature and Jacobian of the true model, computed once a period."""
         if self._truth is None:
-            feature, jacobian, self._seen = self._model.look(self._q)
+            feature, jacobian, self._seen = self._model.observe(self._q)
             self._truth = Truth(feature, jacobian)
         return self._truth
 

@@ -1,10 +1,10 @@
-"""The bench around a robot: clipped and delayed commands, noisy, late and lost features, for every world alike.
+"""The bench around a robot: clipped and delayed commands, noisy, late and lost features, the same for every world.
 
     u(k) = clip(command(k), limits),        the world advances under u(k − d)
     frame(k) = see(k) + σ N(0, 1),          the observation at k holds frame(k − l), or the last valid one if it is lost
 
 with the command delay d and the latency l; where they are no multiples of the control period, the world advances in
-sub-steps (`plant.contract.timing`). What else may happen to a frame is in `plant.bench.sensor`. Many runs side
+sub-steps (`plant.contract.timing`). Other disturbances of a frame are in `plant.bench.sensor`. Many runs side
 by side share one bench: their arrays have a leading axis, and each run has random streams of its own.
 """
 
@@ -54,7 +54,7 @@ class BenchState:
         frames: frames under way, oldest first.
         held: (..., m), the last valid feature.
         sensor: its random streams, and the outliers and occlusions that last.
-        world: what the world saved.
+        world: the saved state of the world.
     """
 
     period: int
@@ -67,7 +67,7 @@ class BenchState:
 
 @final
 class Bench(Plant):
-    """A plant: a world under clipped and delayed commands, seen through noise, latency and lost frames."""
+    """A plant: a world under clipped and delayed commands, measured with noise, latency and lost frames."""
 
     def __init__(self, world: World, command_delay: float, sensing: SensingConfig, period: float | None = None) -> None:
         """Put a world on the bench, which closes it; `reset` begins a run. `build_bench` also builds the world.
@@ -173,7 +173,7 @@ class Bench(Plant):
         return feature, valid
 
     def _observation(self, joints: FloatArray, feature: FloatArray, valid: BoolArray) -> Observation:
-        """Return what is seen at the present period, of features that are held where they do not arrive."""
+        """Return the observation of the present period; features that do not arrive are held."""
         time, whole = self._k * self._period, self._whole
         if valid is not self._all_valid:
             whole = np.logical_and.reduce(valid, axis=-1)
@@ -184,7 +184,7 @@ class Bench(Plant):
         return trusted_observation(time, joints, feature, whole, valid)
 
     def _expose(self) -> FloatArray | None:
-        """Return the feature as seen now, (..., m), with what the sensor adds; None if it is not found."""
+        """Return the feature as measured now, (..., m), with the sensor's disturbances; None if it is not found."""
         feature, unit = self.world.see(), self.world.noise_unit
         if feature is None or unit == 1.0:
             return None if feature is None else self._sensor.measured(feature)
@@ -286,7 +286,7 @@ def build_bench(
         sensing: noise, latency, frame period and lost frames.
 
     Raises:
-        ValueError: times without a common sub-step, or whatever `make` refuses.
+        ValueError: times without a common sub-step, or arguments that `make` refuses.
     """
     step = common_step(setup.period, command_delay, sensing)
     try:

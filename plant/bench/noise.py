@@ -28,7 +28,9 @@ from servobench.plant.contract.sensing import Family
 Shape: TypeAlias = tuple[int, ...]
 Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 
-TINY: Final = 2.0**-54  # floor of what rounding could make 0 or negative: half the grid of the generator's numbers
+TINY: Final = (
+    2.0**-54
+)  # floor of differences that rounding could make 0 or negative: half the grid of the generator's numbers
 
 
 def white(generator: np.random.Generator, shape: Shape) -> FloatArray:

@@ -1,7 +1,7 @@
 """The contract of a plant: a spec, reset, step, save and restore, close, and the truth for the log.
 
 A plant never sees a target. A plant that is added is a `World` on the `Bench` of `plant.bench.bench`, or a class
-of its own below `Plant`; a settings class beside it; and a `PlantEntry` that is named in `harness.config.registry` or
+of its own below `Plant`; a settings class; and a `PlantEntry` that is named in `harness.config.registry` or
 published under the entry-point group `servobench.plants`.
 """
 
@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.robot import Robot
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -70,7 +70,7 @@ class Abilities(ABC):
         """
         return copy.deepcopy(vars(self))
 
-    def restore(self, state: Any) -> None:  # noqa: ANN401 - what `save` returned
+    def restore(self, state: Any) -> None:  # noqa: ANN401 - as returned by `save`
         """Return to a state that `save` of a plant with the same robot and settings returned, as often as wanted."""
         vars(self).update(copy.deepcopy(state))
 
@@ -82,7 +82,7 @@ class Abilities(ABC):
         Raises:
             ValueError: the plant does not know them; says why.
         """
-        raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
+        raise ValueError("this plant does not know the kinematics of its robot, which an upper bound needs")
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """Return the kinematics of the plant's robot with the plant's own delays, as far as it knows them."""
@@ -127,7 +127,7 @@ class Abilities(ABC):
 
 
 class Plant(Abilities):
-    """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
+    """A discrete-time plant: `step` holds the command for one period and returns the observation after it."""
 
     @abstractmethod
     def reset(self, seed: int) -> Observation:
@@ -172,7 +172,7 @@ class PlantSetup:
             or where only the model is known.
     """
 
-    model: SensedArm | None
+    model: RobotModel | None
     start: FloatArray | None
     period: float
     nominal: Robot | None = None
@@ -182,7 +182,7 @@ class PlantSetup:
         """The maker's joint limits, where they are known."""
         return None if self.nominal is None else self.nominal.limits
 
-    def robot(self) -> tuple[SensedArm, FloatArray]:
+    def robot(self) -> tuple[RobotModel, FloatArray]:
         """Return model and start, (..., n), for a plant that needs them.
 
         Raises:
@@ -215,8 +215,8 @@ class PlantEntry:
         config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
-        lacking: returns one line about what this machine lacks beside packages; empty if nothing.
-        engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
+        lacking: returns one line about missing parts of this machine other than packages; empty if nothing is missing.
+        engine: returns one line about the software that computes or renders it, for the terminal and the manifest.
         any_sensing: it takes every sensing set-up; else only the ball that a fixed camera sees in 3-D.
     """
 
@@ -253,7 +253,7 @@ class World(Abilities):
         self.faults = {lane: fault, **self.faults}
 
     noise_unit: float = 1.0
-    """What a metre of noise is in the unit of the features."""
+    """A metre of noise in the unit of the features."""
 
     @abstractmethod
     def reset(self, seed: Any) -> FloatArray:  # noqa: ANN401 - narrowed by worlds that carry out one run only
@@ -285,7 +285,7 @@ class World(Abilities):
         """Return the feature as the sensor sees it now, (..., m); None if a single run's is not found."""
 
     def visible(self) -> BoolArray | None:
-        """Return which features of what was seen last are measured, (..., m); None for all of them."""
+        """Return which features of the last measurement are valid, (..., m); None for all of them."""
         return None
 
     def why_unseen(self) -> str:

@@ -72,7 +72,7 @@ class Sensor:
         self._due: FloatArray = np.zeros(lead)[()]
 
     def measured(self, feature: FloatArray) -> FloatArray:
-        """Return what the next frame shows of a true feature, (..., m)."""
+        """Return a true feature, (..., m), as the next frame shows it."""
         config = self._config
         if self._scale > 0.0:
             feature = feature + self._noise.next()
@@ -134,7 +134,7 @@ class Spell(NamedTuple):
     Attributes:
         left: (...), frames of the present spell that are left after this one.
         inside: (...), whether the present frame is in a spell.
-        value: (..., *), what the present spell drew, or the last one.
+        value: (..., *), drawn for the present spell, or for the last one.
     """
 
     left: npt.NDArray[np.int_]

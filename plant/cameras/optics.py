@@ -1,4 +1,4 @@
-"""Cameras as optics: a pinhole with radial distortion, its derivative, and what is in the image.
+"""Cameras as optics: a pinhole with radial distortion, its derivative, and the limits of the image.
 
 With p = (x, y, z) in the camera frame, z along the optical axis, x right and y down in the image,
 
@@ -21,7 +21,7 @@ from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
 CAMERA: Final = PinholeCamera()  # as planned, of every set-up in pixels
-NEAR: Final = 0.02  # [m] least depth: a point behind it is not seen, and its features are those of this depth
+NEAR: Final = 0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 
 
@@ -83,7 +83,7 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
 def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
     """Return the points that appear at given pixels, (..., c, p, 3) m: the inverse of `project` for known depths.
 
-    Where the distortion shows no point at all, it is one at the edge of what it shows.
+    A pixel at which the distortion shows no point gets a point at the edge of the visible ones.
 
     Args:
         pixels: (..., c, p, 2) [px].

@@ -61,7 +61,7 @@ def check_number(
         below: it must be less than this.
 
     Raises:
-        ValueError: not finite, or out of bounds; names the argument, what was wanted and what came.
+        ValueError: not finite, or out of bounds; names the argument, the wanted and the given value.
     """
     if not (math.isfinite(value) and above < value < below and at_least <= value <= at_most):
         bounds = {"above": above, "at least": at_least, "at most": at_most, "below": below}

@@ -1,4 +1,4 @@
-"""Every named reason why a run ends before its last period; `status` is what the table of runs shows.
+"""Every named reason why a run ends before its last period; `status` is its word in the table of runs.
 
     RunFault                    fault
     ├── PlantDiverged           plant_diverged

@@ -1,11 +1,11 @@
 """Many runs side by side: arrays with leading axes, a lane a run; a single run has no leading axis.
 
-Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. What is to happen in some lanes
+Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. An action in some lanes
 only goes through `branch`, so that no part writes a mask. A state is a tree of arrays: named tuples, tuples and
-dataclasses, of which every array has the leading axes; whatever else is in them is shared by all lanes. A number of a
+dataclasses, of which every array has the leading axes; all other values in them are shared by all lanes. A number of a
 single run is a scalar of numpy, which costs a tenth of an array without axes: `array[()]` makes the one of the other.
 
-A lane has the same bits whatever its neighbours are, as long as no leading axis becomes an axis of a matrix: products
+A lane has the same bits beside any neighbours, as long as no leading axis becomes an axis of a matrix: products
 are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over the last, contiguous axes.
 """
 
@@ -62,7 +62,7 @@ def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
 
 
 def stack(trees: Sequence[Tree]) -> Tree:
-    """Return the trees of single runs as one tree with a leading axis; what is no array is that of the first one."""
+    """Return the trees of single runs as one with a leading axis; values other than arrays are those of the first."""
     stacked: Tree = map_arrays(lambda *arrays: np.stack(arrays), *trees)
     return stacked
 
@@ -72,8 +72,8 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
 
     Args:
         chosen: (...), bool.
-        function: returns a tree like its first argument; it sees only lanes that are chosen, along one axis.
-        tree: what may change.
+        function: returns a tree like its first argument; it gets only the chosen lanes, along one axis.
+        tree: the values that may change.
         arguments: further trees that the function needs.
     """
     mask = np.asarray(chosen)

@@ -153,7 +153,7 @@ class PlantSpec:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What a controller sees at an instant.
+    """The measurements that a controller gets at an instant.
 
     Many runs side by side share one observation, whose arrays have a leading axis; the bench makes it.
 

@@ -112,7 +112,7 @@ class FmuDescription:
 
         Args:
             name: of a scalar, of an array, or of a family of scalars.
-            role: what the mapping uses it for, for the message.
+            role: its use in the mapping, for the message.
             types: that may be used there; None for all.
 
         Raises:
@@ -206,7 +206,7 @@ def read_exchange(path: Path, root: Path) -> None:
         raise ValueError(f"fmu file {path} has no directional derivatives, so its Jacobian cannot be read; {wanted}")
     if exchange.canBeInstantiatedOnlyOncePerProcess:
         raise ValueError(
-            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read beside a run"
+            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read during a run"
         )
 
 

@@ -24,9 +24,9 @@ class Exchanging(Protocol):
     """The part of an instance of model exchange that is used here."""
 
     description: FmuDescription
-    asked: InstanceOptions
+    options: InstanceOptions
 
-    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
+    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - types of C
         """Call a function of the library and check its status; raises FmuError."""
 
     def update_discrete_states(self) -> tuple[bool, bool, float]:
@@ -131,7 +131,7 @@ class Integrator:
             set_time=self._guarded(lambda now: self._instance.call("SetTime", ctypes.c_double(now))),
             input=_Held(),
             startTime=time,
-            relativeTolerance=self._instance.asked.tolerance or RELATIVE_TOLERANCE,
+            relativeTolerance=self._instance.options.tolerance or RELATIVE_TOLERANCE,
             maxNumSteps=MAX_SOLVER_STEPS,
         )
 

@@ -1,8 +1,8 @@
 """PyBullet: a scene for the cameras, rendered by TinyRenderer, and the moving arm as rigid bodies.
 
 The world frame W is the arm's base frame B. The drives of `servobench.plant.rendered.drives` integrate the motion;
-PyBullet gives inertia, gravity torques and contact, in a physics world without looks: the arm with its true load, the
-arm as the drives believe it, and the table, the floor and the boxes around it.
+PyBullet gives inertia, gravity torques and contact, in a physics world without visual shapes: the arm with its true
+load, the arm as the drives assume it, and the table, the floor and the boxes around it.
 
 PyBullet's C library prints a banner, past `sys.stderr`, so the file descriptor is redirected during the import. All
 other output that is written to it in the meantime is passed on afterwards.
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from servobench.plant.robot.arm import SerialArm
     from servobench.plant.robot.robot import Robot
 
-BANNER = b"pybullet build time:"  # what the line begins with
+BANNER = b"pybullet build time:"  # the beginning of the line
 STANDARD_ERROR = 2  # file descriptor
 CONTACT_DISTANCE = 8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
 
@@ -213,7 +213,7 @@ class BulletSimulation(Simulation):
 
 
 class Mechanics:
-    """An arm in a PyBullet world without looks; joint angles here are the true ones, θ."""
+    """An arm in a PyBullet world without visual shapes; joint angles here are the true ones, θ."""
 
     def __init__(
         self,
@@ -231,7 +231,7 @@ class Mechanics:
             payload: kg, point load at the ball.
             assumed_payload: kg, that of the drives' model.
             robot: by its maker's description, for masses and shapes.
-            boxes: obstacles beside table and floor.
+            boxes: obstacles other than table and floor.
 
         Raises:
             ConnectionError: PyBullet opens no world, as too many are open.

@@ -60,7 +60,7 @@ class DriveConfig:
     friction_compensation: Share = 0.8
     """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
     payload: NonNegative = 2.5
-    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and what it holds."""
+    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and its load."""
     assumed_payload: NonNegative = 0.9
     """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
 
@@ -115,7 +115,7 @@ class DriveState(NamedTuple):
 
 
 class RigidBody(NamedTuple):
-    """What the links and the load ask of the drives in one state.
+    """Inertia and torques of the links and the load in one state, as the drives have to overcome them.
 
     Attributes:
         inertia: M, (n, n) [kg m²].
@@ -152,8 +152,8 @@ class Drives:
     """The cascade of one arm, tuned to its inertia at the start of a run.
 
     The equations are one function of CasADi, which works in arrays: a step of all loops takes a few microseconds, where
-    numpy takes twenty, most of them for calls. Attributes are those arrays, (n,): whoever steps the loops writes the
-    first four and reads the others.
+    numpy takes twenty, most of them for calls. Attributes are those arrays, (n,): the caller of `step` writes the first
+    four and reads the others.
 
     Attributes:
         command: [rad/s], commanded speed of the true angles.
@@ -204,7 +204,7 @@ class Drives:
         self._step = InPlace(self._law(n), arguments, (self._next.ravel(), self.torque, self.drag))
 
     def start(self, angle: FloatArray, body: RigidBody) -> DriveState:
-        """Return joints at rest at `angle` (n,) [rad] whose integrals carry what gravity compensation lacks."""
+        """Return joints at rest at `angle` (n,) [rad] whose integrals carry the rest of the gravity."""
         rest = np.zeros(len(angle))
         return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity)
 
@@ -232,7 +232,7 @@ class Drives:
         """Advance joints and loops by a physics step under the loops' torques.
 
         Args:
-            body: what the links and the load ask in the present state.
+            body: inertia and torques of links and load in the present state.
         """
         self.assumed_gravity[:] = body.assumed_gravity
         self.step()
@@ -268,7 +268,7 @@ class Drives:
     def _followed(self, blend: SX, u: SX, r: SX, c: SX) -> tuple[SX, SX]:
         """Return the reference r and its speed c one physics step further; it stops at the stops.
 
-        `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would cancel what then cancels.
+        `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would then simplify the sum.
         """
         c = c + blend * (u - c)
         wanted = r + PHYSICS_STEP * c

@@ -1,4 +1,4 @@
-"""The contract of a physics engine under a rendered plant: it shows an arm, and it moves one.
+"""The contract of a physics engine under a rendered plant: it renders an arm, and it moves one.
 
 Joint angles here are the true ones, θ; the world frame W is the arm's base frame B.
 """
@@ -25,7 +25,7 @@ MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
 
 class Scene(ABC):
-    """An arm with a ball on its flange that is only looked at."""
+    """An arm with a ball on its flange, for rendering only."""
 
     @abstractmethod
     def place(self, theta: FloatArray) -> None:
@@ -39,7 +39,7 @@ class Scene(ABC):
     def render(
         self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
     ) -> tuple[ByteArray, FloatArray]:
-        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
+        """Return the image of a camera at X_BC (4, 4): colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
 
         With a window only this part of the image, the same pixels as in all of it.
         """
@@ -56,7 +56,7 @@ class OpenScene(Protocol):
         """Open a world and load the room.
 
         Args:
-            room: what there is to see.
+            room: the bodies.
             window: whether to open the engine's window.
 
         Raises:
@@ -66,12 +66,12 @@ class OpenScene(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """What a simulation is built from.
+    """The parts that a simulation is built from.
 
     Attributes:
         arm: the true kinematics.
         robot: by its maker's description, for masses and shapes.
-        boxes: obstacles beside table and floor.
+        boxes: obstacles other than table and floor.
         drives: loops, torque limits, friction and load of the joints.
         lag: [s] by which the drives smooth commanded velocities, 0 for none.
         start: (n,) [rad], joint angles at which the loops are tuned.
@@ -88,7 +88,7 @@ class Machine:
 
 
 class Joints(Protocol):
-    """The state of a simulation: an immutable value with whatever the engine needs to go on."""
+    """The state of a simulation: an immutable value from which the engine can continue."""
 
     @property
     def angle(self) -> FloatArray:

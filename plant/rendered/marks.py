@@ -1,7 +1,7 @@
-"""Coloured marks, the ball or discs, in an image: which one is where, by nothing but its pixels.
+"""Coloured marks, the ball or discs, found in an image by nothing but its pixels.
 
-Colour tells marks apart, so none is taken for another. A mark is seen if its pixels fill an ellipse. With their mean μ
-and covariance Σ, the pixels x of a whole ellipse are those with
+Each mark has a colour of its own, so none is taken for another. A mark is found if its pixels fill an ellipse. With
+their mean μ and covariance Σ, the pixels x of a whole ellipse are those with
 
     (x − μ)ᵀ Σ⁻¹ (x − μ) ≤ 4
 
@@ -69,7 +69,7 @@ class Mark(NamedTuple):
 
 
 def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | None]:
-    """Return the mark of each colour, or None where it is not wholly seen.
+    """Return the mark of each colour, or None where it is not wholly visible.
 
     Args:
         rgb: (h, w, 3 or 4).

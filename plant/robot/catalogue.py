@@ -93,7 +93,7 @@ MAX_DRAWS: Final = 200
 
 
 def random_robot(number: int) -> Robot:
-    """Return the arm of a number, the same for ever.
+    """Return the random arm with a number; a number always gives the same arm.
 
     Raises:
         ValueError: a number out of its bounds.

@@ -23,7 +23,7 @@ from servobench.plant.contract.files import user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_calibration, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
-from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
+from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, length_scale, with_ball
 
 Triple = tuple[float, float, float]
 NO_BALL: Final = (0.0, 0.0, 0.0)
@@ -123,7 +123,7 @@ def _ur5() -> Robot:
     )  # fmt: skip
     workspace = Workspace(
         scale=1.0,
-        centre=np.array(ur5.WORKSPACE_CENTRE),
+        centre=np.array(CENTRE),
         shoulder=np.array(ur5.SHOULDER),
         home=np.array(ur5.HOME),
         lower=np.array(ur5.TRAINING_LOWER),
@@ -239,7 +239,7 @@ def deviation_from(arm: SerialArm, title: str) -> float:
     """Return by how much the lengths of a calibrated arm differ from a data sheet at most [m].
 
     The parallel axes of shoulder lift, elbow and wrist 1 leave the split of d2, d3 and d4 open, so that calibrations
-    differ in it by metres and mean the same arm; the ball's place in a few postures tells arms apart.
+    differ in it by metres and mean the same arm, so arms are compared by the position of the flange in a few postures.
     """
     nominal = UNIVERSAL_ROBOTS[title].arm()
     postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, nominal.n))

@@ -49,8 +49,8 @@ class Workspace:
         upper: (n,) [rad].
         moves: start and target of the moves by name.
         stretched: (n,) [rad], a start at which the Jacobian is nearly singular.
-        clear: tells for joint positions (..., n) whether the arm is free of contact and the ball in view; None where
-            all of the box is.
+        clear: returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None
+            where all of the box is.
     """
 
     scale: float
@@ -65,12 +65,12 @@ class Workspace:
 
     @property
     def camera_distance(self) -> float:
-        """From the camera to the centre [m]."""
+        """Distance of the camera from the centre [m]."""
         return CAMERA_DISTANCE * self.scale
 
     @property
     def ball_radius(self) -> float:
-        """Of the ball, which looks as large in every image [m]."""
+        """Radius of the ball, which has the same size in the image of every arm [m]."""
         return BALL_RADIUS * self.scale
 
     @property
@@ -93,7 +93,7 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
 
 BoolArray = npt.NDArray[np.bool_]
 
-HEIGHT: Final = 0.03  # [m] of a link above the table, beside its radius; of a UR5
+HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius; of a UR5
 BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
 OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
 BUILT_IN: Final = 0.4  # share of random postures from which on two tubes are built into each other
@@ -140,7 +140,7 @@ def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """The judge of postures; `scale` is that of the workspace.
+    """Decides whether postures are fit to work in; `scale` is that of the workspace.
 
     Attributes:
         arm: the nominal arm.
@@ -188,18 +188,18 @@ class Clearance:
         return np.asarray(segment_distance(first, second) - self.tubes.radius[pairs].sum(axis=-1))
 
     def _above_table(self, placed: FloatArray) -> BoolArray:
-        """The first two links stand on the table."""
+        """Return whether all links but the first two, which stand on the table, are above it."""
         chosen = self.tubes.link >= 1
         low = placed[..., 2][..., chosen, :].min(axis=-1) - self.tubes.radius[chosen]
         return np.asarray((low >= HEIGHT * self.scale).all(axis=-1))
 
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
-        seen = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
+        p_C = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
         half = IMAGE_SHARE * np.array([CAMERA.width, CAMERA.height]) / (2.0 * CAMERA.focal)
-        inside = (np.abs(seen[..., :2]) <= half * seen[..., 2:]).all(axis=-1) & (seen[..., 2] > 0.0)
-        sight = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
-        free = segment_distance(placed, sight[..., None, :, :]) - self.tubes.radius
+        inside = (np.abs(p_C[..., :2]) <= half * p_C[..., 2:]).all(axis=-1) & (p_C[..., 2] > 0.0)
+        line = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
+        free = segment_distance(placed, line[..., None, :, :]) - self.tubes.radius
         return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
 
     def _apart(self, placed: FloatArray) -> BoolArray:
@@ -247,7 +247,7 @@ MOVES: Final = {
 }
 
 STARTS: Final = 512  # of the search for a home
-CANDIDATES: Final = 12  # homes whose surroundings are looked at
+CANDIDATES: Final = 12  # homes whose surroundings are sampled
 WINDING: Final = 0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
 NEIGHBOURS: Final = 192  # postures that say how fit a box is
 NEAR_STARTS: Final = 96  # of the search for a posture near the home
