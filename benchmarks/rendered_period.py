@@ -42,12 +42,13 @@ def bullet_calls(config: RenderedConfig, opened: ExitStack) -> Calls:
     """Return the calls of PyBullet, of the plant and of a loop in the manner of Gymnasium."""
     import pybullet
 
-    from servobench.plant.rendered.bullet import BulletScene, Mechanics
+    from servobench.plant.rendered.bullet import BulletScene, BulletSimulation
 
     plant = opened.enter_context(closing(build_bullet(config, PlantSetup(MODEL, HOME, PERIOD))))
     scenes = [opened.enter_context(closing(BulletScene(Room(MODEL.arm, config.scenery, ROBOT)))) for _ in range(2)]
-    loads = {"payload": config.drives.payload, "assumed_payload": config.drives.assumed_payload}
-    mechanics = opened.enter_context(closing(Mechanics(MODEL.arm, robot=ROBOT, **loads)))
+    stops = np.full(6, np.pi)
+    machine = Machine(MODEL.arm, ROBOT, (), config.drives, config.lag, HOME, (-stops, stops))
+    mechanics = opened.enter_context(closing(BulletSimulation(machine)))
     camera = config.camera()
     plant.reset(0)
     for scene in scenes:

@@ -72,7 +72,7 @@ def planned(count: int) -> CameraDraws:
 
 
 def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
-    """Draw how `count` cameras differ from those that are planned; `seed` is that of the robot's mismatch."""
+    """Draw the deviations of `count` cameras from the planned ones; `seed` is that of the robot's mismatch."""
     size = mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
@@ -91,7 +91,7 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
 
 
 def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
-    """Return the rotation vector, (3,) rad, of a further camera, drawn as that of the first one is."""
+    """Return the rotation vector, (3,) rad, of a further camera, drawn as for the first one."""
     angle = mismatch.size("camera_rotation")
     axis = draw_camera_axis(angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}"))
     share = 1.0 if mismatch.camera_exact else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)

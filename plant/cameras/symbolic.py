@@ -202,12 +202,12 @@ def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
     return casadi.vertcat(*made[0].tolist())
 
 
-def seen_features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
-    """Return which features are seen of points (1, c, p, 3), (m, 1) of ones and zeros; see `SetupModel.in_view`."""
+def valid_features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
+    """Return which features of points (1, c, p, 3) are valid, (m, 1) of ones and zeros; see `SetupModel.valid_at`."""
     pixels, half = project(points, optics)[0], 0.5 * np.array(optics.size)
     seen = []
     for points_of_camera, pixels_of_camera in zip(points[0], pixels, strict=True):
-        front = _facing(points_of_camera)
+        front = _shows_front(points_of_camera)
         for point, pixel in zip(points_of_camera, pixels_of_camera, strict=True):
             inside = [casadi.fabs(pixel[axis] - half[axis]) <= half[axis] for axis in (0, 1)]
             seen.append(casadi.logic_and(casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)))
@@ -219,7 +219,7 @@ def seen_features(points: Expressions, optics: Optics, setup: SensingSetup) -> S
     return casadi.vertcat(*[whole] * setup.m)
 
 
-def _facing(points: Expressions) -> SX:
+def _shows_front(points: Expressions) -> SX:
     """Return whether points (p, 3) show their front; see `MIN_INCIDENCE`."""
     if len(points) < 3:
         return casadi.SX(1.0)

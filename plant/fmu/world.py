@@ -1,6 +1,6 @@
 """Any FMI 2 or FMI 3 FMU as a plant; delay, noise, latency and lost frames are those of the bench.
 
-An `FmuMapping` says which variables are commands, joints and features; names are looked up once, at construction. The
+An `FmuMapping` says which variables are commands, joints and features; names are resolved once, at construction. The
 FMU is stepped with its own period, which divides that of the world; commands are held meanwhile. Parameters of any type
 are set before every run.
 """
@@ -73,7 +73,7 @@ class FmuWorld(World):
         lag: float | None = None,
         model: RobotModel | None = None,
     ) -> None:
-        """Extract and load the FMU and look all names up.
+        """Extract and load the FMU and resolve all names.
 
         Args:
             mapping: the roles of its variables; values of parameters may have leading axes.
