@@ -41,12 +41,12 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
         ("controllers/estimators/*.py",),
         ("controllers/test_estimators.py", "controllers/test_arm_estimator.py", "controllers/test_rbf.py",
          "controllers/test_rbf_lyapunov.py", "controllers/test_estimator_lanes.py",
-         "controllers/test_correntropy.py", "controllers/test_robust.py"),
+         "controllers/test_correntropy.py", "controllers/test_robust_filter.py"),
     ),
     "laws": (
         ("controllers/laws/*.py", "controllers/laws/mpc/*.py"),
         ("controllers/test_pid.py", "controllers/test_mfac.py", "controllers/test_laws.py",
-         "controllers/test_preview.py", "controllers/test_rbfnn.py", "controllers/test_mpc.py",
+         "controllers/test_periods.py", "controllers/test_rbfnn.py", "controllers/test_mpc.py",
          "controllers/test_mpc_closed_form.py", "controllers/test_mpc_optimality.py"),
     ),
     "metrics": (("harness/run/metrics.py",), ("harness/test_metrics.py", "harness/test_metrics_oracle.py")),
@@ -56,7 +56,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # name -> module
         ("harness/test_results.py", "harness/test_result.py", "harness/test_integrity.py"),
     ),
     "folders": (
-        ("harness/batch/tables.py", "harness/batch/checksums.py", "harness/batch/integrity.py",
+        ("harness/batch/tables.py", "plant/contract/checksums.py", "harness/batch/integrity.py",
          "harness/batch/results.py"),
         ("harness/test_checksums.py", "harness/test_results.py", "harness/test_integrity.py"),
     ),

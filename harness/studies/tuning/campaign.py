@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from servobench.harness.batch.lock import LOCK
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.defaults import default_config, file_stem
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.studies.tuning.objective import TuningSet, score
@@ -125,7 +125,7 @@ class Method:
 
     @property
     def done(self) -> int:
-        """Number of points asked for, as if every finished study had used its whole budget."""
+        """Number of requested points, as if every finished study had used its whole budget."""
         whole = self._plan.trials + self._plan.search
         return sum(each.asked if each.outcome is None else whole for each in self.studies)
 

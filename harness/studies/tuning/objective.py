@@ -31,7 +31,7 @@ import numpy as np
 
 from servobench.harness.batch.blocks import Job, carry_out_blocks, cut, even_size
 from servobench.harness.batch.plan import TUNING, Cell, tuning_seeds
-from servobench.harness.batch.workers import Workers
+from servobench.harness.batch.sandbox import Workers
 from servobench.harness.config.registry import find_plant
 from servobench.harness.config.settings import Settings
 from servobench.harness.run.lanes import side_by_side_key
@@ -114,7 +114,7 @@ class TuningSet:
                 raise ValueError(f"plant {name} cannot be tuned on: it needs a UR5 and a camera's latency")
 
     def second(self) -> TuningSet:
-        """Return the second, larger set: other robots of the tuning range, which no trial sees."""
+        """Return the second, larger set: other robots of the tuning range, which no trial uses."""
         return TuningSet(self.plants, SECOND_FACTOR * self.robots, (self.offset + SECOND_OFFSET) % len(TUNING))
 
     def runs(self) -> list[TuningRun]:
