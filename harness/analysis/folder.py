@@ -1,4 +1,4 @@
-"""Describes a results folder in words, and reads its tables beside the runs and steps."""
+"""Describes a results folder in words, and reads its further tables."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pyarrow import ArrowException
 
 from servobench.harness.batch import results
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run.request import SECTIONS
 from servobench.harness.run.result import COMPLETED
 
 DESCRIBED: Final = {
@@ -22,7 +23,7 @@ DESCRIBED: Final = {
     "noise_factor": "noise factor",
     "latency_s": "latency [s]",
     "period_s": "period [s]",
-}  # column -> heading
+}  # column -> heading; settings that are varied, too, have their key
 MAX_LISTED: Final = 15  # values of a column
 
 
@@ -35,7 +36,8 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
     manifest = results.read_manifest(folder)
     completed = int((runs["status"] == COMPLETED).sum())
     facts = {"runs": f"{len(runs)}, of which {completed} reached the last period"}
-    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in DESCRIBED.items() if name in runs}
+    described = DESCRIBED | {name: name for name in runs.columns if name.startswith(SECTIONS)}
+    facts |= {head: _listed(runs[name].unique().tolist()) for name, head in described.items() if name in runs}
     packages = manifest.get("packages") or {}
     made = f"{manifest.get('created', 'at an unknown time')} by servobench {packages.get('servobench') or 'unknown'}"
     commit = manifest.get("git_commit")
@@ -46,7 +48,7 @@ def describe_folder(folder: Path, runs: pd.DataFrame) -> dict[str, str]:
 
 
 def describe_settings(folder: Path) -> dict[str, str]:
-    """Return every setting of the runs by section and name; empty where the folder does not tell them.
+    """Return every setting of the runs by section and name; empty where the folder has none.
 
     Raises:
         ConfigurationError: not a results folder.
@@ -63,7 +65,7 @@ def describe_settings(folder: Path) -> dict[str, str]:
 
 
 def other_tables(folder: Path) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield name and content of each table beside the runs and steps of a folder, such as answered claims.
+    """Yield name and content of each further table of a folder, without runs and steps, such as answered claims.
 
     Raises:
         ConfigurationError: one of them cannot be read.

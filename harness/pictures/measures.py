@@ -14,6 +14,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from pandas.api.types import is_numeric_dtype
 
 from servobench.harness.analysis.comparison import settled_share, settling_times, shown_unit
 from servobench.harness.analysis.statistics import NO_ESTIMATE, Estimate
@@ -30,6 +31,7 @@ from servobench.harness.pictures.style import (
 )
 from servobench.harness.pictures.tracks import Ensembles
 from servobench.harness.run.metrics import METRICS
+from servobench.harness.run.request import varied_columns
 from servobench.harness.run.result import COMPLETED
 from servobench.plant.contract.checks import FloatArray
 
@@ -39,16 +41,15 @@ PERCENTILES = (1.0, 25.0, 50.0, 75.0, 99.0)
 LINE: Final = 0.165  # [in] a controller
 WIDE_RANGE: Final = 30.0  # largest over smallest value from which on an axis is logarithmic
 MAX_RANGE: Final = 1e6  # largest over smallest value that an axis shows
-NAME_LETTERS: Final = 20  # of a controller's name in a line beside an axis, for each column of a layout
+NAME_LETTERS: Final = 20  # of a controller's name at an axis, for each column of a layout
 LETTERS: Final = 16.0  # of a label in an inch
-NUMBERS: Final = 0.25  # [in] beside the names
+NUMBERS: Final = 0.25  # [in] next to the names
 LEAST_ROWS: Final = 4  # controllers for which a panel has room
 SPREAD = 0.5  # share of the distance between two places over which the marks of the methods are spread
 UPPER: Final = 0.97  # of a panel's height, where the mark of an infinite value stands
 LINE_LETTERS: Final = 30  # of a line of text within a panel
 Curves = Mapping[str, Sequence[Estimate]]  # method -> an estimate a place
 SIZED_AXIS = re.compile(r"^(?P<axis>[a-z_ ]+)=(?P<magnitude>[0-9.eE+-]+)(?P<unit>[a-zA-Z%°]*)$")
-SWEPT = {"noise_factor": ("noise factor", 1.0), "latency_s": ("latency [ms]", 1e3), "period_s": ("period [ms]", 1e3)}
 
 
 class _Dots(NamedTuple):
@@ -62,7 +63,7 @@ class _Dots(NamedTuple):
 def draw_measures(runs: pd.DataFrame, kind: str, styles: Styles, layout: Layout = WIDE) -> Figure | None:
     """Draw metrics of every run, a column a task, a row a metric, a line a controller; None without values.
 
-    The metrics of a single task are beside each other, on a narrow sheet below each other.
+    The metrics of a single task stand in one row, on a narrow sheet in one column.
 
     A bar is the median over runs. Runs that never settled stand at the right edge and are counted there.
 
@@ -108,23 +109,18 @@ def _draw_each_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles) -
 
 
 def _draw_one_task(runs: pd.DataFrame, rows: Sequence[_Dots], styles: Styles, layout: Layout) -> Figure:
-    """Draw measures of one task beside each other, as many as the layout has columns."""
+    """Draw metrics of one task in rows of as many panels as the layout has columns."""
     names = runs["controller"].unique().tolist()
     rows = [row for row in rows if _applies(runs, row)] or list(rows)[:1]
-    columns = min(layout.columns, len(rows))
-    lines = -(-len(rows) // columns)
     beside = LETTER * max(len(_short_name(name, layout)) for name in names) + NUMBERS
-    letters = round((layout.width - beside) / columns / LETTER)
+    letters = round((layout.width - beside) / min(layout.columns, len(rows)) / LETTER)
     words = [textwrap.fill(row.label, letters) for row in rows]
     height = 0.4 + LINE * (max(text.count("\n") + 1 for text in words) + max(LEAST_ROWS, len(names)))
-    figure = Figure(figsize=(layout.width, 0.35 + lines * height), layout="constrained")
-    panels = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
-    for axes, row, label in zip(panels, rows, words, strict=False):
+    figure, panels = panel_grid(len(rows), height, layout, head=0.35)
+    for axes, row, label in zip(panels, rows, words, strict=True):
         _draw_dots(axes, runs, names, styles, row)
         _name_rows(axes, names, layout)
         axes.set_xlabel(label)
-    for axes in panels[len(rows) :]:
-        axes.set_visible(False)
     return figure
 
 
@@ -274,7 +270,7 @@ def draw_places(
     values: Mapping[str, Sequence[Estimate]],
     styles: Mapping[str, MethodStyle],
 ) -> None:
-    """Draw an estimate with its interval for each method at each place; the methods stand beside each other.
+    """Draw an estimate with its interval for each method at each place; the marks of the methods are shifted sideways.
 
     Args:
         axes: where.
@@ -385,8 +381,8 @@ def _sweeps(runs: pd.DataFrame) -> dict[str, pd.DataFrame]:
     places = [runs] if "axis" not in runs else [own for _, own in runs.groupby(["axis", "magnitude"], dropna=False)]
     sweeps = {
         label: runs.assign(size=factor * runs[name].astype(float))
-        for name, (label, factor) in SWEPT.items()
-        if name in runs and any(own[name].nunique() > 1 for own in places)
+        for name, (label, factor) in varied_columns(runs.columns).items()
+        if is_numeric_dtype(runs[name]) and any(own[name].nunique() > 1 for own in places)
     }
     if "axis" not in runs or (runs["axis"].fillna("") == "").all():
         none = runs[runs["mismatch"] == "none"].assign(size=0.0)
