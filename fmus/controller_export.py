@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import html
-import string
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from servobench.fmus.model_description import Description, sampled_sections
-from servobench.fmus.product import Product, c_files, committed, tool, word
+from servobench.fmus.product import Product, c_files, documentation, tool, word
 from servobench.fmus.reference import table
 from servobench.fmus.sources import generated_source
 from servobench.fmus.trace.branches import NOT_DEFINITE
@@ -143,16 +141,12 @@ class ControllerModel:
         }
 
     def _documentation(self, layout: Layout) -> str:
-        rows = [
-            f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
-            f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
-            for group in layout.groups
-        ]
-        return string.Template(committed(MODEL, "documentation.html")).substitute(
-            name=html.escape(self.name),
-            summary=html.escape(self.summary),
+        return documentation(
+            MODEL,
+            layout,
+            name=self.name,
+            summary=self.summary,
             period=f"{self.period:g}",
-            memory=self.recorded.states,
-            settings=html.escape(self.settings),
-            rows="\n".join(rows),
+            memory=str(self.recorded.states),
+            settings=self.settings,
         )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import html
-import string
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -12,8 +10,8 @@ import numpy as np
 
 from servobench.fmus.compile import Platform, this_platform
 from servobench.fmus.model_description import Description, arm_sections
-from servobench.fmus.product import Product, c_files, check_version, committed, tool, word
-from servobench.fmus.reference import input_csv, output_csv, reference_run
+from servobench.fmus.product import Product, c_files, check_version, documentation, tool, word
+from servobench.fmus.reference import COMMAND, reference_run, table
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
 from servobench.plant.cameras.model import SetupModel
@@ -132,12 +130,12 @@ def product(options: ExportOptions, *, documented: bool = True) -> Product:
     reference = ("", "")
     if documented:
         run = reference_run(options.model, options.actuation)
-        reference = input_csv(run, layout), output_csv(run, layout)
+        reference = table(run.time, {COMMAND: run.command}, layout), table(run.time, run.outputs, layout)
     return Product(
         fmi_version=options.fmi_version,
         folder=MODEL,
         core=CORE,
-        source=_kinematics(layout),
+        source=kinematics_source(layout),
         constants=arm_constants(layout),
         description=description,
         documentation=_documentation(layout, options) if documented else "",
@@ -151,26 +149,15 @@ def arm_layout(n: int, view: View | None = None) -> ArmLayout:
     return ArmLayout(arm_groups(n, view), view)
 
 
-@cache
-def _kinematics(layout: ArmLayout) -> str:
-    return kinematics_source(layout)
-
-
 def _documentation(layout: ArmLayout, options: ExportOptions) -> str:
-    template, view = committed(MODEL, "documentation.html"), options.view
-    rows = [
-        f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
-        f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
-        for group in layout.groups
-    ]
-    return string.Template(template).substitute(
-        title=html.escape(options.title),
-        summary=html.escape(options.summary),
-        joints=options.model.arm.n,
-        seen=f" and cameras: {html.escape(view.setting)}" if view else " carries a ball; a fixed camera sees it",
+    view = options.view
+    return documentation(
+        MODEL,
+        layout,
+        title=options.title,
+        summary=options.summary,
+        joints=str(options.model.arm.n),
+        seen=f" and cameras: {view.setting}" if view else " carries a ball; a fixed camera sees it",
         feature="y = R_BC' (p_B(theta) - p_BC)" if view is None else PIXELS,
-        mismatch="the nominal model"
-        if options.mismatch == "none"
-        else f"the mismatch “{html.escape(options.mismatch)}”",
-        rows="\n".join(rows),
+        mismatch="the nominal model" if options.mismatch == "none" else f"the mismatch “{options.mismatch}”",
     )

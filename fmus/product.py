@@ -6,8 +6,10 @@ Equal inputs give equal bytes: no date, no path and no machine name enters the a
 from __future__ import annotations
 
 import hashlib
+import html
 import os
 import re
+import string
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -28,6 +30,7 @@ from servobench.fmus.model_description import (
 )
 from servobench.fmus.reference import INPUT_FILE, OUTPUT_FILE
 from servobench.fmus.sources import layout_header
+from servobench.fmus.variables import Layout
 from servobench.plant.contract.files import reason
 
 MACHINERY: Final = "fmi"  # folder of the FMI functions, which serve every model
@@ -180,6 +183,17 @@ def c_files(fmi_version: int, core: str) -> tuple[str, ...]:
 def committed(folder: str, name: str) -> str:
     """Return the text of a file of this package."""
     return (files("servobench.fmus") / folder / name).read_text(encoding="utf-8")
+
+
+def documentation(folder: str, layout: Layout, **words: str) -> str:
+    """Return the documentation of a model: its template with these words and a table of the variables."""
+    rows = [
+        f"<tr><td><code>{html.escape(group.name)}</code></td><td>{' × '.join(map(str, group.shape))}</td>"
+        f"<td>{group.role}</td><td>{group.unit}</td><td>{html.escape(group.description)}</td></tr>"
+        for group in layout.groups
+    ]
+    escaped = {name: html.escape(text) for name, text in words.items()}
+    return string.Template(committed(folder, "documentation.html")).substitute(escaped, rows="\n".join(rows))
 
 
 def tool() -> str:

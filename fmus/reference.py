@@ -73,16 +73,6 @@ def _features(model: RobotModel, positions: FloatArray) -> dict[str, FloatArray]
     return {FEATURE: feature, SEEN: seen.astype(np.float64)}
 
 
-def input_csv(run: ReferenceRun, layout: Layout) -> str:
-    """Return the commands as CSV with one column for each scalar."""
-    return table(run.time, {COMMAND: run.command}, layout)
-
-
-def output_csv(run: ReferenceRun, layout: Layout) -> str:
-    """Return the outputs as CSV with one column for each scalar."""
-    return table(run.time, run.outputs, layout)
-
-
 def read_table(text: str) -> tuple[list[str], FloatArray]:
     """Return the header and the numbers of a CSV table.
 

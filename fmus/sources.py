@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from servobench.plant.cameras.symbolic import (
     feature_and_jacobian,
     features,
     points_in_cameras,
-    seen_features,
+    valid_features,
 )
 from servobench.plant.contract.checks import FloatArray
 
@@ -102,6 +103,7 @@ def _initialiser(name: str, values: list[str]) -> str:
     return f"#define {name} {{ \\\n    " + ", \\\n    ".join(values) + "}"
 
 
+@cache
 def kinematics_source(layout: ArmLayout) -> str:
     """Return the C source of the kinematic core for the arm that `layout` describes."""
     return generated_source("kinematics", _core_functions(layout))
@@ -143,13 +145,13 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
     part = {group.name: p[layout.offsets[group.name] :][: group.size] for group in layout.kinematic}
     arm, view = _arm(part), layout.view
     if view is None:
-        ball = HandEyeGeometry(*arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
+        ball = HandEyeGeometry(arm, part["tool"], _rotation(part["camera_rpy"]), part["camera_position"])
         feature, jacobian = feature_and_jacobian(q, ball)
         return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), jacobian
     geometry = _view(part, arm, view)
     points = points_in_cameras(q, geometry, view.mount)
     feature = features(points, geometry.optics, view.setup)
-    seen = seen_features(points, geometry.optics, view.setup)
+    seen = valid_features(points, geometry.optics, view.setup)
     return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
 
 

@@ -116,7 +116,7 @@ class KinematicWorld(World):
         return self.truth().feature
 
     def visible(self) -> BoolArray | None:
-        """Return which features the cameras see; see `World.visible`."""
+        """Return which features are valid; see `World.visible`."""
         self.truth()
         return self._seen
 
@@ -146,7 +146,7 @@ class KinematicWorld(World):
         self.restore(take(self.save(), lanes))
 
     def _rest(self, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Let the lanes rest whose new joint positions, (..., n) rad, are not finite."""
+        """Stop the lanes whose new joint positions, (..., n) rad, are not finite."""
         bad = ~np.isfinite(q).all(axis=-1)
         for lane in np.flatnonzero(bad).tolist():
             reached = q.reshape(-1, self.spec.n)[lane]
@@ -154,7 +154,7 @@ class KinematicWorld(World):
         return where(bad, self._q, q), where(bad, np.zeros_like(v), v)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """There are no resources to free."""
 
 
 def build_kinematic(config: KinematicConfig, setup: PlantSetup) -> Bench:

@@ -159,8 +159,7 @@ def mckf_estimator(config: MckfConfig, knowledge: RobotKnowledge | None = None) 
     until x stays. Then P = (I − K H) P⁻ (I − K H)ᵀ + K R Kᵀ. Ren and Li applied it to visual servoing.
     """
     weight = partial(gaussian_weight, bandwidth=config.bandwidth)
-    fixed_point = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
-    return _by_rows(config, fixed_point)
+    return _by_fixed_point(config, weight)
 
 
 @settings
@@ -183,6 +182,13 @@ def generalised_weight(error: FloatArray, shape: float, bandwidth: float) -> Flo
     return np.asarray(size ** (shape - 2.0) * np.exp(-np.minimum((size / bandwidth) ** shape, MAX_EXPONENT)))
 
 
+def _by_fixed_point(
+    config: MckfConfig | GmckfConfig, weight: Callable[[FloatArray], FloatArray]
+) -> RandomWalkEstimator:
+    update = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
+    return _by_rows(config, update)
+
+
 def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None) -> RandomWalkEstimator:
     """Return the generalised maximum correntropy Kalman filter (GMCKF); nothing about the robot is needed.
 
@@ -197,8 +203,7 @@ def gmckf_estimator(config: GmckfConfig, knowledge: RobotKnowledge | None = None
     `MIN_ERROR`. The paper's choice of α by an estimate of the kurtosis is left out; α is a setting.
     """
     weight = partial(generalised_weight, shape=config.shape, bandwidth=config.bandwidth)
-    fixed_point = partial(fixed_point_update, weight=weight, tolerance=config.tolerance, iterations=config.iterations)
-    return _by_rows(config, fixed_point)
+    return _by_fixed_point(config, weight)
 
 
 @settings

@@ -76,6 +76,6 @@ class Law(ABC, Generic[State]):
         del joint_velocity, limited
         return state
 
-    @abstractmethod
     def diagnostics(self, state: State) -> Diagnostics:
-        """Return named numbers (...) about the last command; for the log only."""
+        """Return named numbers (...) about the last command, if there are any; for the log only."""
+        return {}

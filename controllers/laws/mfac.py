@@ -13,7 +13,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 
-from servobench.controllers.controller import Diagnostics, RobotKnowledge
+from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate, Law
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import plus_diagonal, transposed
@@ -71,7 +71,3 @@ class MfacLaw(Law[MfacState]):
         """Return u, (..., n), rad/s; see `Law.command`."""
         e = reference[..., 0, :] - observation.feature
         return state, mfac_step(estimate.jacobian, e, self._share, self._weight) / self._dt
-
-    def diagnostics(self, state: MfacState) -> Diagnostics:
-        """Return nothing."""
-        return {}

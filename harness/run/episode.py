@@ -19,8 +19,7 @@ from servobench.harness.run.lanes import AllEnded, Ends, ManyBenches, ManyLogs, 
 from servobench.harness.run.log import StepLog, Steps
 from servobench.harness.run.loop import careful, run_loop
 from servobench.harness.run.metrics import judge_run
-from servobench.harness.run.outcome import find_outcome
-from servobench.harness.run.pose_error import final_pose_error, pose_errors
+from servobench.harness.run.outcome import final_pose_error, find_outcome, pose_errors
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import ResolvedRun, resolve
 from servobench.harness.run.result import COMPLETED, Ending, RunResult, ends_batch, is_defect
@@ -36,10 +35,10 @@ def run_experiment(
     """Carry one run out; the row's `status` and `reason` name a fault on the way.
 
     Args:
-        request: what to run.
+        request: the run.
         settings: overrides of the defaults.
         steps: also return one row a period.
-        picture: also return what the camera saw last, where there is one.
+        picture: also return the last picture of the camera, if there is one.
         keep: results folder in which trained networks are kept beside the runs.
 
     Raises:
@@ -72,7 +71,7 @@ def carry_out(
     except BaseException as error:
         if ends_batch(error) or (debug and is_defect(error)):
             raise
-        ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row says what
+        ending = Ending.of(error)  # a plug-in may raise anything; the batch goes on and the row names it
     finally:
         logged = log.steps()
         image = plant.picture() if picture and len(logged) else None
@@ -100,7 +99,7 @@ def carry_out_together(runs: Sequence[ResolvedRun], *, keep: Path | None = None)
 
     Raises:
         Exception: they cannot be built together, because something is wrong with one of them; each has to be carried
-            out by itself, and its row says what it is.
+            out by itself, and its row names the error.
     """
     most = max(1, ROWS_AT_ONCE // runs[0].run.periods(draw(runs[0]).scenario.duration))
     parts = (runs[first : first + most] for first in range(0, len(runs), most))

@@ -70,7 +70,7 @@ class Bench(Plant):
     """A plant: a world under clipped and delayed commands, measured with noise, latency and lost frames."""
 
     def __init__(self, world: World, command_delay: float, sensing: SensingConfig, period: float | None = None) -> None:
-        """Put a world on the bench, which closes it; `reset` begins a run. `build_bench` also builds the world.
+        """Take a world, which the bench closes; `reset` begins a run. `build_bench` also builds the world.
 
         Args:
             world: the robot and its camera.
@@ -94,7 +94,7 @@ class Bench(Plant):
         self._size_masks()
 
     def _size_masks(self) -> None:
-        """Take the leading axis from the world."""
+        """Set the shapes of commands and masks by the leading axis of the world."""
         self._shape = (*self.world.lead, self.spec.n)
         self._whole = np.ones(self.world.lead, dtype=np.bool_)[()]
         self._all_valid = np.ones((*self.world.lead, self.spec.m), dtype=np.bool_)
@@ -103,7 +103,7 @@ class Bench(Plant):
             mask.setflags(write=False)
 
     def reset(self, seed: Seeds) -> Observation:
-        """Return to the start; all that the sensor draws gets random streams of its own. See `Plant.reset`.
+        """Return to the start, with new random streams for the sensor. See `Plant.reset`.
 
         Args:
             seed: non-negative; a sequence of one for each of the runs side by side.
@@ -150,7 +150,7 @@ class Bench(Plant):
         return self._observation(joints, *self._delivered(self._k * timing.steps))
 
     def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
-        """Return the newest features that arrived since the last control instant, and which ones did, (..., m)."""
+        """Return the newest features that arrived since the last control instant, and which of them did, (..., m)."""
         if self._sensor.jitters:
             return self._delivered_by_lane(now)
         feature, valid = self._held, self._none_valid
@@ -163,7 +163,7 @@ class Bench(Plant):
         return feature, valid
 
     def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
-        """Return the same where a frame is due at another time in each lane."""
+        """Return the same as `_delivered` for lanes whose frames are due at different times."""
         feature, valid, before = self._held, self._none_valid, now - self._timing.steps
         for due, newer, own in self._frames:
             fresh = np.logical_and(own, np.asarray(np.logical_and(before < due, due <= now))[..., None])
@@ -191,7 +191,7 @@ class Bench(Plant):
         return unit * self._sensor.measured(feature / unit)
 
     def _unseen(self) -> BoolArray | None:
-        """Return which features cannot be seen now, (..., m); None for none of them."""
+        """Return which features are not valid now, (..., m); None if all are valid."""
         seen = self.world.visible()
         return None if seen is None or seen.all() else np.logical_not(seen)
 
@@ -277,7 +277,7 @@ class Bench(Plant):
 def build_bench(
     make: Callable[[PlantSetup], World], setup: PlantSetup, command_delay: float, sensing: SensingConfig
 ) -> Bench:
-    """Return a bench around a world that is as fine as the delays need.
+    """Return a bench around a world with the sub-steps that the delays need.
 
     Args:
         make: builds the world from a setup whose period is the sub-step.

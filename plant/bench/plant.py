@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
-from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -29,7 +29,7 @@ ImageArray: TypeAlias = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class TrueModel:
-    """The kinematics of the true robot and how late commands and features are; for upper bounds only.
+    """The kinematics of the true robot and the delays of commands and features; for upper bounds only.
 
     Attributes:
         jacobian: (..., n) rad -> (..., m, n), unit of the feature per rad.
@@ -47,7 +47,7 @@ class TrueModel:
 
 
 class Abilities(ABC):
-    """The abilities of plants and worlds in addition to moving; those that are optional have a default."""
+    """Abilities that plants and worlds share; the optional ones have a default."""
 
     spec: PlantSpec
     """Sizes, names, limits and period; set on construction."""
@@ -71,7 +71,7 @@ class Abilities(ABC):
         return copy.deepcopy(vars(self))
 
     def restore(self, state: Any) -> None:  # noqa: ANN401 - as returned by `save`
-        """Return to a state that `save` of a plant with the same robot and settings returned, as often as wanted."""
+        """Return to a saved state of a plant with the same robot and settings; a state can be used repeatedly."""
         vars(self).update(copy.deepcopy(state))
 
     def true_model(self) -> TrueModel:
@@ -100,7 +100,7 @@ class Abilities(ABC):
         return None
 
     def move_camera(self, X_BC: FloatArray) -> None:
-        """Put the camera elsewhere from the next measurement on, until `reset`: a camera displaced during the run.
+        """Move the camera from the next measurement on, until `reset`: a camera displaced during the run.
 
         Args:
             X_BC: (4, 4), the camera's new pose in the base frame; (..., 4, 4) for runs side by side.
@@ -111,7 +111,7 @@ class Abilities(ABC):
         raise ValueError("the plant has no camera that could be moved")
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
-        """Drop all other runs for good, of runs side by side.
+        """Keep only some of the runs side by side and drop the others permanently.
 
         Args:
             lanes: (k,), indices of the lanes that stay, in their new order.
@@ -192,13 +192,6 @@ class PlantSetup:
             raise ValueError("model and start must be given for this plant, got None")
         return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
 
-    def ball_robot(self) -> tuple[HandEyeModel, FloatArray]:
-        """Return model and start for a plant that sees the ball in 3-D by a fixed camera only; errors as in `robot`."""
-        model, start = self.robot()
-        if not isinstance(model, HandEyeModel):
-            raise ValueError("model must be of a ball that is seen in 3-D by a fixed camera for this plant")  # noqa: TRY004
-        return model, start
-
 
 @dataclass(frozen=True)
 class PlantEntry:
@@ -234,7 +227,7 @@ class PlantEntry:
 
 
 class World(Abilities):
-    """A robot and its camera, which only advance and see; `Bench` makes a plant of it.
+    """A robot and its camera, which only advance and measure; `Bench` makes a plant of it.
 
     Arrays that a world returns are never changed again, finite and float64; the bench makes them read-only. Those of a
     world that carries out runs side by side have the leading axis `lead`.
@@ -247,7 +240,7 @@ class World(Abilities):
     """[s] time constant of the joints' velocity loops; None where it is unknown."""
 
     def fail(self, lane: int, fault: RunFault) -> None:
-        """Take the fault of a lane, or raise that of a single run; of a lane the first one counts."""
+        """Record the fault of a lane, of which the first one counts, or raise that of a single run."""
         if not self.lead:
             raise fault
         self.faults = {lane: fault, **self.faults}
@@ -282,7 +275,7 @@ class World(Abilities):
 
     @abstractmethod
     def see(self) -> FloatArray | None:
-        """Return the feature as the sensor sees it now, (..., m); None if a single run's is not found."""
+        """Return the feature as measured now, (..., m); None if that of a single run is not found."""
 
     def visible(self) -> BoolArray | None:
         """Return which features of the last measurement are valid, (..., m); None for all of them."""

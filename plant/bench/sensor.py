@@ -24,7 +24,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.bench.noise import directions, family_of, quantised
+from servobench.plant.bench.noise import draw_directions, family_of, quantise
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import take, where
 from servobench.plant.contract.seeds import Seeds, Stream
@@ -35,7 +35,7 @@ TIME_TOLERANCE: Final = 1e-9  # [s] by which a frame may be earlier than a windo
 
 
 class Sensor:
-    """The random side of a sensor over a run, or over runs side by side; it can be copied and pickled.
+    """The random disturbances of a sensor over a run, or over runs side by side; it can be copied and pickled.
 
     Attributes:
         jitters: whether frames are late by different times.
@@ -56,16 +56,11 @@ class Sensor:
         """
         self._config, self.jitters = config, config.jitter > 0.0
         self._scale = config.noise_factor * config.feature_noise
-        offset = config.noise_offset / config.feature_noise if config.feature_noise > 0.0 else 0.0
-        family = family_of(
-            config.noise, share=config.noise_share, offset=offset, spread=config.noise_spread,
-            stability=config.stability, skewness=config.skewness,
-        )  # fmt: skip
         stream: Callable[..., Stream] = partial(Stream, seed)
-        self._noise = stream("feature_noise", family, (m,), self._scale)
+        self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
         self._losses, self._lateness = stream("dropped_frames", "random"), stream("late_frames", "random")
         self._outlier_begins, self._occlusion_begins = stream("outliers", "random"), stream("occlusions", "random")
-        self._outlier_values = stream("outlier_values", directions, (m,), config.outlier_size)
+        self._outlier_values = stream("outlier_values", draw_directions, (m,), config.outlier_size)
         frames = [max(1, round(time / interval)) for time in (config.outlier_duration, config.occlusion_duration)]
         self._frames = frames[0], frames[1]
         self._outlier, self._occlusion = Spell.none(lead, np.zeros((*lead, m))), Spell.none(lead, np.zeros(lead)[()])
@@ -81,10 +76,10 @@ class Sensor:
             begins = self._outlier_begins.next() < begin_probability(config.outliers, frames)
             self._outlier = self._outlier.next(begins, frames, self._outlier_values.next())
             feature = where(self._outlier.inside, feature + self._outlier.value, feature)
-        return quantised(feature, config.quantum) if config.quantum > 0.0 else feature
+        return quantise(feature, config.quantum) if config.quantum > 0.0 else feature
 
     def missing(self, time: float) -> BoolArray | None:
-        """Return where the frame that is exposed at `time` [s] arrives without the feature, (...); None for nowhere."""
+        """Return in which lanes the frame exposed at `time` [s] arrives without the feature, (...); None for none."""
         config, absent = self._config, None
         if config.drop_probability > 0.0:
             absent = self._losses.next() < config.drop_probability
@@ -98,7 +93,7 @@ class Sensor:
         return absent if absent is not None and absent.any() else None
 
     def due(self, step: int, size: float) -> FloatArray:
-        """Return after which sub-step the frame is delivered that is due at `step` without jitter, (...).
+        """Return the sub-step after which a frame is delivered that would be due at `step` without jitter, (...).
 
         Args:
             step: number of the sub-step.

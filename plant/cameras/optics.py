@@ -50,7 +50,7 @@ def ideal_optics(camera: PinholeCamera, count: int) -> Optics:
 
 
 def project(points: FloatArray, optics: Optics) -> FloatArray:
-    """Return where points appear.
+    """Return the pixels at which points appear.
 
     Args:
         points: (..., c, p, 3), in the frame of each camera [m]; numbers, or expressions in an array of objects.
@@ -65,7 +65,7 @@ def project(points: FloatArray, optics: Optics) -> FloatArray:
 
 
 def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
-    """Return how points move in the images, (..., c, p, 2, n) px.
+    """Return the motions of points in the images, (..., c, p, 2, n) px.
 
     Args:
         points: (..., c, p, 3) [m].
@@ -109,7 +109,7 @@ def _undistorted(bent: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArray:
-    """Return which points, (..., c, p, 3) m, are before the camera and in the image, (..., c, p).
+    """Return which points, (..., c, p, 3) m, are in front of the camera and in the image, (..., c, p).
 
     Args:
         points: in the frame of each camera.

@@ -65,14 +65,14 @@ class CameraDraws:
         return {f"camera_{field.name}": getattr(self, field.name).tolist() for field in fields(self)}
 
 
-def planned(count: int) -> CameraDraws:
+def planned_draws(count: int) -> CameraDraws:
     """Return the draws of `count` cameras that are as planned."""
     zero = np.zeros(count)
     return CameraDraws(np.ones(count), np.zeros((count, 2)), zero, np.zeros((count, 3)), np.zeros((count, 3)))
 
 
 def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
-    """Draw how `count` cameras differ from those that are planned; `seed` is that of the robot's mismatch."""
+    """Draw the deviations of `count` cameras from the planned ones; `seed` is that of the robot's mismatch."""
     size = mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
@@ -91,7 +91,7 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
 
 
 def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
-    """Return the rotation vector, (3,) rad, of a further camera, drawn as that of the first one is."""
+    """Return the rotation vector, (3,) rad, of a further camera, drawn as for the first one."""
     angle = mismatch.size("camera_rotation")
     axis = draw_camera_axis(angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}"))
     share = 1.0 if mismatch.camera_exact else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
@@ -108,7 +108,7 @@ def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel
     if robot.n < setup.least_joints:
         wanted = f"an arm of {setup.least_joints} joints or more"
         raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
-    return _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), planned(setup.cameras))
+    return _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), planned_draws(setup.cameras))
 
 
 def true_model(

@@ -22,7 +22,7 @@ DEFAULT_SENSING: Final = "position"
 
 @dataclass(frozen=True)
 class Sensing:
-    """A set-up and how its cameras are mounted; `str` gives back the word that `parse` reads."""
+    """A set-up and the mount of its cameras; `str` returns the word that `parse` reads."""
 
     setup: SensingSetup = POSITION
     mount: Mount = "fixed"

@@ -114,7 +114,7 @@ def _prune(kind: Path) -> None:
 
 @contextlib.contextmanager
 def _alone(kind: Path) -> Iterator[None]:
-    """Keep other processes from moving entries of a kind meanwhile, where the system can."""
+    """Hold a lock against other processes that move entries of a kind, where the system has locks."""
     with (kind / ".lock").open("a") as file, contextlib.ExitStack() as stack:
         try:
             import fcntl  # noqa: PLC0415 - not on Windows

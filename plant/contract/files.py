@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, also after a power cut, and TOML that is refused in one line."""
+"""Atomic writing of files, and reading of TOML with errors of one line."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def read_toml(kind: str, path: Path) -> dict[str, Any]:
 
 
 def reason(error: Exception) -> str:
-    """Return why a file cannot be read or written, without number and path for an error of the system."""
+    """Return the reason of an error about a file; for an error of the system without its number and path."""
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def user_path(text: str) -> Path:
-    """Return the path that a user wrote, with ~ for a home folder.
+    """Return a path as written by a user, in which ~ stands for a home folder.
 
     Raises:
         ValueError: there is no such home folder.

@@ -42,13 +42,13 @@ def map_arrays(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  #
 
 
 def take(tree: Tree, lanes: Lanes) -> Tree:
-    """Return a tree with the lanes that an index names; a single number gives the tree of a single run."""
+    """Return a tree with the indexed lanes; a single number gives the tree of a single run."""
     taken: Tree = map_arrays(lambda array: array[lanes], tree)
     return taken
 
 
 def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
-    """Return a tree in which the lanes that an index names are those of `part`; they were those of `before`."""
+    """Return a tree with the indexed lanes taken from `part` and all others from `before`."""
 
     def replaced(array: FloatArray, values: FloatArray, old: FloatArray) -> FloatArray:
         if values is old:
@@ -68,7 +68,7 @@ def stack(trees: Sequence[Tree]) -> Tree:
 
 
 def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
-    """Return `function(tree, *arguments)` in the lanes that are chosen and `tree` in all others.
+    """Return `function(tree, *arguments)` in the chosen lanes and `tree` in all others.
 
     Args:
         chosen: (...), bool.
@@ -92,7 +92,7 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
 def repeat(
     condition: Callable[[Tree], npt.ArrayLike], function: Callable[[Tree], Tree], tree: Tree, at_most: int
 ) -> Tree:
-    """Return a tree after `function` was applied, `at_most` so often, in the lanes in which a condition still holds.
+    """Apply `function` up to `at_most` times in the lanes in which a condition still holds, and return the tree.
 
     Args:
         condition: of a tree, (...), bool.
@@ -109,7 +109,7 @@ def repeat(
 
 
 def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Mark a function that is written for single runs: it is called for one lane after the other.
+    """Decorate a function for single runs so that it is called for one lane after the other.
 
     Args:
         signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
@@ -132,7 +132,7 @@ def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[...,
 
 
 def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:
-    """Return the entries that an index of each lane names along the first axis after the leading ones.
+    """Return the entries at one index for each lane, along the first axis after the leading ones.
 
     Args:
         array: (..., k, *).
@@ -152,7 +152,7 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
 
 
 def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return `one` in the lanes that are chosen, (...), and `other` elsewhere; both may have further axes."""
+    """Return `one` in the chosen lanes, (...), and `other` elsewhere; both may have further axes."""
     mask = np.asarray(chosen)
     return np.where(mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)), one, other)
 

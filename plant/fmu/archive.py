@@ -93,7 +93,7 @@ def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
 
 
 def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse an archive that is built, or damaged, to fill the disk or the memory."""
+    """Refuse an archive that would fill the disk or the memory."""
     if len(entries) > MAX_FILES:
         raise ValueError(f"fmu file {path} holds {len(entries)} files; at most {MAX_FILES} are unpacked")
     description = max(entry.file_size for entry in entries if entry.filename == DESCRIPTION)

@@ -166,7 +166,7 @@ class Instance(ABC):
 
     @abstractmethod
     def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        """Return a function that takes a step of size `step`, s, at the time `now`, s, as both are at every call.
+        """Return a function that takes a step of size `step`, s, at the time `now`, s; both are read at every call.
 
         It returns 0 where the step was taken without anything to report; any other result is for `finish`.
         """
@@ -190,14 +190,14 @@ class Instance(ABC):
 
     @abstractmethod
     def _reached(self, status: int, time: float) -> float | None:
-        """Return where a step from `time`, s, ended if it ended early, by the result of its `step_call`.
+        """Return the time [s] at which a step from `time` ended early, by the result of its `step_call`; else None.
 
         Raises:
             FmuError: it failed.
         """
 
     def stepper(self, step: float) -> Callable[[float], None]:
-        """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+        """Return a function that advances by `step`, s, from its argument, a time in s; it raises FmuError."""
         now = ctypes.c_double()
         call = self.step_call(now, ctypes.c_double(step))
 
@@ -300,11 +300,6 @@ class Instance(ABC):
                 self.check(f"{verb} {port.summary}", status)
 
         return checked
-
-    def derivative(self, unknowns: Port, knowns: Port) -> None:
-        """Turn the seed in the buffer of `knowns` into the sensitivity in the buffer of `unknowns`."""
-        buffers = (*self._row(knowns, 0), *self._row(unknowns, 0))
-        self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
 
     def save(self) -> ctypes.c_void_p:
         """Return the present state; it has to be given to `free`."""

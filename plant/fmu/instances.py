@@ -122,7 +122,7 @@ class Instances:
         self.live = list(self.lanes)
 
     def each(self, act: Callable[[Lane], None]) -> None:
-        """Do something outside the inner loop with each lane that has not failed."""
+        """Call `act`, outside the inner loop, with each lane that has not failed."""
         for i, lane in enumerate(self.live):
             if lane is self.lanes[i]:
                 try:
@@ -149,7 +149,7 @@ class Instances:
                     self.drop(i, fault)
 
     def drop(self, i: int, fault: FmuError) -> None:
-        """Call an instance no more, because of a fault, nor any other if it is fatal; that of a single run raises."""
+        """Stop calling an instance after a fault, and all others if the fault is fatal; that of a single run raises."""
         for j in range(len(self.lanes)) if self.lanes[i].instance.fatal else (i,):
             if self.live[j] is self.lanes[j]:
                 self._fail(j, fault)
@@ -192,7 +192,7 @@ _logs: weakref.WeakValueDictionary[int, MessageLog] = weakref.WeakValueDictionar
 
 
 def _log_message(environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes) -> None:
-    """Pass a message to the log of the instance that it came from; the environment says which."""
+    """Pass a message to the log of the instance that it came from; the environment identifies it."""
     log = _logs.get(environment or 0) or MessageLog("fmu")
     log.add(status, (message or b"").decode("utf-8", errors="replace"))
 

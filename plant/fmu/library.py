@@ -19,7 +19,7 @@ _fatal: set[int] = set()  # handles of libraries that may never be called again;
 
 
 def condemn(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Take note that an instance reported a fatal error: no instance of this library may be called again."""
+    """Record a fatal error of an instance: no instance of this library may be called again."""
     _fatal.add(library._handle)
 
 
@@ -66,7 +66,7 @@ def _load_copy(file: Path) -> ctypes.CDLL:
 
 
 def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Give the library back to the system, unless it may never be called again, not even to unload it."""
+    """Unload the library, unless a fatal error forbids any further call."""
     if is_condemned(library):
         return
     from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
@@ -128,7 +128,7 @@ class MessageLog:
 
 @dataclass(frozen=True)
 class InstanceOptions:
-    """Wishes with which an instance is made and begun.
+    """Options of an instance.
 
     Attributes:
         tolerance: relative one of its own solver, or of CVode in model exchange; None: the solver's own.

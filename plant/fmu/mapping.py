@@ -178,7 +178,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
 
 
 def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float) -> str:
-    """Return a remark where an FMU takes longer steps than it is meant to; empty where it does not.
+    """Return a remark if an FMU takes longer steps than intended, else an empty text.
 
     One of model exchange is integrated with steps of its solver's.
     """

@@ -62,7 +62,7 @@ class Patch:
     columns: IntArray
 
     def shifted(self, rows: int, columns: int) -> Patch:
-        """Return the patch so many pixels further down and to the right."""
+        """Return the patch shifted by numbers of pixels down and to the right."""
         return Patch(self.rows + rows, self.columns + columns)
 
 
@@ -200,7 +200,7 @@ def find_ball(
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
-    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    """Return the area, px², of the ellipse of a sphere at `centre` (3,) m, which is stretched off the optical axis."""
     nearest2 = centre[2] ** 2 - radius**2
     return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
 
@@ -316,6 +316,14 @@ def whole(camera: PinholeCamera) -> Window:
 
 def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
     """Return the window outside of which no pixel shows a ball, with a margin for noise; None where none does.
+
+    A sphere of radius R about (x, y, z) in the camera frame appears between the columns and rows at which the planes
+    through the lens that contain one axis of the image touch it:
+
+        (x z ± R √(x² + z² − R²)) / (z² − R²)        of x/z, and likewise of y/z
+
+    Nothing else in a rendered room has the ball's colour, so an image that is cut to this window gives the same
+    detection as all of it.
 
     Args:
         centre: (3,) [m], of the ball in the camera frame.

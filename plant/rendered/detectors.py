@@ -61,7 +61,7 @@ class Lens:
     """One camera of a set-up."""
 
     def __init__(self, planned: PinholeCamera, optics: Optics, camera: int) -> None:
-        """Prepare where pixels are taken from.
+        """Prepare the map from the pixels to those of the ideal image.
 
         Args:
             planned: the camera as planned, whose picture needs no lens.

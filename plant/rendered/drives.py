@@ -32,10 +32,8 @@ from servobench.plant.robot.robot import Robot
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
-POSITION_SHARE, INTEGRAL_SHARE = (
-    0.25,
-    0.1,
-)  # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
+# [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
+POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
 RATED_PAYLOAD = 5.0  # [kg] of a UR5
 MAX_FOLLOWING_ERROR = 0.1  # [rad] the reference waits for a joint that falls behind further
@@ -129,7 +127,7 @@ class RigidBody(NamedTuple):
 
 
 class InPlace:
-    """A function of CasADi on arrays, which it reads and writes where they are."""
+    """A function of CasADi that reads its arguments and writes its results in place."""
 
     def __init__(
         self, function: casadi.Function, arguments: Sequence[FloatArray], results: Sequence[FloatArray]
@@ -209,7 +207,7 @@ class Drives:
         return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity)
 
     def take(self, state: DriveState, command: FloatArray) -> None:
-        """Go on from a state of joints and loops under a command (n,) [rad/s]."""
+        """Set the state of joints and loops, and the command (n,) [rad/s]."""
         self.command[:], self.angle[:], self.speed[:] = command, state.angle, state.speed
         self._loops[:] = state[2:]
 
@@ -245,7 +243,7 @@ class Drives:
         self.speed[:] = np.where(self.angle == moved, speed, 0.0)
 
     def _reference_law(self, n: int) -> casadi.Function:
-        """Return (blend, u, loops) -> loops with the reference one physics step further."""
+        """Return (blend, u, loops) -> loops with the reference one physics step later."""
         arguments = blend, u, loops = _symbols(blend=1, u=n, loops=3 * n)
         r, c, z = casadi.vertsplit(loops, n)
         return casadi.Function("reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)])
@@ -266,7 +264,7 @@ class Drives:
         return casadi.Function("step", arguments, [after, torque, self._drag(omega)])
 
     def _followed(self, blend: SX, u: SX, r: SX, c: SX) -> tuple[SX, SX]:
-        """Return the reference r and its speed c one physics step further; it stops at the stops.
+        """Return the reference r and its speed c one physics step later, limited to the stops.
 
         `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would then simplify the sum.
         """

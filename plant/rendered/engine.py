@@ -8,18 +8,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.detection import ByteArray, Window
+from servobench.plant.rendered.drives import DriveConfig
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
-
-if TYPE_CHECKING:
-    from servobench.plant.rendered.detection import ByteArray, Window
-    from servobench.plant.rendered.drives import DriveConfig
-    from servobench.plant.rendered.room import Room
 
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
@@ -46,7 +44,7 @@ class Scene(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the engine's world; calling it twice is allowed."""
+        """Close the engine's world; calling it twice is allowed."""
 
 
 class OpenScene(Protocol):
@@ -108,11 +106,11 @@ class Overlap(NamedTuple):
 
 
 class Simulation(ABC):
-    """An arm with mass and drives among obstacles; its state is a value that goes in and comes out."""
+    """An arm with mass and drives among obstacles; methods take its state and return a new one."""
 
     @abstractmethod
     def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - `Joints` of its own, as below
-        """Return joints at rest at `angle` (n,) [rad] whose drives carry the arm's weight."""
+        """Return joints at rest at `angle` (n,) [rad] with drives that carry the arm's weight."""
 
     @abstractmethod
     def advance(self, joints: Any, speed: FloatArray, steps: int) -> Any:  # noqa: ANN401
@@ -134,7 +132,7 @@ class Simulation(ABC):
 
 
 class Engine(NamedTuple):
-    """A physics engine: how its scenes and simulations are opened.
+    """A physics engine, by the constructors of its scenes and simulations.
 
     Attributes:
         scene: for the camera.

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import mujoco
@@ -27,17 +27,13 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.detection import Window, whole
+from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
 from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
 from servobench.plant.robot.robot import GRAVITY
-
-if TYPE_CHECKING:
-    from servobench.plant.contract.checks import FloatArray
-    from servobench.plant.rendered.detection import ByteArray
-    from servobench.plant.rendered.room import Room
 
 if mujoco.get_mju_user_warning() is None:
     # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; a wrong motion shows in the joints.
@@ -97,7 +93,7 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
 
 @contextmanager
 def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
-    """Let OpenGL fill no pixel of the current context outside of a rectangle, counted from the lower left corner."""
+    """Restrict OpenGL in the current context to a rectangle of pixels, counted from the lower left corner."""
     from OpenGL import GL  # noqa: PLC0415 - chooses the platform that `open_context` has loaded
 
     GL.glEnable(GL.GL_SCISSOR_TEST)
@@ -219,7 +215,7 @@ class MujocoScene(Scene):
 
 
 def _compile(room: Room) -> Any:  # noqa: ANN401
-    """Return the model of all that is drawn, an `MjModel`."""
+    """Return the model of all drawn bodies, an `MjModel`."""
     files = room.files()
     (_, spec), *around = [(name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")]
     for name, body in around:
@@ -268,7 +264,16 @@ class MujocoState(NamedTuple):
 
 
 class MujocoSimulation(Simulation):
-    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next."""
+    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next.
+
+    A physics step is MuJoCo's own, with the implicit integrator `implicitfast`:
+
+        M(θ) ω̇ = T − b(θ, ω) − B ω + τ,        τ: of dry friction and of the stops, solved as constraints
+
+    T is the torque of `servobench.plant.rendered.drives`, M includes the rotors and b the true load. The gravity torque
+    by which the drives compensate is MuJoCo's, too, as if the load were the assumed one. Contact is only detected:
+    bodies do not push each other.
+    """
 
     def __init__(self, machine: Machine) -> None:
         """Load the arm.
@@ -367,7 +372,7 @@ def _assumed_inertia(machine: Machine) -> FloatArray:
 
 
 def _solid(machine: Machine) -> tuple[Any, dict[int, str]]:
-    """Return the model of all that can be met, an `MjModel`, and the names of its boxes by number."""
+    """Return the model of all collision shapes, an `MjModel`, and the names of its boxes by number."""
     spec = read_urdf(arm_mechanics(machine.arm, 0.0, shapes=True, robot=machine.robot))
     boxes = (*room_boxes(machine.robot.workspace.scale), *machine.boxes)
     for box in boxes:

@@ -39,13 +39,13 @@ BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too
 
 
 def text(robot: ET.Element) -> str:
-    """Return a URDF as text."""
+    """Return the text of a URDF."""
     ET.indent(robot)
     return ET.tostring(robot, encoding="unicode")
 
 
 def numbers(values: npt.ArrayLike) -> str:
-    """Return numbers as URDF writes them, with spaces between."""
+    """Return numbers in the notation of URDF, separated by spaces."""
     return " ".join(repr(value) for value in np.asarray(values, dtype=np.float64).tolist())
 
 

@@ -103,7 +103,7 @@ class RenderedWorld(World):
     """An arm with drives and its cameras."""
 
     def __init__(self, engine: Engine, config: RenderedConfig, setup: PlantSetup) -> None:
-        """Open worlds of its own and load the arm.
+        """Open a scene and a simulation with the arm.
 
         Raises:
             ValueError: a start of the wrong size, a period that physics steps do not divide, a list that does not
@@ -167,7 +167,7 @@ class RenderedWorld(World):
         return self._reported()
 
     def _check_state(self, step: int) -> None:
-        """Raise the fault of joints that are not finite or of an arm that touches something, at a physics step."""
+        """Raise a fault, at a physics step, if joints are not finite or the arm touches a body."""
         if not np.isfinite(self._joints.angle).all():
             raise PlantDiverged(f"joint positions are not finite: {self._joints.angle.tolist()}")
         self._check_contact(step)
@@ -216,7 +216,7 @@ class RenderedWorld(World):
         return self._detector.picture(self._model, self._joint_position())
 
     def close(self) -> None:
-        """Leave the engine's worlds."""
+        """Close the scene and the simulation."""
         self._scene.close()
         self._simulation.close()
 
@@ -227,7 +227,7 @@ class RenderedWorld(World):
         return q
 
     def _reported(self) -> FloatArray:
-        """Return the joint positions in steps of the encoders, (n,) rad; a stop is the end of the scale."""
+        """Return the joint positions in steps of the encoders, (n,) rad; the scale ends at the stops."""
         q, resolution = self._joint_position(), self._config.encoder_resolution
         if resolution == 0.0:
             return q
@@ -236,7 +236,7 @@ class RenderedWorld(World):
         return np.where(q <= lower + half, lower, steps)
 
     def _keep_pace(self) -> None:
-        """Wait until the wall clock has come as far as the run; only with a window."""
+        """Wait until the wall clock has reached the time of the run; only with a window."""
         time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
 
 

@@ -21,7 +21,6 @@ from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
-from servobench.plant.robot.ur5 import UR5
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
@@ -57,11 +56,6 @@ def find_robot(text: str) -> Robot:
     except OSError as error:
         raise ValueError(f"robot file {path} cannot be read: {error.strerror}") from error
     return _read(text, changed)
-
-
-def nominal_ur5() -> Robot:
-    """Return the robot of every run that names none."""
-    return _known(UR5)
 
 
 @cache

@@ -38,7 +38,7 @@ SHRINK, GROW = 0.3, 4.0  # of the damping after a step that is taken, and after 
 def closest_distance(
     arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike, starts: int = STARTS
 ) -> FloatArray:
-    """Return how near the ball can be brought to a point.
+    """Return the distance to which the ball can approach a point.
 
     Args:
         arm: one arm, or arms whose leading axes are the last ones of the points'.
@@ -59,7 +59,7 @@ def closest_distance(
 def reach_for(
     arm: SerialArm, point: FloatArray, starts: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where the search ends that begins at each of many joint positions.
+    """Return joint positions near a point, found from each of many starts.
 
     Args:
         arm: one arm.
@@ -110,7 +110,7 @@ def _search(
 
 
 def _starts(count: int, lead: tuple[int, ...], lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return where the search begins, (count, ..., n) rad: the same joint positions for every point, within a turn."""
+    """Return the starts of the search, (count, ..., n) rad: the same for every point, within a turn."""
     drawn = np.random.default_rng(0).uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower)))
     return np.broadcast_to(drawn.reshape(count, *(1,) * len(lead), -1), (count, *lead, len(lower))).copy()
 
@@ -141,7 +141,7 @@ POSE_SHRINK, POSE_GROW = 0.2, 5.0  # of the damping after a step that is taken, 
 def reach_pose(
     arm: SerialArm, pose: FloatArray, start: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Return joint positions near a start at which the flange has a pose.
+    """Return joint positions near a start that give the flange a pose.
 
     Args:
         arm: one arm.

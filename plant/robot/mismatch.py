@@ -1,4 +1,4 @@
-"""Named, seeded differences between the true robot and the nominal model that controllers know.
+"""Named, seeded deviations of the true robot from the nominal model that controllers know.
 
 A mismatch is written as words joined by `+`: a profile (`none`, `factory`, `moderate`, `severe`), single axes with a
 magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20mm`, `gear_ratio=5%`,
@@ -110,7 +110,7 @@ class Mismatch:
         return "+".join([profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes])
 
     def with_axis(self, axis: str, magnitude: Magnitude) -> Mismatch:
-        """Return this mismatch with one axis put on top of it.
+        """Return this mismatch with one axis added.
 
         Raises:
             ValueError: it has this axis already.
@@ -129,7 +129,7 @@ class Mismatch:
         return tuple((axis, magnitude) for axis, magnitude in self.axes if axis in SENSOR_AXES)
 
     def disturbed(self, sensing: SensingConfig) -> SensingConfig:
-        """Return the settings of a sensor with the axes of the sensor put on top.
+        """Return the settings of a sensor with the axes of the sensor applied.
 
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
@@ -262,7 +262,7 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
 
 
 def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
-    """Draw an axis about which a turn by up to `angle` tilts the optical axis by at most `max_tilt`.
+    """Draw an axis such that a turn about it by up to `angle` tilts the optical axis by at most `max_tilt`.
 
     A turn by φ about an axis at γ from the optical axis tilts that by τ with sin(τ/2) = sin(φ/2) sin γ.
     """

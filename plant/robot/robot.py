@@ -106,7 +106,7 @@ PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
 
 
 def link_lengths(arm: SerialArm) -> FloatArray:
-    """Return how far each joint is from the next one, or the flange, (n,) m."""
+    """Return the distance of each joint from the next one, or the flange, (n,) m."""
     return norm(arm.translation[1:])
 
 

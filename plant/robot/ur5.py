@@ -87,5 +87,5 @@ def ur5_arm() -> SerialArm:
 
 
 def shipped_calibration() -> Path:
-    """Return the calibration file of one real UR5 which the package brings."""
+    """Return the calibration file of one real UR5, which is part of the package."""
     return Path(str(files("servobench.plant") / "data" / "ur5_factory_calibration.yaml"))

@@ -38,7 +38,7 @@ Move = tuple[FloatArray, FloatArray]  # start and target, (n,) and (n,) [rad]
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """The part of a robot's reach in which tasks are taught.
+    """The part of a robot's reach in which tasks are placed.
 
     Attributes:
         scale: of all lengths, over those of a UR5's bench.
@@ -75,11 +75,11 @@ class Workspace:
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Distances of the ball from the shoulder that are easily reached [m]."""
+        """Least and largest easily reached distance of the ball from the shoulder [m]."""
         return REACH[0] * self.scale, REACH[1] * self.scale
 
     def camera_pose(self, R_BC: npt.ArrayLike = R_BC_DOWN) -> FloatArray:
-        """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3) that looks at the centre."""
+        """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3), directed at the centre."""
         return camera_pose(R_BC, self.centre, self.camera_distance)
 
 
@@ -125,7 +125,7 @@ class Tubes:
 
 
 def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
-    """Return the tubes of links with a `radius`, (n,) m, that lie `aside`, (n,) m, of their joints."""
+    """Return the tubes of links with a `radius`, (n,) m, at an offset `aside`, (n,) m, from their joints."""
     link, ends, radii = [], [], []
     for i in range(arm.n):
         step = arm.translation[i + 1]
@@ -206,8 +206,8 @@ class Clearance:
         return np.asarray((self.gaps(placed, self.pairs) >= -OVERLAP * self.scale).all(axis=-1))
 
 
-def watched_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the pairs of tubes, (p, 2), that can meet: not of neighbouring links, and apart in most of (k, n) rad."""
+def collision_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
+    """Return the pairs of tubes, (p, 2), that can collide: not of neighbours, and separate in most of (k, n) rad."""
     link = clearance.tubes.link
     i, j = np.triu_indices(len(link), 1)
     pairs = np.stack([i, j], axis=-1)[link[j] - link[i] > 1]
@@ -262,7 +262,7 @@ WITHDRAWALS: Final = 8  # steps of a tenth towards the home for a place that no 
 
 
 def length_scale(arm: SerialArm) -> float:
-    """Return how long an arm is from its shoulder to its flange, over a UR5."""
+    """Return the length of an arm from its shoulder to its flange, over that of a UR5."""
     return float(norm(arm.translation[2:]).sum()) / LENGTH_OF_UR5
 
 
@@ -299,7 +299,7 @@ def find_workspace(
 def _at_height(
     arm: SerialArm, limits: tuple[FloatArray, FloatArray], shapes: tuple[FloatArray, FloatArray], height: float
 ) -> tuple[float, Workspace] | None:
-    """Return the workspace at a height and the share of its box that is fit; None where no home is."""
+    """Return the workspace at a height and the fit share of its box; None where no home is found."""
     scale = length_scale(arm)
     centre = scale * (np.array(CENTRE) + np.array([0.0, 0.0, height]))
     pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
@@ -307,7 +307,7 @@ def _at_height(
     clear = Clearance(arm, link_tubes(arm, *shapes), lower, upper, pose, scale, BALL_RADIUS * scale)
     rng = np.random.default_rng(0)
     postures = rng.uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (STARTS, arm.n))
-    clear = replace(clear, pairs=watched_pairs(clear, postures))
+    clear = replace(clear, pairs=collision_pairs(clear, postures))
     lift = np.array([0.0, 0.0, height])
     home = _find_home(clear, scale * (np.array(HOME_POINT) + lift), postures)
     if home is None:
@@ -342,7 +342,7 @@ def _within_a_turn(q: FloatArray, clear: Clearance) -> FloatArray:
 
 
 def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArray, FloatArray]]:
-    """Return the largest box around a home of which enough is fit, with the share of it that is."""
+    """Return the largest box around a home with enough fit postures, and their share."""
     half = np.full(clear.arm.n, HALF_BOX)
     half[-1] = LAST_HALF
     unit = np.random.default_rng(1).uniform(-1.0, 1.0, (NEIGHBOURS, clear.arm.n))
@@ -379,7 +379,7 @@ def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatAr
 
 
 def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> FloatArray:
-    """Return the postures, (k+1, s, n) rad, on straight ways of the ball from (s, n) rad to a target (3,) m."""
+    """Return the postures, (k+1, s, n) rad, on straight paths of the ball from (s, n) rad to a target (3,) m."""
     q, ways = starts, [starts]
     for left in range(WAY_STEPS, 0, -1):
         ball, J = clear.arm.ball_and_jacobian(q)
@@ -389,7 +389,7 @@ def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> 
 
 
 def _stretch(clear: Clearance, home: FloatArray, point: FloatArray, postures: FloatArray) -> FloatArray:
-    """Return the posture with the least gain that is otherwise fit, of those that point at a place out of reach."""
+    """Return the otherwise fit posture with the least gain, of those that point at a position out of reach."""
     near = home + NEAR * np.random.default_rng(3).standard_normal((NEAR_STARTS, clear.arm.n))
     starts = np.clip(np.vstack([near, postures[: 2 * NEAR_STARTS]]), clear.lower, clear.upper)
     q, _ = reach_for(clear.arm, point, starts, clear.lower + 0.1, clear.upper - 0.1)

@@ -21,7 +21,7 @@ from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run import experiment
 from servobench.harness.run.episode import carry_out_together, run_experiment
 from servobench.harness.run.experiment import build, build_experiment, train_networks
-from servobench.harness.run.pose_error import pose_error
+from servobench.harness.run.outcome import pose_error
 from servobench.harness.run.references import View
 from servobench.harness.run.request import RunRequest
 from servobench.harness.run.resolution import resolve
@@ -65,10 +65,10 @@ def test_laws_and_estimators_see_a_metre_whatever_the_unit():
     seen = plant.reset(3)
     desired = experiment.scenario.reference.sampled(0.05, 100)
     for controller, unit in zip(pair, (1.0, 1000.0), strict=True):
-        controller.reset(seen.seen_as(seen.joint_position, unit * seen.feature), 0)
+        controller.reset(seen.with_values(seen.joint_position, unit * seen.feature), 0)
     for k in range(40):
         commands = [
-            controller.step(seen.seen_as(seen.joint_position, unit * seen.feature), unit * desired[k : k + 11])
+            controller.step(seen.with_values(seen.joint_position, unit * seen.feature), unit * desired[k : k + 11])
             for controller, unit in zip(pair, (1.0, 1000.0), strict=True)
         ]
         np.testing.assert_allclose(commands[1].joint_velocity, commands[0].joint_velocity, rtol=1e-6, atol=1e-9)
