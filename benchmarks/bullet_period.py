@@ -17,8 +17,9 @@ from measuring import milliseconds, print_periods
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.checks import FloatArray, whole_steps
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.bullet import BulletScene, Mechanics
+from servobench.plant.rendered.bullet import BulletScene, BulletSimulation
 from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.plants import build_bullet
 from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
@@ -26,7 +27,6 @@ from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import view_matrix
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.ur5 import nominal_ur5
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]
@@ -68,11 +68,13 @@ class PlainEnvironment:
 
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of bare periods, whole ones and those of a plain environment, (3, repeats) ms."""
-    model = nominal_ur5()
+    model = find_robot("ur5").nominal
     plant = build_bullet(config, PlantSetup(model, HOME, PERIOD))
     scenes = [BulletScene(Room(model.arm, config.scenery, find_robot("ur5"))) for _ in range(2)]
-    payloads = {"payload": config.drives.payload, "assumed_payload": config.drives.assumed_payload}
-    mechanics = Mechanics(model.arm, robot=find_robot("ur5"), **payloads)
+    stops = np.full(6, np.pi)
+    mechanics = BulletSimulation(
+        Machine(model.arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
+    )
     camera, environment = config.camera(), PlainEnvironment(scenes[1], config, model.X_BC)
     plant.reset(0)
     for scene in scenes:

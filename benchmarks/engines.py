@@ -25,7 +25,8 @@ from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import BALL_RADIUS, HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
+from servobench.plant.robot.workspace import BALL_RADIUS
 
 FIRST_SEED = 50_000
 PERIODS, STEPS, PERIOD = 40, 50, 0.05  # of a swing, of physics in a period, [s]
@@ -61,7 +62,7 @@ def swings(drives: DriveConfig, robots: int) -> tuple[FloatArray, FloatArray]:
 
 def detections(poses: int) -> FloatArray:
     """Return how far detected balls are from the true ones on both engines, and from each other, (k, 3) m."""
-    model, camera, rng = nominal_ur5(), RenderedConfig().camera(), np.random.default_rng(FIRST_SEED)
+    model, camera, rng = find_robot("ur5").nominal, RenderedConfig().camera(), np.random.default_rng(FIRST_SEED)
     scenes = [kind(Room(model.arm, False, find_robot("ur5"))) for kind in (BulletScene, MujocoScene)]
     rows = []
     for _ in range(poses):

@@ -25,7 +25,8 @@ from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.world import FmuWorld
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.ur5 import HOME
 
 CALLS = 200
 BLOCK = 128
@@ -36,7 +37,7 @@ BARE = "bare calls by ctypes: set, step, get"
 def open_plant(runs: int = 0) -> Bench:
     """Return the exported UR5 without anything around it; with `runs`, so many side by side."""
     config = Ur5FmuConfig(command_delay=0.0, sensing=SensingConfig(0.0))
-    model, start = nominal_ur5(), np.array(HOME)
+    model, start = find_robot("ur5").nominal, np.array(HOME)
     if runs:
         model, start = stack([model] * runs), np.tile(start, (runs, 1))
     return build_ur5(config, PlantSetup(model, start, PERIOD))

@@ -13,7 +13,8 @@ import numpy as np
 from measuring import PERIODS, asked_to_be_quick, microseconds, resolved_runs, table
 from servobench.harness.run.episode import carry_out_together
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.ur5 import HOME
 
 PERIOD, KEPT = 0.05, np.exp(-1.0)  # [s]; share of a joint's velocity that is left after a period
 RHO, LAMBDA = 0.287, 0.00163  # gains of the law
@@ -23,7 +24,7 @@ SOURCE = Path(__file__).with_name("bare_loop.c")
 
 def bare_numpy(runs: int) -> float:
     """Return the processor time of a period of one run [s], all runs in one array; the arms are nominal ones."""
-    rng, arm, eye, m, n = np.random.default_rng(0), nominal_ur5(), np.eye(6), 3, 6
+    rng, arm, eye, m, n = np.random.default_rng(0), find_robot("ur5").nominal, np.eye(6), 3, 6
     q = np.array(HOME) + 0.05 * rng.normal(size=(runs, n))
     v = sent = np.zeros((runs, n))
     y, J = arm.feature_and_jacobian(q)

@@ -20,14 +20,14 @@ from servobench.controllers.laws.mpc.closed_form import decay_shares, decay_targ
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.signals import Observation, trusted_observation
+from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.ur5 import nominal_ur5
 
 PROBLEMS, BLOCK, FACTOR, AGREEMENT = 60, 128, 10.0, 5e-4  # IPOPT stops some 1e-4 rad short: its barrier
 CONFIG = MpcConfig()
 BLOCK_TIME = CONFIG.horizon_time / CONFIG.moves  # [s] a period of the problem
 SHARES = decay_shares(CONFIG.moves, CONFIG.decay * BLOCK_TIME)
-MODEL = nominal_ur5()
+MODEL = find_robot("ur5").nominal
 SPEC = hand_eye_spec(MODEL, BLOCK_TIME, 1.0, 2 * np.pi)
 START = np.array([2.8, -1.4, 2.3, 2.2, -1.2, -0.2])
 

@@ -27,7 +27,7 @@ from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.rendered.world import CONTACT_STEPS
 from servobench.plant.robot import ur5
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.ur5 import BALL_RADIUS, nominal_ur5
+from servobench.plant.robot.workspace import BALL_RADIUS
 
 HOME = np.array(ur5.HOME)
 PERIOD = 0.05  # [s]
@@ -46,7 +46,7 @@ class BareCalls:
 
     def __init__(self, config: RenderedConfig) -> None:
         """Open a scene and a simulation of their own."""
-        self._model, self._camera = nominal_ur5(), config.camera()
+        self._model, self._camera = find_robot("ur5").nominal, config.camera()
         arm, stops = self._model.arm, np.full(6, config.joint_range)
         machine = Machine(arm, find_robot("ur5"), (), config.drives, config.lag, HOME, (-stops, stops))
         self._simulation = MujocoSimulation(machine)
@@ -85,7 +85,7 @@ class BareCalls:
 
 def measure(config: RenderedConfig, repeats: int) -> FloatArray:
     """Return the times of `KINDS`, (5 or 6, repeats) ms; without PyBullet the last one is missing."""
-    setup, bare = PlantSetup(nominal_ur5(), HOME, PERIOD), BareCalls(config)
+    setup, bare = PlantSetup(find_robot("ur5").nominal, HOME, PERIOD), BareCalls(config)
     plants = [build_mujoco(config, setup)]
     if find_spec("pybullet") is not None:
         from servobench.plant.rendered.plants import build_bullet

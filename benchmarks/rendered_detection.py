@@ -15,12 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from measuring import asked_to_be_quick, table
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.rendered.bullet import BulletScene
-from servobench.plant.rendered.detectors import open_sight
+from servobench.plant.rendered.detectors import open_detector
 from servobench.plant.rendered.room import Rig, Room
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.catalogue import find_robot
@@ -33,12 +33,12 @@ ROBOT = find_robot("ur5")
 NOISELESS = replace(RenderedConfig(), colour_noise=0.0)
 
 
-def true_model(word: str, seed: int) -> EyeModel:
+def true_model(word: str, seed: int) -> SetupModel:
     """Return a true UR5 and its cameras."""
     drawn = named_seed(seed, "mismatch")
     arm, sample = sample_mismatch(MODERATE, ROBOT, drawn)
     model, _ = Sensing.parse(word).true(ROBOT, arm, sample, MODERATE, drawn)
-    if not isinstance(model, EyeModel):
+    if not isinstance(model, SetupModel):
         raise TypeError(f"sensing {word} has no pixels")
     return model
 
@@ -47,22 +47,22 @@ def measure(word: str, seed: int, poses: int) -> tuple[FloatArray, FloatArray, f
     """Return true and found pixels (poses, c, p, 2), NaN where a mark is not found, and the time of a look [ms]."""
     model, rng = true_model(word, seed), np.random.default_rng(seed)
     scene = BulletScene(Room(model.arm, NOISELESS.scenery, robot=ROBOT, rig=Rig.of(model, ROBOT)))
-    sight, work, took = open_sight(model, scene, NOISELESS, ROBOT), ROBOT.workspace, 0.0
-    sight.reset(seed)
+    detector, work, took = open_detector(model, scene, NOISELESS, ROBOT), ROBOT.workspace, 0.0
+    detector.reset(seed)
     true, found = [], []
     while len(true) < poses:
         q = rng.uniform(work.lower, work.upper)
-        exact, _, in_view = model.look(q)
+        exact, _, in_view = model.observe(q)
         if not in_view.all():
             continue
         scene.place(model.arm.joint_angle(q))
         began = time.process_time()
-        seen = sight.see(model, q)
+        seen, valid = detector.measure(model, q)
         took += time.process_time() - began
         true.append(exact)
-        found.append(np.where(sight.visible(), seen, np.nan))
+        found.append(np.where(valid, seen, np.nan))
     scene.close()
-    shape = (poses, model.eye.cameras, len(model.target), 2)
+    shape = (poses, model.setup.cameras, len(model.target), 2)
     return np.reshape(true, shape), np.reshape(found, shape), 1e3 * took / poses
 
 

@@ -129,7 +129,7 @@ class Servo:
     def _natural(self, observation: Observation) -> Observation:
         if self._unit == 1.0:
             return observation
-        return observation.seen_as(observation.joint_position, observation.feature / self._unit)
+        return observation.with_values(observation.joint_position, observation.feature / self._unit)
 
     def _probe(self, both: tuple[ServoState, FloatArray], observation: Observation) -> tuple[ServoState, FloatArray]:
         initial, velocity, done = self.initial.step(both[0].initial, observation)
@@ -159,7 +159,7 @@ class Servo:
         if self.predictor is not None:
             past = self._past(self.predictor, estimation.learned.pair, observation)
             predictor, bound = self.predictor.predict(predictor, J, past, observation)
-            ahead = observation.seen_as(bound.joint_position, bound.feature)
+            ahead = observation.with_values(bound.joint_position, bound.feature)
             later = shifted(reference, bound.lead, self._rows)
         forward: FloatArray = np.zeros(())
         if self._feeds_forward:
@@ -195,7 +195,7 @@ class Servo:
         if self._turns:
             T = self.estimation.into_model_frame(estimation, ahead)
             J, reference = T @ J, reference @ T.mT
-            ahead = ahead.seen_as(ahead.joint_position, np.vecmat(ahead.feature, T.mT))
+            ahead = ahead.with_values(ahead.joint_position, np.vecmat(ahead.feature, T.mT))
         return self.law.command(state.law, Estimate(J), ahead, reference)
 
     def diagnostics(self, state: ServoState) -> Diagnostics:

@@ -14,10 +14,10 @@ from servobench.fmus.product import Product, c_files, check_version, documentati
 from servobench.fmus.reference import COMMAND, reference_run, table
 from servobench.fmus.sources import arm_constants, kinematics_source
 from servobench.fmus.variables import Actuation, ArmLayout, View, arm_groups, parameters_of
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.robot.catalogue import find_robot
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
@@ -47,7 +47,7 @@ class ExportOptions:
     """
 
     fmi_version: int = 2
-    model: SensedArm = field(default_factory=lambda: find_robot(UR5).nominal)
+    model: RobotModel = field(default_factory=lambda: find_robot(UR5).nominal)
     actuation: Actuation = field(default_factory=default_actuation)
     platforms: tuple[Platform, ...] = field(default_factory=lambda: (this_platform(),))
     mismatch: str = "none"
@@ -62,7 +62,7 @@ class ExportOptions:
     @property
     def view(self) -> View | None:
         """The sensing set-up; None for the ball in 3-D by a fixed camera."""
-        return View.of(self.model) if isinstance(self.model, EyeModel) else None
+        return View.of(self.model) if isinstance(self.model, SetupModel) else None
 
     @property
     def layout(self) -> ArmLayout:
@@ -80,7 +80,7 @@ class ExportOptions:
     def title(self) -> str:
         """Name of the model."""
         view = self.view
-        seen = "" if view is None else f", seen by {view.eye.name}{' on the hand' if view.mount == 'hand' else ''}"
+        seen = "" if view is None else f", seen by {view.setup.name}{' on the hand' if view.mount == 'hand' else ''}"
         return f"{self.robot.title} with mismatched kinematics{seen}"
 
     @property

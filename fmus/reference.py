@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from servobench.fmus.variables import FEATURE, SEEN, Actuation, Layout
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.kinematic import discretise_lag
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 
 STEP = 0.05  # [s]
 STEPS = 200
@@ -38,7 +38,7 @@ class ReferenceRun:
     outputs: dict[str, FloatArray]
 
 
-def reference_run(model: SensedArm, actuation: Actuation) -> ReferenceRun:
+def reference_run(model: RobotModel, actuation: Actuation) -> ReferenceRun:
     """Return the reference run of `model`; some of its commands exceed the speed limit."""
     n = model.arm.n
     stops = actuation.stops(n)
@@ -65,11 +65,11 @@ def reference_run(model: SensedArm, actuation: Actuation) -> ReferenceRun:
     return ReferenceRun(np.arange(STEPS + 1, dtype=np.float64) * STEP, wanted, outputs)
 
 
-def _features(model: SensedArm, positions: FloatArray) -> dict[str, FloatArray]:
+def _features(model: RobotModel, positions: FloatArray) -> dict[str, FloatArray]:
     """Return the features at joint positions (k, n), (k, size) by name."""
-    if not isinstance(model, EyeModel):
+    if not isinstance(model, SetupModel):
         return {"ball_position": model.feature(positions), SEEN: np.ones((len(positions), 3))}
-    feature, _, seen = model.look(positions)
+    feature, _, seen = model.observe(positions)
     return {FEATURE: feature, SEEN: seen.astype(np.float64)}
 
 

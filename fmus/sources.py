@@ -25,12 +25,12 @@ from servobench.plant.cameras.optics import Optics
 from servobench.plant.cameras.symbolic import (
     SX,
     ArmGeometry,
-    EyeGeometry,
     HandEyeGeometry,
+    SetupGeometry,
     feature_and_jacobian,
     features,
     points_in_cameras,
-    seen_features,
+    valid_features,
 )
 from servobench.plant.contract.checks import FloatArray
 
@@ -150,8 +150,8 @@ def _equations(layout: ArmLayout, q: SX, p: SX) -> tuple[SX, SX]:
         return casadi.vertcat(feature, casadi.SX.ones(feature.numel())), jacobian
     geometry = _view(part, arm, view)
     points = points_in_cameras(q, geometry, view.mount)
-    feature = features(points, geometry.optics, view.eye)
-    seen = seen_features(points, geometry.optics, view.eye)
+    feature = features(points, geometry.optics, view.setup)
+    seen = valid_features(points, geometry.optics, view.setup)
     return casadi.vertcat(feature, seen), casadi.jacobian(feature, q)
 
 
@@ -166,8 +166,8 @@ def _arm(part: Mapping[str, SX]) -> ArmGeometry:
     )
 
 
-def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> EyeGeometry:
-    c = view.eye.cameras
+def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> SetupGeometry:
+    c = view.setup.cameras
     optics = Optics(
         _objects(part["focal_length"], (c,)),
         _objects(part["principal_point"], (c, 2)),
@@ -176,7 +176,7 @@ def _view(part: Mapping[str, SX], arm: ArmGeometry, view: View) -> EyeGeometry:
     )
     positions, angles = (casadi.vertsplit(part[name], 3) for name in ("camera_position", "camera_rpy"))
     poses = [(_rotation(rpy), position) for rpy, position in zip(angles, positions, strict=True)]
-    return EyeGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
+    return SetupGeometry(arm, casadi.vertsplit(part["target"], 3), poses, optics)
 
 
 def _objects(values: SX, shape: tuple[int, ...]) -> npt.NDArray[Any]:

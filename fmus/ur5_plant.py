@@ -13,7 +13,7 @@ from servobench.fmus.export import export_fmu, fingerprint, nominal_options
 from servobench.fmus.variables import FEATURE, SEEN, Actuation, View, parameters_of
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.registry import Sensing
 from servobench.plant.contract.cache import cached
 from servobench.plant.contract.sensing import SensingConfig
@@ -72,7 +72,7 @@ def cached_fmu(fmi_version: int, robot: Robot | None = None, sensing: Sensing | 
 def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMapping:
     """Return the mapping of the exported arm, with the true model of `setup` as its parameters, (..., size)."""
     model, start = setup.robot()
-    view = View.of(model) if isinstance(model, EyeModel) else None
+    view = View.of(model) if isinstance(model, SetupModel) else None
     lag, n = config.joint_lags or (config.lag,), model.arm.n
     if len(lag) not in {1, n}:
         raise ValueError(f"joint_lags must have {n} numbers or none, got {len(lag)}")
@@ -89,7 +89,7 @@ def ur5_mapping(path: Path, config: Ur5FmuConfig, setup: PlantSetup) -> FmuMappi
         seen=() if view is None else (SEEN,),
         truth=TruthMapping(jacobian=("jacobian",)),
         home="home",
-        camera=("camera_position", "camera_rpy") if view is None or view.eye.cameras == 1 else None,
+        camera=("camera_position", "camera_rpy") if view is None or view.setup.cameras == 1 else None,
         parameters=parameters,
         limits=JointLimits(stops.speed, stops.lower, stops.upper),
         names=LogNames(model.arm.joint_names, model.channel.names, model.channel.unit),
@@ -104,7 +104,7 @@ def build_ur5(config: Ur5FmuConfig, setup: PlantSetup) -> Bench:
             no compiler, or no place in the cache folder.
     """
     model, _ = setup.robot()
-    sensing = Sensing(model.eye, model.mount) if isinstance(model, EyeModel) else None
+    sensing = Sensing(model.setup, model.mount) if isinstance(model, SetupModel) else None
     try:
         path = cached_fmu(config.fmi_version, setup.nominal, sensing)
     except ValueError as error:

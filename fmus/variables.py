@@ -17,11 +17,11 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.model import EyeModel, Mount
+from servobench.plant.cameras.model import Mount, SetupModel
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.robot.arm import JointLimits, narrowed, rpy_from_rotation
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 
 PARAMETER, FIXED, INPUT, STATE = "parameter", "fixed parameter", "input", "state"
 DERIVATIVE, INDICATOR, OUTPUT, SAMPLED = "derivative", "event indicator", "output", "sampled output"
@@ -72,33 +72,33 @@ class View(NamedTuple):
     A set-up takes the place of the ball, its fixed camera and its position in the table of variables.
 
     Attributes:
-        eye: the set-up.
+        setup: the set-up.
         mount: of its cameras.
         size: width and height of the images [px].
     """
 
-    eye: Eye
+    setup: SensingSetup
     mount: Mount
     size: tuple[float, float]
 
     @classmethod
-    def of(cls, model: EyeModel) -> Self:
+    def of(cls, model: SetupModel) -> Self:
         """Return the view of an arm and its cameras."""
-        return cls(model.eye, model.mount, model.optics.size)
+        return cls(model.setup, model.mount, model.optics.size)
 
     @property
     def word(self) -> str:
         """Name of set-up and mount, as a word of C."""
-        return self.eye.name if self.mount == "fixed" else f"{self.eye.name}_{self.mount}"
+        return self.setup.name if self.mount == "fixed" else f"{self.setup.name}_{self.mount}"
 
     @property
     def setting(self) -> str:
         """Features and place of the cameras, for descriptions."""
-        return f"{self.eye.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
+        return f"{self.setup.summary}, {'beside the arm' if self.mount == 'fixed' else 'on the hand'}"
 
     def parameters(self) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
         """Return name, shape, unit and description of each kinematic parameter of target and cameras, in order."""
-        c, p = self.eye.cameras, len(self.eye.target)
+        c, p = self.setup.cameras, len(self.setup.target)
         on, off = ("base", "flange") if self.mount == "fixed" else ("flange", "base")
         return (
             ("target", (p, 3), "m", f"Points of the target in the {off} frame."),
@@ -111,8 +111,8 @@ class View(NamedTuple):
 
     def outputs(self, n: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
         """Return name, shape, unit and description of each output of an arm with `n` joints."""
-        m, unit = self.eye.m, self.eye.unit
-        names = ", ".join(self.eye.features)
+        m, unit = self.setup.m, self.setup.unit
+        names = ", ".join(self.setup.features)
         return (
             (FEATURE, (m,), unit, f"Measured features: {names}."),
             (SEEN, (m,), "1", "1 where a camera sees the feature, with nothing in between; 0 elsewhere."),
@@ -120,7 +120,7 @@ class View(NamedTuple):
         )
 
 
-def view_parameters(model: EyeModel) -> dict[str, FloatArray]:
+def view_parameters(model: SetupModel) -> dict[str, FloatArray]:
     """Return the values of the parameters of target and cameras by name, (..., size)."""
 
     def flat(values: FloatArray, axes: int) -> FloatArray:
@@ -275,7 +275,7 @@ class Actuation:
         return narrowed(self.limits, n, self.max_speed, self.joint_range)
 
 
-def parameters_of(model: SensedArm, actuation: Actuation) -> dict[str, FloatArray]:
+def parameters_of(model: RobotModel, actuation: Actuation) -> dict[str, FloatArray]:
     """Return the FMU's parameters for `model` and `actuation` by group, (..., size)."""
     arm, n = model.arm, model.arm.n
     stops = actuation.stops(n)
@@ -298,8 +298,8 @@ def parameters_of(model: SensedArm, actuation: Actuation) -> dict[str, FloatArra
     }
 
 
-def _sensing_parameters(model: SensedArm) -> dict[str, FloatArray]:
-    if isinstance(model, EyeModel):
+def _sensing_parameters(model: RobotModel) -> dict[str, FloatArray]:
+    if isinstance(model, SetupModel):
         return view_parameters(model)
     pose = model.camera
     return {

@@ -25,7 +25,7 @@ from servobench.plant.contract.seeds import Seeds
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.contract.settings import NonNegative, Positive, nested, settings
 from servobench.plant.contract.signals import BoolArray, Truth
-from servobench.plant.robot.hand_eye import SensedArm, hand_eye_spec
+from servobench.plant.robot.hand_eye import RobotModel, hand_eye_spec
 
 
 @settings
@@ -70,7 +70,7 @@ class KinematicState(NamedTuple):
         v: (..., n), rad/s.
     """
 
-    model: SensedArm
+    model: RobotModel
     q: FloatArray
     v: FloatArray
 
@@ -116,14 +116,14 @@ class KinematicWorld(World):
         return self.truth().feature
 
     def visible(self) -> BoolArray | None:
-        """Return which features the cameras see; see `World.visible`."""
+        """Return which features are valid; see `World.visible`."""
         self.truth()
         return self._seen
 
     def truth(self) -> Truth:
         """Return feature and Jacobian of the true model, computed once a period."""
         if self._truth is None:
-            feature, jacobian, self._seen = self._model.look(self._q)
+            feature, jacobian, self._seen = self._model.observe(self._q)
             self._truth = Truth(feature, jacobian)
         return self._truth
 
@@ -146,7 +146,7 @@ class KinematicWorld(World):
         self.restore(take(self.save(), lanes))
 
     def _rest(self, q: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Let the lanes rest whose new joint positions, (..., n) rad, are not finite."""
+        """Stop the lanes whose new joint positions, (..., n) rad, are not finite."""
         bad = ~np.isfinite(q).all(axis=-1)
         for lane in np.flatnonzero(bad).tolist():
             reached = q.reshape(-1, self.spec.n)[lane]
@@ -154,7 +154,7 @@ class KinematicWorld(World):
         return where(bad, self._q, q), where(bad, np.zeros_like(v), v)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """There are no resources to free."""
 
 
 def build_kinematic(config: KinematicConfig, setup: PlantSetup) -> Bench:

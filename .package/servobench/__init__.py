@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from servobench.harness.batch.api import Results, compare, load, run
     from servobench.harness.check.controllers import check_controller
     from servobench.harness.check.plants import check_plant
+    from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting
     from servobench.plant.bench.plant import Plant, PlantEntry, PlantSetup, World
     from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 
@@ -31,6 +32,10 @@ __all__ = [
     "PlantSpec",
     "Results",
     "RobotKnowledge",
+    "Scenario",
+    "Task",
+    "TaskEntry",
+    "TaskSetting",
     "Truth",
     "World",
     "check_controller",
@@ -45,6 +50,7 @@ _HOMES = {
     "servobench.harness.batch.api": ("Results", "compare", "load", "run"),
     "servobench.harness.check.controllers": ("check_controller",),
     "servobench.harness.check.plants": ("check_plant",),
+    "servobench.harness.run.scenario": ("Scenario", "Task", "TaskEntry", "TaskSetting"),
     "servobench.plant.bench.plant": ("Plant", "PlantEntry", "PlantSetup", "World"),
     "servobench.plant.contract.signals": ("Command", "Observation", "PlantSpec", "Truth"),
 }

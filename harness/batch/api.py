@@ -26,6 +26,7 @@ from servobench.harness.run.episode import run_experiment
 from servobench.harness.run.request import RunRequest, read_mismatch, read_seed
 from servobench.harness.run.resolution import check_settings
 from servobench.harness.run.result import RunResult
+from servobench.harness.run.tasks import choose_task
 from servobench.plant.bench.plant import Plant, PlantEntry, World
 from servobench.plant.cameras.registry import DEFAULT_SENSING
 
@@ -66,7 +67,7 @@ def run(
         plant: a name such as "bullet"; a place such as "./cell.py" or "./cell.py:Cell"; a subclass of `Plant` or
             `World`, which is constructed as `cls(setup)` with a `PlantSetup`, or as `cls(config, setup)`; or a
             `PlantEntry`.
-        task: name of the task.
+        task: name of a task, or a place such as "./spiral.py" or "./spiral.py:Spiral".
         mismatch: difference between the true robot and the nominal model, such as "moderate" or "links=10%".
         robot: name such as "ur10e" or "panda", or the path of a file: a factory calibration, a DH table or a URDF.
         sensing: set-up such as "pixel", "stereo:hand" or "./polar.py", where the plant has it.
@@ -80,7 +81,7 @@ def run(
         ConfigurationError: a name, setting or mismatch that cannot be used; it is a ValueError.
     """
     with offering():
-        place = _plant_name(plant), _name(controller), task, read_mismatch(mismatch), seed
+        place = _plant_name(plant), _name(controller), _task_name(task), read_mismatch(mismatch), seed
         request = RunRequest(*place, robot=robot, sensing=sensing)
         given = Settings(settings or {})
         check_settings(given, [request.plant, request.controller, request.task])
@@ -112,7 +113,7 @@ def compare(
     Args:
         controllers: names, places, classes, objects or entries; see `run`.
         plants: names, places, classes or entries; see `run`.
-        tasks: names of tasks.
+        tasks: names or places of tasks.
         mismatches: such as "moderate".
         seeds: a number of seeds from 0 on, or the seeds.
         robot: see `run`.
@@ -140,9 +141,9 @@ def compare(
     with offering():
         names = tuple(_name(each) for each in controllers)
         worlds = tuple(_plant_name(each) for each in plants)
-        batch = Batch(worlds, names, tuple(tasks), tuple(mismatches), chosen, robot, tuple(sensings))
+        batch = Batch(worlds, names, tuple(map(_task_name, tasks)), tuple(mismatches), chosen, robot, tuple(sensings))
         how = Execution(workers, None, Bounds(run_timeout, run_memory, isolate), resume)
-        if not _can_travel(offered([*worlds, *names])):
+        if not _can_travel(offered([*worlds, *names, *batch.tasks])):
             how = Execution(1, None, Bounds(isolate=False), resume)
         return _rows(batch, Settings(settings or {}), out, how)
 
@@ -202,6 +203,10 @@ def _name(given: AnyController) -> str:
 def _plant_name(given: AnyPlant) -> str:
     """Return the name by which a plant is found, one given as an object from now on."""
     return choose_plant(given) if isinstance(given, str) else offer(own_object(PLANT, given))
+
+
+def _task_name(given: str) -> str:
+    return choose_task(given) if isinstance(given, str) else given  # a request refuses the others
 
 
 def _can_travel(own: tuple[Offer, ...]) -> bool:

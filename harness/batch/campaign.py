@@ -35,7 +35,12 @@ from servobench.harness.run.result import RunResult
 
 Row = dict[str, Any]
 NAMES: Final = ("plants", "controllers", "tasks", "mismatches", "seeds")  # entries of a manifest that say what runs
-SOURCES: Final = ("own_controllers", "own_plants", "plugins")  # entries that have the hash of code by its name
+SOURCES: Final = (
+    "own_controllers",
+    "own_plants",
+    "own_tasks",
+    "plugins",
+)  # entries that have the hash of code by its name
 REST: Final = "noise, latencies, periods, axes that are varied, or the command"  # of which a manifest has a digest only
 
 
@@ -109,7 +114,7 @@ def carry_out(campaign: Campaign, folder: Path, how: Execution = Execution()) ->
     elif not is_unused(folder):
         check_resumable(folder)
     runs = survey(Grid(_request, campaign.cells))
-    own = offered([*runs.plants, *runs.controllers])
+    own = offered([*runs.plants, *runs.controllers, *runs.tasks])
     bounds = replace(how.bounds, isolate=how.bounds.isolate and not how.debug)
     names = {"plants": runs.plants, "controllers": runs.controllers}
     trusted = [name for name, section in campaign.settings.sections.items() if section.get("isolate") is False]
@@ -156,7 +161,7 @@ def check_campaign(campaign: Campaign, runs: Survey, observer: Observer, place: 
     check_settings(campaign.settings, [*runs.plants, *runs.controllers, *runs.tasks])
     check_effects(campaign.settings, runs.examples, steps=campaign.steps)
     sections = resolve_sections(runs.examples, campaign.settings)
-    own = offered([*runs.plants, *runs.controllers])
+    own = offered([*runs.plants, *runs.controllers, *runs.tasks])
     for index, request in enumerate(runs.examples):
         job = Job(index, Cell(request), select(request, sections))
         if job.owner and place.submit is not None and not place.cluster:
@@ -333,7 +338,7 @@ def changed_source(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
         if there.get("files", {}).get(name, digest) != digest:
             return str(name)
     for key in SOURCES:
-        for name, record in here[key].items():
+        for name, record in here.get(key, {}).items():
             if record.get("sha256") != there.get(key, {}).get(name, record).get("sha256"):
                 return str(record["place"])
     return ""

@@ -18,6 +18,7 @@ from servobench.harness.config.registry import MAPPED, Offer, find_plant, publis
 from servobench.harness.config.robots import find_robot, find_sensing, sensing_file, sensing_place
 from servobench.harness.config.settings import flatten
 from servobench.harness.config.source import PLACE, digest_of_module, neighbours
+from servobench.harness.run.tasks import published_task
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.files import read_toml, user_path
 from servobench.plant.robot.mismatch import Mismatch
@@ -40,6 +41,7 @@ PACKAGES = (
 OWN = {  # keys of the place and the hash of what users gave as a file or an object, by what it is
     "controller": "own_controllers",
     "plant": "own_plants",
+    "task": "own_tasks",
 }
 
 
@@ -87,22 +89,19 @@ def describe_batch(
 
 
 def _plugins(runs: Survey) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield names of controllers and plants that others have installed, and what a manifest says about each."""
-    kinds: tuple[tuple[type[ControllerEntry | PlantEntry], Iterable[str]], ...] = (
-        (ControllerEntry, runs.controllers),
-        (PlantEntry, runs.plants),
-    )
-    for kind, names in kinds:
-        for name in names:
-            point = published(kind, name)
-            if point is not None:
-                made = f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
-                yield name, {"place": point.value, "distribution": made, "sha256": digest_of_module(point.module)}
+    """Yield names of controllers, plants and tasks that others have installed, and the record of each."""
+    points = {name: published(ControllerEntry, name) for name in runs.controllers}
+    points |= {name: published(PlantEntry, name) for name in runs.plants}
+    points |= {name: published_task(name) for name in runs.tasks}
+    for name, point in points.items():
+        if point is not None:
+            made = f"{point.dist.name} {point.dist.version}" if point.dist is not None else "unknown"
+            yield name, {"place": point.value, "distribution": made, "sha256": digest_of_module(point.module)}
 
 
 def describe_sensing(word: str) -> dict[str, Any]:
     """Return what a manifest says about a sensing set-up: its features."""
-    eye = find_sensing(word).eye
+    eye = find_sensing(word).setup
     return {"name": word, "features": list(eye.features), "unit": eye.unit, "cameras": eye.cameras}
 
 

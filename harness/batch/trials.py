@@ -34,7 +34,7 @@ from servobench.harness.run.experiment import build
 from servobench.harness.run.request import RunRequest, RunSettings, read_mismatch
 from servobench.harness.run.resolution import resolve
 from servobench.harness.run.result import TIMED_OUT, Ending
-from servobench.harness.run.tasks import TASKS
+from servobench.harness.run.tasks import task_names
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
 from servobench.plant.contract.faults import FmuError, RunFault
 from servobench.plant.contract.files import user_path
@@ -216,12 +216,12 @@ class _Kind:
         """Return the result of a trial; it is built for a robot if there is one."""
         try:
             entry = self.find(name)
-            if robot is not None and name not in TASKS:
+            if robot is not None and name not in task_names():
                 with contextlib.suppress(RunFault, _Trains):  # the run's row will report a fault
                     self.build(name, robot)
         except ConfigurationError as error:
             return Tried(name, fault=str(error))
-        if name in TASKS:
+        if name in task_names():
             return Tried(name, fault=f"a task is called {name!r}, too; give the {self.word} another name")
         return Tried(name, str(entry.summary))
 

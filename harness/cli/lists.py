@@ -68,21 +68,22 @@ def tasks(
 ) -> None:
     """List the tasks, or show the settings of one."""
     from servobench.harness.config.robots import find_robot
-    from servobench.harness.run.tasks import TASKS, fitted
+    from servobench.harness.run.tasks import choose_task, find_task, fitted, task_names
 
     if name:
+        name = choose_task(name)
         _show_settings(name, fitted(name, find_robot(robot)), as_json=as_json)
     elif robot != DEFAULT_ROBOT:
         refuse("--robot shows the settings of one task for that arm; name the task, such as exp1")
     else:
-        _show_names([_described(name, entry.summary) for name, entry in TASKS.items()], as_json=as_json)
+        _show_names([_described(name, find_task(name).summary) for name in task_names()], as_json=as_json)
 
 
 def sensing(as_json: JsonOption = False) -> None:
     """List the sensing set-ups: features that cameras measure."""
-    from servobench.plant.cameras.registry import EYES
+    from servobench.plant.cameras.registry import SETUPS
 
-    _show_names([_described(name, entry.summary) for name, entry in EYES.items()], as_json=as_json)
+    _show_names([_described(name, entry.summary) for name, entry in SETUPS.items()], as_json=as_json)
     if not as_json:
         console.print("\nEach with fixed cameras or with cameras on the hand, as pixel:hand; or a file of your own.")
 
@@ -111,7 +112,7 @@ def init(
     nominal = read_mismatch("none")
     requests = [RunRequest(*each, nominal, 0, robot=robot) for each in product(*names)]
     settings = overrides.settings()
-    settings.check_sections([*known_sections(), *names[0], *names[1]])
+    settings.check_sections([*known_sections(), *names[0], *names[1], *names[2]])
     finds: dict[str, Callable[[str], Any]] = {"plant": find_plant, "controller": find_controller, "task": find_task}
     titles = {"run": "common to all plants, controllers and tasks"} | {
         name: f"{kind}: {find(name).summary}"

@@ -80,6 +80,7 @@ def run(
     """
     from servobench.harness.batch.campaign import Execution, comparison
     from servobench.harness.batch.plan import Batch, parse_seeds
+    from servobench.harness.run.tasks import choose_task
 
     if None not in (method, controller) and method != controller:
         refuse(f"two controllers are named, {method} and --controller {controller}; a run has one")
@@ -89,7 +90,7 @@ def run(
     law = next((each for each in (method, controller) if each is not None), DEFAULT_CONTROLLER)
     name = selection.known_controller(law if estimator is None else f"{law}+{estimator}")
     seeds = parse_seeds(f"{seed},")
-    batch = Batch((plant,), (name,), (task,), (mismatch,), seeds, robot, (sensing,))
+    batch = Batch((plant,), (name,), (choose_task(task),), (mismatch,), seeds, robot, (sensing,))
     campaign = comparison(batch, overrides.settings(*["bullet.view=true"] * view))
     how = Execution(workers=1, bounds=limited.bounds(), debug=debug)
     _carry_out(campaign, out, how, with_report=with_report, strict=True)

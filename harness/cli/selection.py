@@ -32,9 +32,9 @@ def complete_controllers(incomplete: str) -> list[str]:
 
 def complete_tasks(incomplete: str) -> list[str]:
     """Return the tasks whose names begin so."""
-    from servobench.harness.run.tasks import TASKS
+    from servobench.harness.run.tasks import task_names
 
-    return _matching(incomplete, TASKS)
+    return _matching(incomplete, task_names())
 
 
 def complete_sensings(incomplete: str) -> list[str]:
@@ -199,9 +199,10 @@ def _usable(all_of_them: Sequence[Tried]) -> list[str]:
 
 def split_tasks(text: str) -> tuple[str, ...]:
     """Return the names of tasks, each looked up."""
-    from servobench.harness.run.tasks import TASKS, find_task
+    from servobench.harness.run.tasks import choose_task, find_task, task_names
 
-    return split_names("tasks", text, list(TASKS), find_task)
+    words = [word if word == "all" else choose_task(word) for word in split_words(text)]
+    return split_names("tasks", ",".join(words), task_names(), find_task)
 
 
 def split_mismatches(text: str) -> tuple[str, ...]:

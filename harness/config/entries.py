@@ -40,6 +40,7 @@ class Kind(Generic[Entry]):
         argument: what a constructor takes beside settings.
         wanted: what may be given, in words.
         of_class: makes an entry of a class and that of its settings, None if it takes none.
+        make: makes an entry of a given object, its place and a name or None; None for `make_entry`.
     """
 
     word: str
@@ -48,6 +49,7 @@ class Kind(Generic[Entry]):
     argument: str
     wanted: str
     of_class: Callable[[type[Any], type[Any] | None], Entry]
+    make: Callable[[object, str, str | None], Entry] | None = None
 
 
 def _controller_of(kind: type[Any], config: type[Any] | None) -> ControllerEntry:
@@ -277,7 +279,10 @@ def read_own(kind: Kind[Entry], text: str) -> Own[Entry]:
         source, module = None, import_user_module(found["module"])
         given = _pick(kind, module, found["module"], found["attribute"])
         file, digest = Path(module.__file__ or found["module"]), digest_of_module(found["module"])
-    entry = make_entry(kind, given, place, found["alias"])
+    if kind.make is None:
+        entry = make_entry(kind, given, place, found["alias"])
+    else:
+        entry = kind.make(given, place, found["alias"])
     return Own(kind.word, entry, place, source, str(file), digest)
 
 

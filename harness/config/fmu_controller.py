@@ -67,7 +67,7 @@ class ControllerMapping:
     parameters: Mapping[str, Values] = nested(dict)
     """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
     tolerance: Positive | None = None
-    """[1] relative one of the FMU's own solver; None for what it takes by itself."""
+    """[1] relative one of the FMU's own solver; None for the solver's own."""
     debug_log: File | None = None
     """A file to which all messages of the FMU are appended, with its debug log turned on; None: it is off."""
 
@@ -98,8 +98,8 @@ class FmuController(Controller):
                   for name, each in mapping.parameters.items())  # fmt: skip
         setters = ((variables[0], setter(variables, name, each, ())) for variables, name, each in values)
         self._setters = [act for _, act in sorted(setters, key=lambda pair: pair[0].causality != STRUCTURAL)]
-        asked = InstanceOptions(mapping.tolerance, mapping.debug_log)
-        self._instance = open_instance(self._description, root, asked=asked)
+        options = InstanceOptions(mapping.tolerance, mapping.debug_log)
+        self._instance = open_instance(self._description, root, options=options)
         weakref.finalize(self, self._instance.close)
         roles = (mapping.joints, mapping.features, mapping.seen, mapping.reference)
         self._given = tuple(bool(names) for names in roles)
@@ -180,7 +180,7 @@ class FmuController(Controller):
             raise ValueError(
                 f"{self._description.path.name} cannot serialise its state (canSerializeFMUstate is false)"
             )
-        return FmuControllerState(self._instance.states.save_bytes())
+        return FmuControllerState(self._instance.save_bytes())
 
     def restore(self, state: object) -> None:
         """Go back to a state that `save` returned.
@@ -191,7 +191,7 @@ class FmuController(Controller):
         """
         if not isinstance(state, FmuControllerState):
             raise TypeError(f"state must come from save, got {type(state).__name__}")
-        self._instance.states.restore_bytes(state.content)
+        self._instance.restore_bytes(state.content)
 
 
 def mapped_controller(path: Path, name: str) -> ControllerEntry:

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from servobench.controllers.controller import ControllerEntry
 from servobench.controllers.methods import METHODS, compose, suggest_pair
@@ -54,7 +54,7 @@ NOT_COMPOSED = {"nmpc_calibrated": "servobench.controllers.nmpc_calibrated:ENTRY
 CONTROLLERS = (*METHODS, *NOT_COMPOSED)
 
 
-Offer: TypeAlias = Own[ControllerEntry] | Own[PlantEntry]
+Offer: TypeAlias = Own[ControllerEntry] | Own[PlantEntry] | Own[Any]
 
 _OFFERED: dict[str, Offer] = {}
 

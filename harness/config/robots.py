@@ -8,8 +8,8 @@ from typing import Final
 
 from servobench.harness.config.settings import ConfigurationError
 from servobench.harness.config.source import PLACE, SourceFile
-from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
+from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.robot import catalogue, ur5
 from servobench.plant.robot.robot import Robot
 
@@ -36,7 +36,7 @@ def find_robot(name: str) -> Robot:
 
 def sensing_names() -> list[str]:
     """Return the words of all sensing set-ups of this package, each with fixed cameras and with cameras on the hand."""
-    return [str(Sensing(eye, mount)) for eye in EYES.values() for mount in (FIXED, HAND)]
+    return [str(Sensing(setup, mount)) for setup in SETUPS.values() for mount in (FIXED, HAND)]
 
 
 def find_sensing(word: str) -> Sensing:
@@ -53,7 +53,7 @@ def _find(word: str, file: SourceFile | None) -> Sensing:
     place, found = _place(word)
     own = {} if file is None or found is None else {place: _pick(file, found["file"], found["name"])}
     try:
-        return Sensing.parse(word, {**EYES, **own})
+        return Sensing.parse(word, {**SETUPS, **own})
     except ValueError as error:
         raise ConfigurationError(str(error)) from error
 
@@ -76,16 +76,20 @@ def _place(word: str) -> tuple[str, re.Match[str] | None]:
     return place, PLACE.fullmatch(place)
 
 
-def _pick(source: SourceFile, file: str, name: str | None) -> Eye:
+def _pick(source: SourceFile, file: str, name: str | None) -> SensingSetup:
     """Return the set-up called `name` that a file defines, or without a name its only one."""
-    module, known = source.load(), EYES.values()
-    found = {key: value for key, value in vars(module).items() if isinstance(value, Eye) and value not in known}
+    module, known = source.load(), SETUPS.values()
+    found = {
+        key: value for key, value in vars(module).items() if isinstance(value, SensingSetup) and value not in known
+    }
     if name is None and len(found) == 1:
         return next(iter(found.values()))
     if name in found:
         return found[name]
     if not found:
-        raise ConfigurationError(f"{file} defines no sensing set-up: no object of servobench.plant.cameras.eye.Eye")
+        raise ConfigurationError(
+            f"{file} defines no sensing set-up: no object of servobench.plant.cameras.setups.SensingSetup"
+        )
     first, *_ = found
     wrong = f"has no sensing set-up {name!r}" if name else "has several sensing set-ups"
     raise ConfigurationError(f"{file} {wrong}: it defines {', '.join(found)}; name one, such as {file}:{first}")

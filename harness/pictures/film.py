@@ -32,7 +32,7 @@ from servobench.harness.pictures.style import MethodStyle, figure_style, method_
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.settings import suggest
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.robot.ur5 import BALL_RADIUS
+from servobench.plant.robot.workspace import BALL_RADIUS
 
 MP4, GIF, SNAPSHOTS = KINDS = ("mp4", "gif", "snapshots")
 WIDTH, HEIGHT = 960, 816  # px of a frame; ffmpeg wants multiples of 16

@@ -30,7 +30,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.seeds import named_seed
 from servobench.plant.kinematic import KinematicConfig
-from servobench.plant.robot.hand_eye import SensedArm, TrueJacobian, hand_eye_spec
+from servobench.plant.robot.hand_eye import RobotModel, TrueJacobian, hand_eye_spec
 from servobench.plant.robot.mismatch import Mismatch, MismatchSample, sample_mismatch
 
 
@@ -39,13 +39,13 @@ class Drawn:
     """What is drawn for one run."""
 
     scenario: Scenario
-    true: SensedArm | None = None  # the true robot and its cameras; None for a plant that brings its own
+    true: RobotModel | None = None  # the true robot and its cameras; None for a plant that brings its own
     sample: MismatchSample | None = None  # how it differs from the nominal one
-    moved: SensedArm | None = None  # the true robot after its camera was moved; None if it is not
+    moved: RobotModel | None = None  # the true robot after its camera was moved; None if it is not
     cameras: CameraDraws | None = None  # how cameras differ from those planned; None where they are part of `sample`
 
     @property
-    def final(self) -> SensedArm | None:
+    def final(self) -> RobotModel | None:
         """The true robot with the camera as it is at the end of the run."""
         return self.moved or self.true
 
@@ -153,7 +153,7 @@ def build(resolved: ResolvedRun, *, keep: Path | None = None, progress: Progress
 
 def assemble(
     resolved: ResolvedRun,
-    true: SensedArm | None,
+    true: RobotModel | None,
     start: FloatArray | None,
     keep: Path | None = None,
     progress: Progress | None = None,
@@ -283,7 +283,7 @@ def _build_with_own_robot(
     return Experiment(plant, controller, Drawn(scenario), run)
 
 
-def _equations(model: SensedArm | None) -> TrueModel:
+def _equations(model: RobotModel | None) -> TrueModel:
     if model is None:
         raise ValueError("model must be given for a controller that needs the truth, got None")
 

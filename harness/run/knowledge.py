@@ -15,10 +15,10 @@ from servobench.controllers.networks.fit import Progress, train, training_digest
 from servobench.controllers.units import in_natural_units
 from servobench.harness.run.loop import one_thread
 from servobench.harness.run.request import RunSettings
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.cache import cache_folder, cached
 from servobench.plant.contract.signals import PlantSpec
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 NETWORKS = "networks"
@@ -27,7 +27,7 @@ NETWORKS_KEPT = 8  # trained networks in the memory of a process; a file takes t
 _KEPT: dict[tuple[Path, str], TrainedNetworks] = {}
 
 
-def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
+def nominal_knowledge(robot: Robot, nominal: RobotModel, spec: PlantSpec, run: RunSettings) -> RobotKnowledge:
     """Return what every controller may know."""
     if not robot.known:
         return RobotKnowledge(spec, run.preview_rows, region=(spec.joint_lower, spec.joint_upper))
@@ -40,18 +40,18 @@ def nominal_knowledge(robot: Robot, nominal: SensedArm, spec: PlantSpec, run: Ru
     )
 
 
-def _cameras(nominal: SensedArm) -> CameraModel | None:
+def _cameras(nominal: RobotModel) -> CameraModel | None:
     """Return how the cameras of a nominal model see points, where its features are those of single points."""
-    if not (isinstance(nominal, EyeModel) and nominal.eye.single and nominal.eye.locate):
+    if not (isinstance(nominal, SetupModel) and nominal.setup.single and nominal.setup.locate):
         return None
-    return CameraModel(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
+    return CameraModel(nominal.setup.cameras, len(nominal.setup.target), nominal.point_motions, nominal.interaction)
 
 
-def in_view(knowledge: RobotKnowledge, nominal: SensedArm, robot: Robot) -> RobotKnowledge:
+def in_view(knowledge: RobotKnowledge, nominal: RobotModel, robot: Robot) -> RobotKnowledge:
     """Return what networks are trained on: a Jacobian that says nothing about what the cameras do not see."""
     if nominal is robot.nominal:
         return knowledge
-    return replace(knowledge, nominal_jacobian=lambda q: nominal.jacobian_in_view(q, robot.workspace.home))
+    return replace(knowledge, nominal_jacobian=lambda q: nominal.valid_jacobian(q, robot.workspace.home))
 
 
 def trained_on(

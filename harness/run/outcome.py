@@ -24,7 +24,7 @@ import numpy as np
 from servobench.harness.run.log import Steps
 from servobench.harness.run.scenario import Scenario
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.inverse import closest_distance
 
 SETTLED, NOT_SETTLED = "settled", "not_settled"
@@ -40,7 +40,7 @@ CURVE_POINTS: Final = 32  # of the judged part of a curve that must be in reach
 
 
 def find_outcome(
-    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: SensedArm | None
+    steps: Steps, scenario: Scenario, settling_time: float, rms_error_evaluated: float, robot: RobotModel | None
 ) -> str:
     """Return the outcome of a run that completed.
 

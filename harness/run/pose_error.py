@@ -8,18 +8,18 @@ from scipy.spatial.transform import Rotation
 from servobench.harness.run.log import Steps
 from servobench.harness.run.metrics import FINAL_SPAN
 from servobench.harness.run.references import Reference, View
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 
 
-def pose_errors(robot: SensedArm | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:
+def pose_errors(robot: RobotModel | None, reference: Reference, steps: Steps) -> tuple[FloatArray, FloatArray] | None:
     """Return distance (k,) [mm] and angle (k,) [deg] of the target from where it should be; None where not judged.
 
     Where the camera is moved during the run, the target is still judged by where it was taught.
     """
-    if not (isinstance(robot, EyeModel) and robot.eye.judges_pose and isinstance(reference, View)):
+    if not (isinstance(robot, SetupModel) and robot.setup.judges_pose and isinstance(reference, View)):
         return None
     distance, angle = pose_error(robot.points(steps.joint_position), reference.points(steps.time))
     return 1e3 * distance, np.degrees(angle)

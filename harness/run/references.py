@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.harness.run.log import column_unit
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.files import reason
 from servobench.plant.contract.signals import Channel
@@ -151,7 +151,7 @@ def read_waypoints(path: Path, feature: Channel) -> Waypoints:
 class View(Reference):
     """A desired place of the target over time, and its image."""
 
-    model: EyeModel
+    model: SetupModel
     """The true arm and its cameras."""
 
     @abstractmethod
@@ -160,7 +160,7 @@ class View(Reference):
 
     def at(self, time: npt.ArrayLike) -> FloatArray:
         """Return its image, (..., m)."""
-        return self.model.seen(self.points(time))
+        return self.model.feature_at(self.points(time))
 
 
 @final
@@ -168,7 +168,7 @@ class View(Reference):
 class TaughtView(View):
     """The target where it is with the arm at given joint positions."""
 
-    model: EyeModel
+    model: SetupModel
     joint_position: FloatArray  # (n,) [rad]
 
     def points(self, time: npt.ArrayLike) -> FloatArray:
@@ -182,7 +182,7 @@ class TaughtView(View):
 class FollowedCurve(View):
     """The target on a curve in space, as above."""
 
-    model: EyeModel
+    model: SetupModel
     curve: Reference  # of a ball in the frame of a fixed camera, (3,) [m]
     robot: Robot  # whose home gives the orientation, and whose workspace the curve is in
 
@@ -196,4 +196,4 @@ class FollowedCurve(View):
 
 def in_space(curve: Reference, model: object, robot: Robot | None) -> Reference:
     """Return what the features should be for a ball on a curve: the curve itself where they are places."""
-    return FollowedCurve(model, curve, robot) if isinstance(model, EyeModel) and robot is not None else curve
+    return FollowedCurve(model, curve, robot) if isinstance(model, SetupModel) and robot is not None else curve

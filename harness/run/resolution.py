@@ -20,7 +20,7 @@ from servobench.harness.config.robots import DEFAULT_ROBOT, find_robot
 from servobench.harness.config.settings import ConfigurationError, Settings
 from servobench.harness.run.request import RunRequest, RunSettings
 from servobench.harness.run.scenario import Task
-from servobench.harness.run.tasks import TASKS, find_task, fitted
+from servobench.harness.run.tasks import find_task, fitted, task_names
 from servobench.plant.bench.plant import PlantEntry
 from servobench.plant.contract.sensing import change_sensing, vary_sensing
 from servobench.plant.robot.robot import Robot
@@ -61,7 +61,7 @@ def resolve_sections(requests: Iterable[RunRequest], settings: Settings, *, to_r
     requests = list(requests)
     for request in requests:
         for name, what in ((request.plant, "plant"), (request.controller, "controller")):
-            if name in TASKS:
+            if name in task_names():
                 raise ConfigurationError(f"a task is called {name!r}, too; give the {what} another name")
         if request.plant == request.controller:
             raise ConfigurationError(f"plant and controller are both called {request.plant!r}; give one another name")
@@ -146,14 +146,14 @@ def check_settings(settings: Settings, running: Iterable[str]) -> None:
 
 def known_sections() -> list[str]:
     """Return every section that a configuration may have, but for those of pairs and of mapped FMUs."""
-    return ["run", *plant_names(), *controller_names(), *TASKS]
+    return ["run", *plant_names(), *controller_names(), *task_names()]
 
 
 def _default(section: str) -> Any:  # noqa: ANN401 - a configuration dataclass
     """Return the defaults of a section; None for a plant or controller that cannot be loaded here."""
-    if section in TASKS:
-        return find_task(section).default
     try:
+        if section in task_names():
+            return find_task(section).default
         return find_plant(section).config() if section in plant_names() else default_config(find_controller(section))
     except ConfigurationError:  # a plug-in, or a library that is not installed: nothing of this section runs here
         return None

@@ -14,10 +14,10 @@ from typing import ClassVar, Self, TypeAlias
 import numpy as np
 
 from servobench.harness.run.references import FixedPoint, Reference, TaskKind, TaughtView, in_space
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector
 from servobench.plant.contract.signals import Channel
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import Workspace
 
@@ -40,13 +40,13 @@ class Scenario:
 class TaskSetting:
     """Where a task is to be done."""
 
-    model: SensedArm | None  # the true robot, or None for a plant that brings its own
+    model: RobotModel | None  # the true robot, or None for a plant that brings its own
     n: int  # number of joints
     feature: Channel  # names and unit of the m features
     seed: int  # for tasks that draw random numbers
-    moved: SensedArm | None = None  # the true robot once its camera was moved; None if it is not
+    moved: RobotModel | None = None  # the true robot once its camera was moved; None if it is not
     robot: Robot | None = None  # by its maker's description; None for a plant that brings its own
-    nominal: SensedArm | None = None  # the same with its cameras as planned
+    nominal: RobotModel | None = None  # the same with its cameras as planned
 
     @property
     def m(self) -> int:
@@ -66,11 +66,11 @@ class TaskSetting:
         model = self.taught_on()[1]
         return (
             TaughtView(model, joint_position)
-            if isinstance(model, EyeModel)
+            if isinstance(model, SetupModel)
             else FixedPoint(model.feature(joint_position))
         )
 
-    def taught_on(self) -> tuple[Robot, SensedArm]:
+    def taught_on(self) -> tuple[Robot, RobotModel]:
         """Return the robot and the true one, for a target that is taught on it.
 
         Raises:

@@ -32,7 +32,7 @@ from annotated_types import Gt, Le
 from scipy.spatial.transform import Rotation
 
 from servobench.harness.run.scenario import Scenario, Task, TaskSetting
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.settings import Positive, settings
@@ -68,7 +68,7 @@ class Box:
 
 
 def draw_in_view(
-    box: Box, robot: Robot, nominal: EyeModel, true: EyeModel, generator: np.random.Generator
+    box: Box, robot: Robot, nominal: SetupModel, true: SetupModel, generator: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Return joint positions of start and target, (n,) and (n,) rad.
 
@@ -98,7 +98,7 @@ def draw_in_view(
 
 
 def drawn_together(
-    start: FloatArray, target: FloatArray, robot: Robot, nominal: EyeModel, true: EyeModel
+    start: FloatArray, target: FloatArray, robot: Robot, nominal: SetupModel, true: SetupModel
 ) -> tuple[FloatArray, FloatArray]:
     """Return start and target of a move, (n,) and (n,) rad, drawn together in tenths until both are in view.
 
@@ -115,7 +115,7 @@ def drawn_together(
     raise ValueError("start and target must be in view, and near the arm's home they are not; use another mismatch")
 
 
-def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: EyeModel, true: EyeModel) -> npt.NDArray[np.bool_]:
+def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:
     """Return which of the postures (k, n) rad are fit, (k,)."""
     fit = robot.arm.ball_position(drawn)[:, 2] >= box.lowest
     if robot.workspace.clear is not None:
@@ -124,11 +124,11 @@ def _fit(drawn: FloatArray, box: Box, robot: Robot, nominal: EyeModel, true: Eye
     return np.asarray(fit)
 
 
-def _in_view(postures: FloatArray, nominal: EyeModel, true: EyeModel) -> npt.NDArray[np.bool_]:
+def _in_view(postures: FloatArray, nominal: SetupModel, true: SetupModel) -> npt.NDArray[np.bool_]:
     """Return in which postures (k, n) rad the cameras see all features as they should, (k,)."""
     points = nominal.points(postures)
-    planned = nominal.in_view(points, PLANNED_SHARE).all(axis=-1) & (nominal.facing(points) >= FACING)
-    return np.asarray(planned & true.in_view(true.points(postures), TRUE_SHARE).all(axis=-1))
+    planned = nominal.valid_at(points, PLANNED_SHARE).all(axis=-1) & (nominal.incidence(points) >= FACING)
+    return np.asarray(planned & true.valid_at(true.points(postures), TRUE_SHARE).all(axis=-1))
 
 
 @settings
@@ -147,7 +147,7 @@ class PoseTask(Task):
     def scenario(self, setting: TaskSetting) -> Scenario:
         """See `Task.scenario`."""
         robot, true = setting.taught_on()
-        if not (isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel) and true.eye.judges_pose):
+        if not (isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel) and true.setup.judges_pose):
             raise ValueError("it needs a target with a pose; use --sensing plate or plate:hand")
         start = pose_start(self, robot, setting.nominal)
         return setting.move(start, setting.taught(robot.workspace.home), self.duration)
@@ -169,7 +169,7 @@ def displaced(config: PoseTask, middle: FloatArray) -> FloatArray:
     return D
 
 
-def pose_start(config: PoseTask, robot: Robot, nominal: EyeModel) -> FloatArray:
+def pose_start(config: PoseTask, robot: Robot, nominal: SetupModel) -> FloatArray:
     """Return the start, (n,) rad, on the nominal arm with its cameras as planned.
 
     Raises:
@@ -180,12 +180,12 @@ def pose_start(config: PoseTask, robot: Robot, nominal: EyeModel) -> FloatArray:
     middle = inverse[:3, :3] @ nominal.points(home).mean(axis=0) + inverse[:3, 3]
     for share in SHARES:
         start = _led(config, share, robot, nominal, middle)
-        if start is not None and nominal.in_view(nominal.points(start), IN_VIEW).all():
+        if start is not None and nominal.valid_at(nominal.points(start), IN_VIEW).all():
             return start
     raise ValueError(f"{robot.title} cannot reach the start of {config.displacement} with the target in view")
 
 
-def _led(config: PoseTask, share: float, robot: Robot, nominal: EyeModel, middle: FloatArray) -> FloatArray | None:
+def _led(config: PoseTask, share: float, robot: Robot, nominal: SetupModel, middle: FloatArray) -> FloatArray | None:
     """Return the joint positions at a share of the displacement, led there from home in steps; None if out of reach."""
     arm, limits, q, camera = robot.arm, robot.limits, robot.workspace.home, nominal.camera
     at_home = arm.frames(q)[-1]

@@ -4,21 +4,30 @@ Targets are taught as a user would teach them: the ball is put somewhere and the
 feature. A target given as joint positions is therefore observed on the true robot, and is always in reach. Curves are
 given in the camera frame; the middle of the workspace is at (0, 0, 1.3) m there, whatever the mismatch; where cameras
 see pixels, the desired feature is the true image of a ball on the curve (`servobench.harness.run.references`).
+
+A user brings a task as a file with a dataclass below `Task`, or publishes it, or a `TaskEntry`, under the entry-point
+group `servobench.tasks`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import ClassVar, Final, Literal, Self
+from dataclasses import is_dataclass, replace
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 
+from servobench.harness.config.entries import Kind, check_class, check_settings, read_own
+from servobench.harness.config.registry import ALL, RUN, offer, offered
 from servobench.harness.config.robots import DEFAULT_ROBOT
 from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.config.source import describe_import, is_place
 from servobench.harness.run.references import FixedPoint, Laps, line, read_waypoints
 from servobench.harness.run.scenario import Scenario, Task, TaskEntry, TaskSetting, Vector, enlarged, numbers
 from servobench.harness.run.starts import Box, PoseTask, draw_in_view, drawn_together
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, check_number
 from servobench.plant.contract.files import user_path
 from servobench.plant.contract.lanes import norm
@@ -31,6 +40,7 @@ from servobench.plant.robot.workspace import Workspace
 
 MAX_DRAWS, DRAWN_AT_ONCE = 1000, 4  # pairs of start and target; one in two fits
 RADII: Final = {"circle": 0.3, "lemniscate": 0.25}  # [m] of the curves on a UR5
+GROUP: Final = "servobench.tasks"  # of entry points, by which other distributions publish tasks
 STRETCHED_START: Final = "singular_start"
 
 
@@ -56,7 +66,7 @@ class PointTask(Task):
         """See `Task.scenario`."""
         start, target = (as_vector(name, getattr(self, name), setting.n) for name in ("start", "target"))
         robot, true = setting.taught_on()
-        if self.into_view and isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+        if self.into_view and isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
             start, target = drawn_together(start, target, robot, setting.nominal, true)
         return setting.move(start, setting.taught(target), self.duration)
 
@@ -119,7 +129,7 @@ class RandomTask(Task):
         if not (lower < upper).all():
             raise ValueError("lower must be below upper for every joint")
         generator = named_generator(setting.seed, "start_and_target")
-        if isinstance(true, EyeModel) and isinstance(setting.nominal, EyeModel):
+        if isinstance(true, SetupModel) and isinstance(setting.nominal, SetupModel):
             box = Box(lower, upper, self.shortest, self.lowest)
             start, target = draw_in_view(box, robot, setting.nominal, true, generator)
             return setting.move(start, setting.taught(target), self.duration)
@@ -272,15 +282,93 @@ _ENTRIES = (
 TASKS = {entry.name: entry for entry in _ENTRIES}
 
 
+def task_names() -> list[str]:
+    """Return the names of all tasks, those of this package first."""
+    return [*TASKS, *_published()]
+
+
 def find_task(name: str) -> TaskEntry:
-    """Return the task called `name`.
+    """Return the task called `name`: of this package, of a file that the user gave, or published by others.
 
     Raises:
-        ConfigurationError: no such task.
+        ConfigurationError: no such task, or one of others that cannot be loaded.
     """
-    if name not in TASKS:
-        raise ConfigurationError(f"unknown task {name!r}: {suggest(name, TASKS)}")
-    return TASKS[name]
+    if name in TASKS:
+        return TASKS[name]
+    for own in offered([name]):
+        if isinstance(own.entry, TaskEntry):
+            return own.entry
+    if name not in _published():
+        if Path(f"{name}.py").is_file():
+            raise ConfigurationError(f"unknown task {name!r}: did you mean your file './{name}.py'?")
+        raise ConfigurationError(f"unknown task {name!r}: {suggest(name, task_names())}")
+    return _load(name)
+
+
+def choose_task(text: str) -> str:
+    """Return the name of the task that a user names, or whose place is given, such as ./spiral.py or ./mine.py:Spiral.
+
+    Raises:
+        ConfigurationError: there is no such task, or it cannot be used; one line with file and line number.
+    """
+    if text not in task_names() and not offered([text]) and is_place(text):
+        own = read_own(TASK, text)
+        if own.name in task_names():
+            raise ConfigurationError(f"a task called {own.name!r} exists already; give yours another name, such as "
+                                     f"my_{own.name}={own.place}")  # fmt: skip
+        return offer(own)
+    find_task(text)
+    return text
+
+
+@cache
+def _published() -> dict[str, EntryPoint]:
+    """Return the tasks that other distributions publish; a name of this package cannot be taken over."""
+    return {point.name: point for point in entry_points(group=GROUP) if point.name not in (*TASKS, ALL, RUN)}
+
+
+def published_task(name: str) -> EntryPoint | None:
+    """Return the entry point of a task that another distribution publishes; None for other tasks."""
+    return _published().get(name)
+
+
+@cache
+def _load(name: str) -> TaskEntry:
+    point = _published()[name]
+    try:
+        given = point.load()
+    except (Exception, SystemExit) as error:
+        why = describe_import(error, point.module)
+        raise ConfigurationError(f"task {name!r} ({point.value}) cannot be loaded: {why}") from error
+    return _entry_of(given, point.value, name)
+
+
+def _entry_of(given: object, place: str, name: str | None) -> TaskEntry:
+    """Return the entry of a class of tasks, whose fields need defaults, or of an entry."""
+    if isinstance(given, TaskEntry):
+        entry = given
+    elif isinstance(given, type) and issubclass(given, Task):
+        check_class(given)
+        check_settings(given, place)
+        entry = TaskEntry(given.__name__, (given.__doc__ or given.__name__).strip().splitlines()[0], given())
+    else:
+        raise ConfigurationError(f"{place} is {given!r}, {TASK.wanted}")
+    default: object = entry.default
+    if not (isinstance(default, Task) and is_dataclass(type(default))):
+        raise ConfigurationError(f"{place}: the settings of a task must be a dataclass below Task, got "
+                                 f"{type(default).__name__}")  # fmt: skip
+    return replace(entry, name=name or entry.name)
+
+
+TASK: Final[Kind[Any]] = Kind(
+    "task",
+    TaskEntry,
+    (Task,),
+    "setting",
+    "wanted a dataclass below servobench.Task or a servobench.TaskEntry",
+    lambda kind, _: _entry_of(kind, kind.__name__, None),
+    _entry_of,
+)
 
 
 def fitted(name: str, robot: Robot) -> Task:

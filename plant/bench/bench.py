@@ -1,10 +1,10 @@
-"""The bench around a robot: clipped and delayed commands, noisy, late and lost features, for every world alike.
+"""The bench around a robot: clipped and delayed commands, noisy, late and lost features, the same for every world.
 
     u(k) = clip(command(k), limits),        the world advances under u(k − d)
     frame(k) = see(k) + σ N(0, 1),          the observation at k holds frame(k − l), or the last valid one if it is lost
 
 with the command delay d and the latency l; where they are no multiples of the control period, the world advances in
-sub-steps (`plant.contract.timing`). What else may happen to a frame is in `plant.bench.sensor`. Many runs side
+sub-steps (`plant.contract.timing`). Other disturbances of a frame are in `plant.bench.sensor`. Many runs side
 by side share one bench: their arrays have a leading axis, and each run has random streams of its own.
 """
 
@@ -54,7 +54,7 @@ class BenchState:
         frames: frames under way, oldest first.
         held: (..., m), the last valid feature.
         sensor: its random streams, and the outliers and occlusions that last.
-        world: what the world saved.
+        world: the saved state of the world.
     """
 
     period: int
@@ -67,10 +67,10 @@ class BenchState:
 
 @final
 class Bench(Plant):
-    """A plant: a world under clipped and delayed commands, seen through noise, latency and lost frames."""
+    """A plant: a world under clipped and delayed commands, measured with noise, latency and lost frames."""
 
     def __init__(self, world: World, command_delay: float, sensing: SensingConfig, period: float | None = None) -> None:
-        """Put a world on the bench, which closes it; `reset` begins a run. `build_bench` also builds the world.
+        """Take a world, which the bench closes; `reset` begins a run. `build_bench` also builds the world.
 
         Args:
             world: the robot and its camera.
@@ -94,7 +94,7 @@ class Bench(Plant):
         self._size_masks()
 
     def _size_masks(self) -> None:
-        """Take the leading axis from the world."""
+        """Set the shapes of commands and masks by the leading axis of the world."""
         self._shape = (*self.world.lead, self.spec.n)
         self._whole = np.ones(self.world.lead, dtype=np.bool_)[()]
         self._all_valid = np.ones((*self.world.lead, self.spec.m), dtype=np.bool_)
@@ -103,7 +103,7 @@ class Bench(Plant):
             mask.setflags(write=False)
 
     def reset(self, seed: Seeds) -> Observation:
-        """Return to the start; all that the sensor draws gets random streams of its own. See `Plant.reset`.
+        """Return to the start, with new random streams for the sensor. See `Plant.reset`.
 
         Args:
             seed: non-negative; a sequence of one for each of the runs side by side.
@@ -150,7 +150,7 @@ class Bench(Plant):
         return self._observation(joints, *self._delivered(self._k * timing.steps))
 
     def _delivered(self, now: int) -> tuple[FloatArray, BoolArray]:
-        """Return the newest features that arrived since the last control instant, and which ones did, (..., m)."""
+        """Return the newest features that arrived since the last control instant, and which of them did, (..., m)."""
         if self._sensor.jitters:
             return self._delivered_by_lane(now)
         feature, valid = self._held, self._none_valid
@@ -163,7 +163,7 @@ class Bench(Plant):
         return feature, valid
 
     def _delivered_by_lane(self, now: int) -> tuple[FloatArray, BoolArray]:
-        """Return the same where a frame is due at another time in each lane."""
+        """Return the same as `_delivered` for lanes whose frames are due at different times."""
         feature, valid, before = self._held, self._none_valid, now - self._timing.steps
         for due, newer, own in self._frames:
             fresh = np.logical_and(own, np.asarray(np.logical_and(before < due, due <= now))[..., None])
@@ -173,7 +173,7 @@ class Bench(Plant):
         return feature, valid
 
     def _observation(self, joints: FloatArray, feature: FloatArray, valid: BoolArray) -> Observation:
-        """Return what is seen at the present period, of features that are held where they do not arrive."""
+        """Return the observation of the present period; features that do not arrive are held."""
         time, whole = self._k * self._period, self._whole
         if valid is not self._all_valid:
             whole = np.logical_and.reduce(valid, axis=-1)
@@ -184,14 +184,14 @@ class Bench(Plant):
         return trusted_observation(time, joints, feature, whole, valid)
 
     def _expose(self) -> FloatArray | None:
-        """Return the feature as seen now, (..., m), with what the sensor adds; None if it is not found."""
+        """Return the feature as measured now, (..., m), with the sensor's disturbances; None if it is not found."""
         feature, unit = self.world.see(), self.world.noise_unit
         if feature is None or unit == 1.0:
             return None if feature is None else self._sensor.measured(feature)
         return unit * self._sensor.measured(feature / unit)
 
     def _unseen(self) -> BoolArray | None:
-        """Return which features cannot be seen now, (..., m); None for none of them."""
+        """Return which features are not valid now, (..., m); None if all are valid."""
         seen = self.world.visible()
         return None if seen is None or seen.all() else np.logical_not(seen)
 
@@ -277,7 +277,7 @@ class Bench(Plant):
 def build_bench(
     make: Callable[[PlantSetup], World], setup: PlantSetup, command_delay: float, sensing: SensingConfig
 ) -> Bench:
-    """Return a bench around a world that is as fine as the delays need.
+    """Return a bench around a world with the sub-steps that the delays need.
 
     Args:
         make: builds the world from a setup whose period is the sub-step.
@@ -286,7 +286,7 @@ def build_bench(
         sensing: noise, latency, frame period and lost frames.
 
     Raises:
-        ValueError: times without a common sub-step, or whatever `make` refuses.
+        ValueError: times without a common sub-step, or arguments that `make` refuses.
     """
     step = common_step(setup.period, command_delay, sensing)
     try:

@@ -23,12 +23,14 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.contract.sensing import Family
+from servobench.plant.contract.sensing import Family, SensingConfig
 
 Shape: TypeAlias = tuple[int, ...]
 Draw: TypeAlias = Callable[[np.random.Generator, Shape], FloatArray]
 
-TINY: Final = 2.0**-54  # floor of what rounding could make 0 or negative: half the grid of the generator's numbers
+TINY: Final = (
+    2.0**-54
+)  # floor of differences that rounding could make 0 or negative: half the grid of the generator's numbers
 
 
 def white(generator: np.random.Generator, shape: Shape) -> FloatArray:
@@ -53,7 +55,7 @@ def mixture(
 
 
 def bimodal(generator: np.random.Generator, shape: Shape, *, share: float, offset: float) -> FloatArray:
-    """Return normal numbers of deviation 1, of which two equal shares are displaced to either side.
+    """Return normal numbers of deviation 1, with equal shares displaced to either side.
 
     Args:
         generator: of the random numbers.
@@ -102,16 +104,19 @@ def uniform(generator: np.random.Generator, shape: Shape) -> FloatArray:
     return math.sqrt(3.0) * (2.0 * generator.random(shape) - 1.0)
 
 
-def family_of(name: Family, *, share: float, offset: float, spread: float, stability: float, skewness: float) -> Draw:
-    """Return the family of a name with its parameters, those of the other families left aside."""
+def family_of(config: SensingConfig) -> Draw:
+    """Return the noise of a sensor with settings `config`, in multiples of its deviation σ; a row for each family."""
+    share, offset = config.noise_share, 0.0
+    if config.feature_noise > 0.0:
+        offset = config.noise_offset / config.feature_noise
     families: dict[Family, Draw] = {
         "white": white,
-        "mixture": partial(mixture, share=share, offset=offset, spread=spread),
+        "mixture": partial(mixture, share=share, offset=offset, spread=config.noise_spread),
         "bimodal": partial(bimodal, share=share, offset=offset),
-        "stable": partial(stable, stability=stability, skewness=skewness),
+        "stable": partial(stable, stability=config.stability, skewness=config.skewness),
         "uniform": uniform,
     }
-    return families[name]
+    return families[config.noise]
 
 
 def quantised(feature: FloatArray, quantum: float) -> FloatArray:

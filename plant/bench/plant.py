@@ -1,7 +1,7 @@
 """The contract of a plant: a spec, reset, step, save and restore, close, and the truth for the log.
 
 A plant never sees a target. A plant that is added is a `World` on the `Bench` of `plant.bench.bench`, or a class
-of its own below `Plant`; a settings class beside it; and a `PlantEntry` that is named in `harness.config.registry` or
+of its own below `Plant`; a settings class; and a `PlantEntry` that is named in `harness.config.registry` or
 published under the entry-point group `servobench.plants`.
 """
 
@@ -21,7 +21,7 @@ from servobench.plant.contract.checks import FloatArray, as_array
 from servobench.plant.contract.faults import RunFault
 from servobench.plant.contract.signals import BoolArray, Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.arm import JointLimits
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 from servobench.plant.robot.robot import Robot
 
 ImageArray: TypeAlias = npt.NDArray[np.uint8]
@@ -29,7 +29,7 @@ ImageArray: TypeAlias = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class TrueModel:
-    """The kinematics of the true robot and how late commands and features are; for upper bounds only.
+    """The kinematics of the true robot and the delays of commands and features; for upper bounds only.
 
     Attributes:
         jacobian: (..., n) rad -> (..., m, n), unit of the feature per rad.
@@ -47,7 +47,7 @@ class TrueModel:
 
 
 class Abilities(ABC):
-    """The abilities of plants and worlds in addition to moving; those that are optional have a default."""
+    """Abilities that plants and worlds share; the optional ones have a default."""
 
     spec: PlantSpec
     """Sizes, names, limits and period; set on construction."""
@@ -70,8 +70,8 @@ class Abilities(ABC):
         """
         return copy.deepcopy(vars(self))
 
-    def restore(self, state: Any) -> None:  # noqa: ANN401 - what `save` returned
-        """Return to a state that `save` of a plant with the same robot and settings returned, as often as wanted."""
+    def restore(self, state: Any) -> None:  # noqa: ANN401 - as returned by `save`
+        """Return to a saved state of a plant with the same robot and settings; a state can be used repeatedly."""
         vars(self).update(copy.deepcopy(state))
 
     def true_model(self) -> TrueModel:
@@ -82,7 +82,7 @@ class Abilities(ABC):
         Raises:
             ValueError: the plant does not know them; says why.
         """
-        raise ValueError("this plant cannot tell the kinematics of its robot, which an upper bound has to know")
+        raise ValueError("this plant does not know the kinematics of its robot, which an upper bound needs")
 
     def with_delays(self, model: TrueModel) -> TrueModel:
         """Return the kinematics of the plant's robot with the plant's own delays, as far as it knows them."""
@@ -100,7 +100,7 @@ class Abilities(ABC):
         return None
 
     def move_camera(self, X_BC: FloatArray) -> None:
-        """Put the camera elsewhere from the next measurement on, until `reset`: a camera displaced during the run.
+        """Move the camera from the next measurement on, until `reset`: a camera displaced during the run.
 
         Args:
             X_BC: (4, 4), the camera's new pose in the base frame; (..., 4, 4) for runs side by side.
@@ -111,7 +111,7 @@ class Abilities(ABC):
         raise ValueError("the plant has no camera that could be moved")
 
     def keep(self, lanes: npt.NDArray[np.intp]) -> None:
-        """Drop all other runs for good, of runs side by side.
+        """Keep only some of the runs side by side and drop the others permanently.
 
         Args:
             lanes: (k,), indices of the lanes that stay, in their new order.
@@ -127,7 +127,7 @@ class Abilities(ABC):
 
 
 class Plant(Abilities):
-    """A discrete-time plant: `step` holds the command for one period and returns what is seen after it."""
+    """A discrete-time plant: `step` holds the command for one period and returns the observation after it."""
 
     @abstractmethod
     def reset(self, seed: int) -> Observation:
@@ -172,7 +172,7 @@ class PlantSetup:
             or where only the model is known.
     """
 
-    model: SensedArm | None
+    model: RobotModel | None
     start: FloatArray | None
     period: float
     nominal: Robot | None = None
@@ -182,7 +182,7 @@ class PlantSetup:
         """The maker's joint limits, where they are known."""
         return None if self.nominal is None else self.nominal.limits
 
-    def robot(self) -> tuple[SensedArm, FloatArray]:
+    def robot(self) -> tuple[RobotModel, FloatArray]:
         """Return model and start, (..., n), for a plant that needs them.
 
         Raises:
@@ -191,13 +191,6 @@ class PlantSetup:
         if self.model is None or self.start is None:
             raise ValueError("model and start must be given for this plant, got None")
         return self.model, as_array("start", self.start, (*self.model.lead, self.model.arm.n))
-
-    def ball_robot(self) -> tuple[HandEyeModel, FloatArray]:
-        """Return model and start for a plant that sees the ball in 3-D by a fixed camera only; errors as in `robot`."""
-        model, start = self.robot()
-        if not isinstance(model, HandEyeModel):
-            raise ValueError("model must be of a ball that is seen in 3-D by a fixed camera for this plant")  # noqa: TRY004
-        return model, start
 
 
 @dataclass(frozen=True)
@@ -215,8 +208,8 @@ class PlantEntry:
         config_for: returns the default settings for a robot, where they depend on it; None: those of `config`.
         side_by_side: `build` also takes a setup of many runs, whose arrays have a leading axis, and returns a `Bench`.
         needs: top-level modules that only an extra brings.
-        lacking: returns one line about what this machine lacks beside packages; empty if nothing.
-        engine: returns one line about what computes or renders this plant, for the terminal and the manifest.
+        lacking: returns one line about missing parts of this machine other than packages; empty if nothing is missing.
+        engine: returns one line about the software that computes or renders it, for the terminal and the manifest.
         any_sensing: it takes every sensing set-up; else only the ball that a fixed camera sees in 3-D.
     """
 
@@ -234,7 +227,7 @@ class PlantEntry:
 
 
 class World(Abilities):
-    """A robot and its camera, which only advance and see; `Bench` makes a plant of it.
+    """A robot and its camera, which only advance and measure; `Bench` makes a plant of it.
 
     Arrays that a world returns are never changed again, finite and float64; the bench makes them read-only. Those of a
     world that carries out runs side by side have the leading axis `lead`.
@@ -247,13 +240,13 @@ class World(Abilities):
     """[s] time constant of the joints' velocity loops; None where it is unknown."""
 
     def fail(self, lane: int, fault: RunFault) -> None:
-        """Take the fault of a lane, or raise that of a single run; of a lane the first one counts."""
+        """Record the fault of a lane, of which the first one counts, or raise that of a single run."""
         if not self.lead:
             raise fault
         self.faults = {lane: fault, **self.faults}
 
     noise_unit: float = 1.0
-    """What a metre of noise is in the unit of the features."""
+    """A metre of noise in the unit of the features."""
 
     @abstractmethod
     def reset(self, seed: Any) -> FloatArray:  # noqa: ANN401 - narrowed by worlds that carry out one run only
@@ -282,10 +275,10 @@ class World(Abilities):
 
     @abstractmethod
     def see(self) -> FloatArray | None:
-        """Return the feature as the sensor sees it now, (..., m); None if a single run's is not found."""
+        """Return the feature as measured now, (..., m); None if that of a single run is not found."""
 
     def visible(self) -> BoolArray | None:
-        """Return which features of what was seen last are measured, (..., m); None for all of them."""
+        """Return which features of the last measurement are valid, (..., m); None for all of them."""
         return None
 
     def why_unseen(self) -> str:

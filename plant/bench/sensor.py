@@ -35,7 +35,7 @@ TIME_TOLERANCE: Final = 1e-9  # [s] by which a frame may be earlier than a windo
 
 
 class Sensor:
-    """The random side of a sensor over a run, or over runs side by side; it can be copied and pickled.
+    """The random disturbances of a sensor over a run, or over runs side by side; it can be copied and pickled.
 
     Attributes:
         jitters: whether frames are late by different times.
@@ -56,13 +56,8 @@ class Sensor:
         """
         self._config, self.jitters = config, config.jitter > 0.0
         self._scale = config.noise_factor * config.feature_noise
-        offset = config.noise_offset / config.feature_noise if config.feature_noise > 0.0 else 0.0
-        family = family_of(
-            config.noise, share=config.noise_share, offset=offset, spread=config.noise_spread,
-            stability=config.stability, skewness=config.skewness,
-        )  # fmt: skip
         stream: Callable[..., Stream] = partial(Stream, seed)
-        self._noise = stream("feature_noise", family, (m,), self._scale)
+        self._noise = stream("feature_noise", family_of(config), (m,), self._scale)
         self._losses, self._lateness = stream("dropped_frames", "random"), stream("late_frames", "random")
         self._outlier_begins, self._occlusion_begins = stream("outliers", "random"), stream("occlusions", "random")
         self._outlier_values = stream("outlier_values", directions, (m,), config.outlier_size)
@@ -72,7 +67,7 @@ class Sensor:
         self._due: FloatArray = np.zeros(lead)[()]
 
     def measured(self, feature: FloatArray) -> FloatArray:
-        """Return what the next frame shows of a true feature, (..., m)."""
+        """Return a true feature, (..., m), as the next frame shows it."""
         config = self._config
         if self._scale > 0.0:
             feature = feature + self._noise.next()
@@ -84,7 +79,7 @@ class Sensor:
         return quantised(feature, config.quantum) if config.quantum > 0.0 else feature
 
     def missing(self, time: float) -> BoolArray | None:
-        """Return where the frame that is exposed at `time` [s] arrives without the feature, (...); None for nowhere."""
+        """Return in which lanes the frame exposed at `time` [s] arrives without the feature, (...); None for none."""
         config, absent = self._config, None
         if config.drop_probability > 0.0:
             absent = self._losses.next() < config.drop_probability
@@ -98,7 +93,7 @@ class Sensor:
         return absent if absent is not None and absent.any() else None
 
     def due(self, step: int, size: float) -> FloatArray:
-        """Return after which sub-step the frame is delivered that is due at `step` without jitter, (...).
+        """Return the sub-step after which a frame is delivered that would be due at `step` without jitter, (...).
 
         Args:
             step: number of the sub-step.
@@ -134,7 +129,7 @@ class Spell(NamedTuple):
     Attributes:
         left: (...), frames of the present spell that are left after this one.
         inside: (...), whether the present frame is in a spell.
-        value: (..., *), what the present spell drew, or the last one.
+        value: (..., *), drawn for the present spell, or for the last one.
     """
 
     left: npt.NDArray[np.int_]

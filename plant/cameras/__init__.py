@@ -1,1 +1,1 @@
-"""Sensing set-ups: what cameras, beside the arm or on its hand, measure of it."""
+"""Sensing set-ups: cameras, beside the arm or on its hand, and the features that they measure."""

@@ -1,4 +1,4 @@
-"""An arm seen by cameras, or with cameras on its hand, under any sensing set-up.
+"""An arm in front of cameras, or with cameras on its hand, under any sensing set-up.
 
 A camera is mounted on the base B (`fixed`) or on the flange F (`hand`); the target is on the flange or in the world:
 
@@ -19,28 +19,28 @@ from typing import Final, Literal, Self, TypeAlias, final
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.optics import Optics, in_image
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm
 from servobench.plant.contract.signals import BoolArray, Channel
 from servobench.plant.robot.arm import YZX, ZXY, SerialArm
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 
 Mount: TypeAlias = Literal["fixed", "hand"]
 """Whether the cameras are beside the arm and the target on it, or the reverse."""
 NEAREST: Final = 0.25  # of the planned distance, the least depth that an interaction matrix takes
-MIN_FACING: Final = 0.2  # cosine of the angle beyond which discs on a plate are not seen
+MIN_INCIDENCE: Final = 0.2  # cosine of the angle beyond which discs on a plate are not valid
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class EyeModel(SensedArm):
+class SetupModel(RobotModel):
     """An arm and its cameras under a sensing set-up; arrays have the leading axes of the arm's.
 
     Attributes:
         arm: the arm.
-        eye: the set-up.
+        setup: the set-up.
         mount: of the cameras.
         cameras: (..., c, 4, 4), poses of the cameras in the frame that they are mounted on.
         optics: their intrinsics.
@@ -51,7 +51,7 @@ class EyeModel(SensedArm):
     """
 
     arm: SerialArm
-    eye: Eye
+    setup: SensingSetup
     mount: Mount
     cameras: FloatArray
     optics: Optics
@@ -63,12 +63,12 @@ class EyeModel(SensedArm):
     @cached_property
     def channel(self) -> Channel:
         """Names, unit and natural size of the features."""
-        return self.eye.channel(self.focal, self.distance)
+        return self.setup.channel(self.focal, self.distance)
 
     @property
     def noise_unit(self) -> float:
-        """What a metre of noise is in the unit of the features: pixels have the same noise from everywhere."""
-        return self.eye.scale(self.focal, self.far)
+        """A metre of noise in the unit of the features; pixels have the same noise at every distance."""
+        return self.setup.scale(self.focal, self.far)
 
     @property
     def camera(self) -> FloatArray:
@@ -82,7 +82,7 @@ class EyeModel(SensedArm):
         return replace(self, cameras=cameras)
 
     def pivot(self, centre: npt.ArrayLike) -> FloatArray:
-        """Return the point that the first camera looks at, about which it turns: for a fixed one the given `centre`."""
+        """Return the point about which the first camera turns: for a fixed one `centre`, else on its optical axis."""
         if self.mount == "fixed":
             return np.asarray(centre, dtype=np.float64)
         return np.asarray(self.camera[..., :3, 3] + self.distance * self.camera[..., :3, 2])
@@ -92,40 +92,40 @@ class EyeModel(SensedArm):
         flange = self.arm.frames(joint_position)[..., -1, :, :]
         return self._mounted(flange, self._in_base(flange))
 
-    def seen(self, points: FloatArray) -> FloatArray:
+    def feature_at(self, points: FloatArray) -> FloatArray:
         """Return the features, (..., m), of a target at `points` (..., p, 3) m in the frame of the cameras' mount."""
-        return self.eye.measure(self._in_cameras(points), self.optics)
+        return self.setup.measure(self._in_cameras(points), self.optics)
 
-    def in_view(self, points: FloatArray, share: float = 1.0) -> BoolArray:
-        """Return which features are seen, (..., m), of such a target, within a share of the images' half sides."""
+    def valid_at(self, points: FloatArray, share: float = 1.0) -> BoolArray:
+        """Return which features of such a target are valid, (..., m), within a share of the images' half sides."""
         return self._valid(self._in_cameras(points), share)
 
-    def facing(self, points: FloatArray) -> FloatArray:
-        """Return the cosine of the angle between the first camera's sight and a plate's normal, (...); 1 of a point."""
-        return _facing(self._in_cameras(points)[..., 0, :, :])
+    def incidence(self, points: FloatArray) -> FloatArray:
+        """Return the cosine of the angle between a plate's normal and the first camera's ray, (...); 1 for a point."""
+        return _incidence(self._in_cameras(points)[..., 0, :, :])
 
-    def visible(self, joint_position: npt.ArrayLike) -> BoolArray | None:
-        """Return which features a camera sees, (..., m)."""
-        return self.in_view(self.points(joint_position))
+    def valid(self, joint_position: npt.ArrayLike) -> BoolArray | None:
+        """Return which features can be measured, (..., m)."""
+        return self.valid_at(self.points(joint_position))
 
     def feature(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return the true features, (..., m), for joint positions (..., n) in rad."""
-        return self.seen(self.points(joint_position))
+        return self.feature_at(self.points(joint_position))
 
     def feature_and_jacobian(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return `feature` and `jacobian`, both read-only, at the cost of one forward kinematics."""
-        y, J, _ = self.look(joint_position)
+        y, J, _ = self.observe(joint_position)
         return y, J
 
-    def look(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return features (..., m), Jacobian (..., m, n) and which features are seen (..., m), all read-only."""
+    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Return features (..., m), Jacobian (..., m, n) and which features are valid (..., m), all read-only."""
         points, motions = self.point_motions(joint_position)
-        y = self.eye.measure(points, self.optics)
-        J = self.eye.change(points, motions, self.optics)
-        seen = self._valid(points)
-        for array in (y, J, seen):
+        y = self.setup.measure(points, self.optics)
+        J = self.setup.change(points, motions, self.optics)
+        valid = self._valid(points)
+        for array in (y, J, valid):
             array.setflags(write=False)
-        return y, J, seen
+        return y, J, valid
 
     def point_motions(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the target in each camera, (..., c, p, 3) m, and its motion with the joints, (..., c, p, 3, n)."""
@@ -144,24 +144,24 @@ class EyeModel(SensedArm):
         """Return L, (..., c, p, k, 3): how the k features of each point change with its place in the camera.
 
         Args:
-            feature: (..., m), where the points are seen.
+            feature: (..., m), of the points.
             depth: (..., c, p) [m], of the points; at least `NEAREST` of the planned distance is taken.
 
         Raises:
             ValueError: the set-up has no such matrix.
         """
-        eye = self.eye
-        if eye.locate is None or not eye.single:
-            raise ValueError(f"sensing {eye.name} has no interaction matrix: single and locate must be given")
-        points = eye.locate(feature, np.maximum(depth, NEAREST * self.distance), self.optics)
+        setup = self.setup
+        if setup.locate is None or not setup.single:
+            raise ValueError(f"sensing {setup.name} has no interaction matrix: single and locate must be given")
+        points = setup.locate(feature, np.maximum(depth, NEAREST * self.distance), self.optics)
         along = np.broadcast_to(np.eye(3), (*points.shape, 3))
-        rates = eye.change(points, along, self.optics)
+        rates = setup.change(points, along, self.optics)
         return rates.reshape(*points.shape[:-1], -1, 3)
 
     def _valid(self, points: FloatArray, share: float = 1.0) -> BoolArray:
-        """Return which features are seen, (..., m), of points in the frame of each camera, (..., c, p, 3) m."""
-        front = _facing(points) > MIN_FACING
-        return self.eye.valid(np.logical_and(in_image(points, self.optics, share), front[..., None]))
+        """Return which features are valid, (..., m), for points in the frame of each camera, (..., c, p, 3) m."""
+        front = _incidence(points) > MIN_INCIDENCE
+        return self.setup.valid(np.logical_and(in_image(points, self.optics, share), front[..., None]))
 
     def _in_base(self, flange: FloatArray) -> FloatArray:
         """Return the target in the base frame, (..., p, 3) m."""
@@ -191,10 +191,10 @@ class EyeModel(SensedArm):
         return np.asarray(motions)
 
 
-def _facing(points: FloatArray) -> FloatArray:
-    """Return the cosine of the angle between the line of sight and a target's normal, (...), for (..., p, 3) m."""
+def _incidence(points: FloatArray) -> FloatArray:
+    """Return the cosine of the angle between a target's normal and the ray to its middle, (...), for (..., p, 3) m."""
     if points.shape[-2] < 3:
         return np.ones(points.shape[:-2])
     first, second = points[..., 1, :] - points[..., 0, :], points[..., 2, :] - points[..., 0, :]
-    normal, sight = np.cross(first, second), points.mean(axis=-2)
-    return np.asarray(np.vecdot(normal, sight) / np.maximum(norm(normal) * norm(sight), 1e-12))
+    normal, ray = np.cross(first, second), points.mean(axis=-2)
+    return np.asarray(np.vecdot(normal, ray) / np.maximum(norm(normal) * norm(ray), 1e-12))

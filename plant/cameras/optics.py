@@ -1,4 +1,4 @@
-"""Cameras as optics: a pinhole with radial distortion, its derivative, and what is in the image.
+"""Cameras as optics: a pinhole with radial distortion, its derivative, and the limits of the image.
 
 With p = (x, y, z) in the camera frame, z along the optical axis, x right and y down in the image,
 
@@ -21,7 +21,7 @@ from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.camera import PinholeCamera
 
 CAMERA: Final = PinholeCamera()  # as planned, of every set-up in pixels
-NEAR: Final = 0.02  # [m] least depth: a point behind it is not seen, and its features are those of this depth
+NEAR: Final = 0.02  # [m] least depth: a nearer point is not valid, and its features are those of this depth
 NEWTON_STEPS: Final = 12  # quadratic convergence from a start within the image
 
 
@@ -50,7 +50,7 @@ def ideal_optics(camera: PinholeCamera, count: int) -> Optics:
 
 
 def project(points: FloatArray, optics: Optics) -> FloatArray:
-    """Return where points appear.
+    """Return the pixels at which points appear.
 
     Args:
         points: (..., c, p, 3), in the frame of each camera [m]; numbers, or expressions in an array of objects.
@@ -65,7 +65,7 @@ def project(points: FloatArray, optics: Optics) -> FloatArray:
 
 
 def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> FloatArray:
-    """Return how points move in the images, (..., c, p, 2, n) px.
+    """Return the motions of points in the images, (..., c, p, 2, n) px.
 
     Args:
         points: (..., c, p, 3) [m].
@@ -83,7 +83,7 @@ def project_rates(points: FloatArray, motions: FloatArray, optics: Optics) -> Fl
 def locate(pixels: FloatArray, depth: FloatArray, optics: Optics) -> FloatArray:
     """Return the points that appear at given pixels, (..., c, p, 3) m: the inverse of `project` for known depths.
 
-    Where the distortion shows no point at all, it is one at the edge of what it shows.
+    A pixel at which the distortion shows no point gets a point at the edge of the visible ones.
 
     Args:
         pixels: (..., c, p, 2) [px].
@@ -109,7 +109,7 @@ def _undistorted(bent: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def in_image(points: FloatArray, optics: Optics, share: float = 1.0) -> BoolArray:
-    """Return which points, (..., c, p, 3) m, are before the camera and in the image, (..., c, p).
+    """Return which points, (..., c, p, 3) m, are in front of the camera and in the image, (..., c, p).
 
     Args:
         points: in the frame of each camera.

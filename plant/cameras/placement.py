@@ -1,11 +1,11 @@
 """Poses of the cameras and the target of a set-up: planned around a robot's workspace, and as drawn for a run.
 
-Fixed cameras look at the middle of the workspace from the same distance: the first one from above, as planned for
-`position`, a second one from in front, `SIDE` from the vertical. The target is on the flange, in place of the ball, and
-a plate faces the first camera at the arm's home.
+Fixed cameras are directed at the middle of the workspace from the same distance: the first one from above, as planned
+for `position`, a second one from in front, `SIDE` from the vertical. The target is on the flange, in place of the ball,
+and a plate faces the first camera at the arm's home.
 
-Cameras on the hand are in place of the ball, look along the flange's axis and are `BASELINE` apart if there are two,
-turned towards the point that they look at. The target is in the world, where they look from the arm's home.
+Cameras on the hand are in place of the ball and directed along the flange's axis; two of them are `BASELINE` apart and
+turned towards a common point. The target is in the world, at that point for the arm at home.
 
 The cameras of a run are drawn by name and seed, as the arm is. Focal lengths are scaled, principal points shifted and
 radial distortions set, each drawn uniformly from plus or minus the magnitude. A camera on the hand is turned about its
@@ -24,9 +24,9 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.model import EyeModel, Mount
+from servobench.plant.cameras.model import Mount, SetupModel
 from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.robot.arm import SerialArm
@@ -35,7 +35,7 @@ from servobench.plant.robot.mismatch import MAX_TILT, Mismatch, draw_camera_axis
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.workspace import camera_pose
 
-SIDE: Final = radians(60.0)  # of the second fixed camera's view from the vertical
+SIDE: Final = radians(60.0)  # of the second fixed camera's optical axis from the vertical
 HAND_DISTANCE: Final = 0.5  # [m] from a camera on the hand to the target at home; for a UR5
 BASELINE: Final = 0.2  # [m] between two cameras on the hand; for a UR5
 OPTICAL = ("focal", "centre", "distortion")  # axes of a mismatch that a camera in pixels has
@@ -72,7 +72,7 @@ def planned(count: int) -> CameraDraws:
 
 
 def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
-    """Draw how `count` cameras differ from those that are planned; `seed` is that of the robot's mismatch."""
+    """Draw the deviations of `count` cameras from the planned ones; `seed` is that of the robot's mismatch."""
     size = mismatch.size
 
     def draw(name: str, *shape: int) -> FloatArray:
@@ -91,7 +91,7 @@ def draw_cameras(mismatch: Mismatch, count: int, seed: int) -> CameraDraws:
 
 
 def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
-    """Return the rotation vector, (3,) rad, of a further camera, drawn as that of the first one is."""
+    """Return the rotation vector, (3,) rad, of a further camera, drawn as for the first one."""
     angle = mismatch.size("camera_rotation")
     axis = draw_camera_axis(angle, MAX_TILT, named_generator(seed, f"mismatch.camera_axis_{camera}"))
     share = 1.0 if mismatch.camera_exact else named_generator(seed, f"mismatch.camera_angle_{camera}").uniform(-1, 1)
@@ -99,23 +99,25 @@ def _draw_turn(mismatch: Mismatch, camera: int, seed: int) -> FloatArray:
 
 
 @lru_cache(maxsize=64)
-def nominal_model(eye: Eye, mount: Mount, robot: Robot) -> EyeModel:
+def nominal_model(setup: SensingSetup, mount: Mount, robot: Robot) -> SetupModel:
     """Return the nominal arm with cameras and target as planned, which controllers may know.
 
     Raises:
         ValueError: the arm has too few joints for the set-up.
     """
-    if robot.n < eye.least_joints:
-        wanted = f"an arm of {eye.least_joints} joints or more"
-        raise ValueError(f"sensing {eye.name} needs {wanted}, and {robot.title} has {robot.n}")
-    return _model(eye, mount, robot, robot.arm, planned_cameras(eye, mount, robot), planned(eye.cameras))
+    if robot.n < setup.least_joints:
+        wanted = f"an arm of {setup.least_joints} joints or more"
+        raise ValueError(f"sensing {setup.name} needs {wanted}, and {robot.title} has {robot.n}")
+    return _model(setup, mount, robot, robot.arm, planned_cameras(setup, mount, robot), planned(setup.cameras))
 
 
-def true_model(eye: Eye, mount: Mount, robot: Robot, arm: SerialArm, turn: FloatArray, draws: CameraDraws) -> EyeModel:
+def true_model(
+    setup: SensingSetup, mount: Mount, robot: Robot, arm: SerialArm, turn: FloatArray, draws: CameraDraws
+) -> SetupModel:
     """Return a true arm with cameras as drawn.
 
     Args:
-        eye: the set-up.
+        setup: the set-up.
         mount: of its cameras.
         robot: the nominal one.
         arm: the true one.
@@ -125,32 +127,32 @@ def true_model(eye: Eye, mount: Mount, robot: Robot, arm: SerialArm, turn: Float
     Raises:
         ValueError: see `nominal_model`.
     """
-    nominal = nominal_model(eye, mount, robot)
+    nominal = nominal_model(setup, mount, robot)
     turns = [turn, *draws.turn[1:]]
     pivot = nominal.pivot(robot.workspace.centre)
     cameras = np.stack([turn_about(pose, each, pivot) for pose, each in zip(nominal.cameras, turns, strict=True)])
     if mount == "hand":
         cameras[:, :3, :3] @= Rotation.from_rotvec(draws.mount).as_matrix()
         cameras[:, :3, 3] += arm.tool - robot.arm.tool
-    return _model(eye, mount, robot, arm, cameras, draws)
+    return _model(setup, mount, robot, arm, cameras, draws)
 
 
-def planned_cameras(eye: Eye, mount: Mount, robot: Robot) -> FloatArray:
+def planned_cameras(setup: SensingSetup, mount: Mount, robot: Robot) -> FloatArray:
     """Return the poses of the cameras as planned, (c, 4, 4), in the frame that they are mounted on.
 
     Raises:
         ValueError: more cameras than there are places for.
     """
-    if eye.cameras not in (1, 2):
-        raise ValueError(f"{eye.name} needs {eye.cameras} cameras, and there are places for one or two")
+    if setup.cameras not in (1, 2):
+        raise ValueError(f"{setup.name} needs {setup.cameras} cameras, and there are places for one or two")
     work = robot.workspace
     if mount == "fixed":
-        above, distance = work.camera_pose()[:3, :3], eye.closeness * work.camera_distance
+        above, distance = work.camera_pose()[:3, :3], setup.closeness * work.camera_distance
         front = Rotation.from_euler("y", SIDE).as_matrix() @ above
-        return np.stack([camera_pose(R, work.centre, distance) for R in (above, front)[: eye.cameras]])
-    poses = np.stack([np.eye(4)] * eye.cameras)
+        return np.stack([camera_pose(R, work.centre, distance) for R in (above, front)[: setup.cameras]])
+    poses = np.stack([np.eye(4)] * setup.cameras)
     poses[:, :3, 3] = robot.arm.tool
-    if eye.cameras == 2:
+    if setup.cameras == 2:
         half, distance = 0.5 * BASELINE * work.scale, HAND_DISTANCE * work.scale
         for pose, side in zip(poses, (-1.0, 1.0), strict=True):
             angle = -side * atan2(half, distance)
@@ -159,17 +161,19 @@ def planned_cameras(eye: Eye, mount: Mount, robot: Robot) -> FloatArray:
     return poses
 
 
-def _model(eye: Eye, mount: Mount, robot: Robot, arm: SerialArm, cameras: FloatArray, draws: CameraDraws) -> EyeModel:
+def _model(
+    setup: SensingSetup, mount: Mount, robot: Robot, arm: SerialArm, cameras: FloatArray, draws: CameraDraws
+) -> SetupModel:
     work = robot.workspace
-    optics = ideal_optics(CAMERA, eye.cameras)
+    optics = ideal_optics(CAMERA, setup.cameras)
     optics = Optics(optics.focal * draws.focal, optics.centre + draws.centre, draws.distortion, optics.size)
     home = robot.arm.frames(work.home)[-1]
-    shape = work.scale * np.array(eye.target)
+    shape = work.scale * np.array(setup.target)
     if mount == "fixed":
-        facing = home[:3, :3].T @ work.camera_pose()[:3, :3]
-        target, distance = arm.tool + shape @ facing.T, eye.closeness * work.camera_distance
+        R_FC = home[:3, :3].T @ work.camera_pose()[:3, :3]
+        target, distance = arm.tool + shape @ R_FC.T, setup.closeness * work.camera_distance
     else:
         distance = HAND_DISTANCE * work.scale
         ahead = robot.arm.tool + np.array([0.0, 0.0, distance])
         target = (shape + ahead) @ home[:3, :3].T + home[:3, 3]
-    return EyeModel(arm, eye, mount, cameras, optics, target, distance, CAMERA.focal, work.camera_distance)
+    return SetupModel(arm, setup, mount, cameras, optics, target, distance, CAMERA.focal, work.camera_distance)

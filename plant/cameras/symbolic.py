@@ -17,11 +17,11 @@ import casadi
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.model import MIN_FACING, EyeModel, Mount
+from servobench.plant.cameras.model import MIN_INCIDENCE, Mount, SetupModel
 from servobench.plant.cameras.optics import NEAR, Optics, project
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.robot.arm import SerialArm
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 
 Expressions: TypeAlias = npt.NDArray[Any]
 """An array of CasADi expressions."""
@@ -75,7 +75,7 @@ class HandEyeGeometry:
 
     @property
     def arm(self) -> ArmGeometry:
-        """What describes the arm."""
+        """The part that describes the arm."""
         return ArmGeometry(self.translation, self.rpy, self.joint_offset, self.gear_ratio)
 
 
@@ -132,7 +132,7 @@ def symbolic_ball(model: HandEyeModel) -> casadi.Function:
 
 
 @dataclass(frozen=True, eq=False)
-class EyeGeometry:
+class SetupGeometry:
     """Everything that describes an arm, its cameras and its target, as CasADi symbols or constants.
 
     Attributes:
@@ -148,13 +148,13 @@ class EyeGeometry:
     optics: Optics
 
     @classmethod
-    def of(cls, model: EyeModel) -> Self:
+    def of(cls, model: SetupModel) -> Self:
         """Return the geometry of `model` as constants."""
         poses = [(casadi.SX(pose[:3, :3]), casadi.SX(pose[:3, 3])) for pose in model.cameras]
         return cls(ArmGeometry.of(model.arm), [casadi.SX(point) for point in model.target], poses, model.optics)
 
 
-def symbolic_feature(model: SensedArm) -> casadi.Function:
+def symbolic_feature(model: RobotModel) -> casadi.Function:
     """Return q -> feature, (n,) rad -> (m,), with the numbers of `model` bound.
 
     Raises:
@@ -162,15 +162,15 @@ def symbolic_feature(model: SensedArm) -> casadi.Function:
     """
     if isinstance(model, HandEyeModel):
         return symbolic_ball(model)
-    if not isinstance(model, EyeModel):
+    if not isinstance(model, SetupModel):
         raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
     q = casadi.SX.sym("joint_position", model.arm.n)
-    geometry = EyeGeometry.of(model)
-    feature = features(points_in_cameras(q, geometry, model.mount), geometry.optics, model.eye)
+    geometry = SetupGeometry.of(model)
+    feature = features(points_in_cameras(q, geometry, model.mount), geometry.optics, model.setup)
     return casadi.Function("feature", [q], [feature], ["joint_position"], ["feature"])
 
 
-def points_in_cameras(joint_position: SX, geometry: EyeGeometry, mount: Mount) -> Expressions:
+def points_in_cameras(joint_position: SX, geometry: SetupGeometry, mount: Mount) -> Expressions:
     """Return the target in the frame of each camera, (1, c, p, 3) m, as expressions.
 
     Args:
@@ -178,55 +178,55 @@ def points_in_cameras(joint_position: SX, geometry: EyeGeometry, mount: Mount) -
         geometry: symbols or constants.
         mount: of the cameras.
     """
-    # A leading axis keeps whatever the function takes apart an array, whose entries numpy asks for their own functions.
+    # With a leading axis every part that the function takes is an array, and numpy calls the functions of its entries.
     points = np.empty((1, len(geometry.cameras), len(geometry.target), 3), dtype=object)
     *_, flange, place = arm_frames(joint_position, geometry.arm)
     for p, target in enumerate(geometry.target):
         mounted = place + flange @ target if mount == "fixed" else flange.T @ (target - place)
         for c, (rotation, position) in enumerate(geometry.cameras):
-            seen = rotation.T @ (mounted - position)
-            points[0, c, p] = [seen[0], seen[1], seen[2]]
+            p_C = rotation.T @ (mounted - position)
+            points[0, c, p] = [p_C[0], p_C[1], p_C[2]]
     return points
 
 
-def features(points: Expressions, optics: Optics, eye: Eye) -> SX:
-    """Return what a set-up makes of points (1, c, p, 3), (m, 1).
+def features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
+    """Return the features of a set-up, (m, 1), for points (1, c, p, 3).
 
     Raises:
         ValueError: the set-up's function cannot be carried out over expressions.
     """
     try:
-        made: Any = eye.measure(points, optics)
+        made: Any = setup.measure(points, optics)
     except (TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"sensing {eye.name} has no symbolic twin: {error}") from error
+        raise ValueError(f"sensing {setup.name} has no symbolic twin: {error}") from error
     return casadi.vertcat(*made[0].tolist())
 
 
-def seen_features(points: Expressions, optics: Optics, eye: Eye) -> SX:
-    """Return which features are seen of points (1, c, p, 3), (m, 1) of ones and zeros; see `EyeModel.in_view`."""
+def valid_features(points: Expressions, optics: Optics, setup: SensingSetup) -> SX:
+    """Return which features of points (1, c, p, 3) are valid, (m, 1) of ones and zeros; see `SetupModel.valid_at`."""
     pixels, half = project(points, optics)[0], 0.5 * np.array(optics.size)
     seen = []
     for points_of_camera, pixels_of_camera in zip(points[0], pixels, strict=True):
-        front = _facing(points_of_camera)
+        front = _shows_front(points_of_camera)
         for point, pixel in zip(points_of_camera, pixels_of_camera, strict=True):
             inside = [casadi.fabs(pixel[axis] - half[axis]) <= half[axis] for axis in (0, 1)]
             seen.append(casadi.logic_and(casadi.logic_and(*inside), casadi.logic_and(point[2] > NEAR, front)))
-    if eye.single:
-        return casadi.vertcat(*(each for each in seen for _ in range(eye.m // len(seen))))
+    if setup.single:
+        return casadi.vertcat(*(each for each in seen for _ in range(setup.m // len(seen))))
     whole = seen[0]
     for each in seen[1:]:
         whole = casadi.logic_and(whole, each)
-    return casadi.vertcat(*[whole] * eye.m)
+    return casadi.vertcat(*[whole] * setup.m)
 
 
-def _facing(points: Expressions) -> SX:
-    """Return whether points (p, 3) show their front; see `MIN_FACING`."""
+def _shows_front(points: Expressions) -> SX:
+    """Return whether points (p, 3) show their front; see `MIN_INCIDENCE`."""
     if len(points) < 3:
         return casadi.SX(1.0)
     at = [casadi.vertcat(*point) for point in points]
-    normal, sight = casadi.cross(at[1] - at[0], at[2] - at[0]), sum(at[1:], at[0]) / len(at)
-    lengths = casadi.fmax(casadi.norm_2(normal) * casadi.norm_2(sight), 1e-12)
-    return casadi.dot(normal, sight) / lengths > MIN_FACING
+    normal, ray = casadi.cross(at[1] - at[0], at[2] - at[0]), sum(at[1:], at[0]) / len(at)
+    lengths = casadi.fmax(casadi.norm_2(normal) * casadi.norm_2(ray), 1e-12)
+    return casadi.dot(normal, ray) / lengths > MIN_INCIDENCE
 
 
 def _rotation(rpy: SX) -> SX:

@@ -1,9 +1,9 @@
-"""The user's cache folder: entries that are made once, verify themselves, and are made anew where they are damaged.
+"""The user's cache folder: entries with checksums, made once, and made again where they are damaged.
 
-    <cache>/servobench/<kind>/<key>/files/...     what was made
+    <cache>/servobench/<kind>/<key>/files/...     its files
     <cache>/servobench/<kind>/<key>/seal.json     the SHA-256 of each of these files
 
-An entry appears whole or not at all, whoever else makes it at the same time. A process verifies it once, so that a
+An entry appears whole or not at all, also if several processes make it at once. A process verifies it once, so that a
 flipped bit or a file cut short never reaches a run. Entries that were not used for long are removed.
 """
 
@@ -46,7 +46,7 @@ def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
         make: writes the files into an empty folder.
 
     Raises:
-        ValueError: the cache folder cannot be written; besides, what `make` raises.
+        ValueError: the cache folder cannot be written, or `make` raises it.
     """
     entry = cache_folder(kind) / key
     if entry not in _verified or not entry.is_dir():
@@ -59,7 +59,7 @@ def cached(kind: str, key: str, make: Callable[[Path], object]) -> Path:
 
 
 def is_whole(entry: Path) -> bool:
-    """Return whether the files of an entry are there as they were made; others may have come beside them."""
+    """Return whether the files of an entry are there as they were made; additional files do not matter."""
     try:
         sums = json.loads((entry / SEAL).read_text(encoding="utf-8"))
         return bool(sums) and all(_sum(entry / FILES / name) == wanted for name, wanted in sums.items())
@@ -68,7 +68,7 @@ def is_whole(entry: Path) -> bool:
 
 
 def _make(entry: Path, make: Callable[[Path], object]) -> None:
-    """Make an entry beside its place and move it there; nothing is left where that fails."""
+    """Make an entry in a temporary folder and move it to its place; nothing is left where that fails."""
     kind = entry.parent
     try:
         kind.mkdir(parents=True, exist_ok=True)
@@ -103,7 +103,7 @@ def _sum(path: Path) -> str:
 
 
 def _remove(entry: Path) -> None:
-    """Remove an entry so that no process meets a part of it under its name."""
+    """Remove an entry in one step, so that no process finds a part of it under its name."""
     if entry.exists():
         aside = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=entry.parent))
         with contextlib.suppress(FileNotFoundError):
@@ -112,7 +112,7 @@ def _remove(entry: Path) -> None:
 
 
 def _prune(kind: Path) -> None:
-    """Remove entries that were not used for long, and what processes left that were killed while they made one."""
+    """Remove entries that were not used for long, and unfinished ones of processes that were killed."""
     now, ages = time.time(), dict[Path, float]()
     for path in kind.iterdir():
         with contextlib.suppress(FileNotFoundError):
@@ -126,7 +126,7 @@ def _prune(kind: Path) -> None:
 
 @contextlib.contextmanager
 def _alone(kind: Path) -> Iterator[None]:
-    """Keep other processes from moving entries of a kind meanwhile, where the system can."""
+    """Hold a lock against other processes that move entries of a kind, where the system has locks."""
     with (kind / ".lock").open("a") as file, contextlib.ExitStack() as stack:
         try:
             import fcntl  # noqa: PLC0415 - not on Windows

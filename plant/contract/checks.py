@@ -1,4 +1,4 @@
-"""Arrays and numbers that are checked where they come in."""
+"""Checks of arrays and numbers at the boundary of a function."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def is_finite(array: FloatArray) -> bool:
-    """Return whether no entry is infinite or NaN; a finite sum of squares says so at a third of the cost."""
+    """Return whether no entry is infinite or NaN; the sum of squares is tried first, at a third of the cost."""
     flat = array.reshape(-1)
     return math.isfinite(flat.dot(flat)) or bool(np.isfinite(array).all())
 
@@ -61,7 +61,7 @@ def check_number(
         below: it must be less than this.
 
     Raises:
-        ValueError: not finite, or out of bounds; names the argument, what was wanted and what came.
+        ValueError: not finite, or out of bounds; names the argument, the wanted and the given value.
     """
     if not (math.isfinite(value) and above < value < below and at_least <= value <= at_most):
         bounds = {"above": above, "at least": at_least, "at most": at_most, "below": below}
@@ -70,7 +70,7 @@ def check_number(
 
 
 def whole_steps(period: float, own_step: float) -> int:
-    """Return how many own steps of a plant make a control period.
+    """Return the number of a plant's own steps in a control period.
 
     Args:
         period: control period, s.

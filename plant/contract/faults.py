@@ -1,4 +1,4 @@
-"""Every named reason why a run ends before its last period; `status` is what the table of runs shows.
+"""Every named reason why a run ends before its last period; `status` is its word in the table of runs.
 
     RunFault                    fault
     ├── PlantDiverged           plant_diverged
@@ -24,13 +24,13 @@ class RunFault(RuntimeError):
 
 
 class PlantDiverged(RunFault):
-    """The plant's state left the finite numbers."""
+    """The plant's state is no longer finite."""
 
     status: ClassVar[str] = "plant_diverged"
 
 
 class Collision(RunFault):
-    """The arm met itself or something in the room."""
+    """The arm touched itself or a body of the room."""
 
     status: ClassVar[str] = "collision"
 
@@ -42,13 +42,13 @@ class FeatureLost(RunFault):
 
 
 class FmuError(RunFault):
-    """An FMU reported a failure, or answered with something that is not a number."""
+    """An FMU reported a failure or returned a value that is not finite."""
 
     status: ClassVar[str] = "fmu_error"
 
 
 class ControllerDiverged(RunFault):
-    """A controller asked for something that is not finite."""
+    """A controller returned a command that is not finite."""
 
     status: ClassVar[str] = "controller_diverged"
 

@@ -1,4 +1,4 @@
-"""Files: written whole or not at all, also after a power cut, and TOML that is refused in one line."""
+"""Atomic writing of files, and reading of TOML with errors of one line."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_toml(what: str, path: Path) -> dict[str, Any]:
-    """Return what a TOML file holds.
+def read_toml(kind: str, path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file.
 
     Args:
-        what: the file is, for error messages, such as "mapping".
+        kind: of the file, for error messages, such as "mapping".
         path: the file.
 
     Raises:
@@ -43,18 +43,18 @@ def read_toml(what: str, path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{what} {path} cannot be read: {reason(error)}") from error
+        raise ValueError(f"{kind} {path} cannot be read: {reason(error)}") from error
     except (ValueError, RecursionError) as error:  # ValueError: no TOML, or a number of thousands of digits
-        raise ValueError(f"{what} {path} is not valid TOML: {error}") from error
+        raise ValueError(f"{kind} {path} is not valid TOML: {error}") from error
 
 
 def reason(error: Exception) -> str:
-    """Return why a file cannot be read or written, without number and path for an error of the system."""
+    """Return the reason of an error about a file; for an error of the system without its number and path."""
     return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def user_path(text: str) -> Path:
-    """Return the path that a user wrote, with ~ for a home folder.
+    """Return a path as written by a user, in which ~ stands for a home folder.
 
     Raises:
         ValueError: there is no such home folder.
@@ -71,7 +71,7 @@ def partial_path(path: Path) -> Path:
 
 
 def sync(path: Path) -> None:
-    """Wait until what a file holds, or which files a folder has, is on the disk.
+    """Wait until the content of a file, or the list of files of a folder, is on the disk.
 
     Without it a file may have its name before it has its content, so that a power cut leaves an empty one.
     """
@@ -85,7 +85,7 @@ def sync(path: Path) -> None:
 
 
 def point_latest(folder: Path) -> None:
-    """Let the link `latest` beside `folder` point at it; where links cannot be made, nothing happens."""
+    """Point the link `latest` in the parent folder at `folder`; where links cannot be made, nothing happens."""
     link = folder.parent / "latest"
     partial = folder.parent / f".latest-{os.getpid()}"
     if link.exists() and not link.is_symlink():

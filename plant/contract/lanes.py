@@ -1,11 +1,11 @@
 """Many runs side by side: arrays with leading axes, a lane a run; a single run has no leading axis.
 
-Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. What is to happen in some lanes
+Parts are written once, over arrays (..., n): a single run is the batch of shape `()`. An action in some lanes
 only goes through `branch`, so that no part writes a mask. A state is a tree of arrays: named tuples, tuples and
-dataclasses, of which every array has the leading axes; whatever else is in them is shared by all lanes. A number of a
+dataclasses, of which every array has the leading axes; all other values in them are shared by all lanes. A number of a
 single run is a scalar of numpy, which costs a tenth of an array without axes: `array[()]` makes the one of the other.
 
-A lane has the same bits whatever its neighbours are, as long as no leading axis becomes an axis of a matrix: products
+A lane has the same bits beside any neighbours, as long as no leading axis becomes an axis of a matrix: products
 are `@`, `numpy.matvec`, `numpy.vecmat` and `numpy.vecdot`, and sums run over the last, contiguous axes.
 """
 
@@ -42,13 +42,13 @@ def map_arrays(function: Callable[..., Any], tree: Any, *others: Any) -> Any:  #
 
 
 def take(tree: Tree, lanes: Lanes) -> Tree:
-    """Return a tree with the lanes that an index names; a single number gives the tree of a single run."""
+    """Return a tree with the indexed lanes; a single number gives the tree of a single run."""
     taken: Tree = map_arrays(lambda array: array[lanes], tree)
     return taken
 
 
 def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
-    """Return a tree in which the lanes that an index names are those of `part`; they were those of `before`."""
+    """Return a tree with the indexed lanes taken from `part` and all others from `before`."""
 
     def replaced(array: FloatArray, values: FloatArray, old: FloatArray) -> FloatArray:
         if values is old:
@@ -62,18 +62,18 @@ def put(tree: Tree, lanes: Lanes, part: Tree, before: Tree) -> Tree:
 
 
 def stack(trees: Sequence[Tree]) -> Tree:
-    """Return the trees of single runs as one tree with a leading axis; what is no array is that of the first one."""
+    """Return the trees of single runs as one with a leading axis; values other than arrays are those of the first."""
     stacked: Tree = map_arrays(lambda *arrays: np.stack(arrays), *trees)
     return stacked
 
 
 def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *arguments: Any) -> Tree:  # noqa: ANN401
-    """Return `function(tree, *arguments)` in the lanes that are chosen and `tree` in all others.
+    """Return `function(tree, *arguments)` in the chosen lanes and `tree` in all others.
 
     Args:
         chosen: (...), bool.
-        function: returns a tree like its first argument; it sees only lanes that are chosen, along one axis.
-        tree: what may change.
+        function: returns a tree like its first argument; it gets only the chosen lanes, along one axis.
+        tree: the values that may change.
         arguments: further trees that the function needs.
     """
     mask = np.asarray(chosen)
@@ -92,7 +92,7 @@ def branch(chosen: npt.ArrayLike, function: Callable[..., Tree], tree: Tree, *ar
 def repeat(
     condition: Callable[[Tree], npt.ArrayLike], function: Callable[[Tree], Tree], tree: Tree, at_most: int
 ) -> Tree:
-    """Return a tree after `function` was applied, `at_most` so often, in the lanes in which a condition still holds.
+    """Apply `function` up to `at_most` times in the lanes in which a condition still holds, and return the tree.
 
     Args:
         condition: of a tree, (...), bool.
@@ -109,7 +109,7 @@ def repeat(
 
 
 def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Mark a function that is written for single runs: it is called for one lane after the other.
+    """Decorate a function for single runs so that it is called for one lane after the other.
 
     Args:
         signature: its arguments and results without leading axes, as of `numpy.vectorize`: "(n),(m,n)->(n)".
@@ -132,7 +132,7 @@ def lane_by_lane(signature: str) -> Callable[[Callable[..., Any]], Callable[...,
 
 
 def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) -> npt.NDArray[Any]:
-    """Return the entries that an index of each lane names along the first axis after the leading ones.
+    """Return the entries at one index for each lane, along the first axis after the leading ones.
 
     Args:
         array: (..., k, *).
@@ -152,7 +152,7 @@ def pick(array: npt.NDArray[Any], index: npt.NDArray[np.int_], axes: int = 0) ->
 
 
 def where(chosen: npt.ArrayLike, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return `one` in the lanes that are chosen, (...), and `other` elsewhere; both may have further axes."""
+    """Return `one` in the chosen lanes, (...), and `other` elsewhere; both may have further axes."""
     mask = np.asarray(chosen)
     return np.where(mask.reshape(mask.shape + (1,) * (max(np.ndim(one), np.ndim(other)) - mask.ndim)), one, other)
 

@@ -48,7 +48,7 @@ def named_seed(seed: int, name: str) -> int:
 
 
 class Stream:
-    """Random numbers of a part, drawn ahead: each run has the numbers of its own named generator, one after the other.
+    """Random numbers of a part, drawn in advance: each run gets the numbers of its own named generator in order.
 
     It can be copied and pickled.
     """

@@ -47,7 +47,7 @@ Periods: TypeAlias = Annotated[int, Ge(0)]
 """A whole number of control periods, or another count that may be 0."""
 
 
-def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
+def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - as read from a file
     if isinstance(value, np.ndarray):
         return value.astype(np.float64)
     entries = value if isinstance(value, list | tuple) else [value]
@@ -59,7 +59,7 @@ def _as_numbers(value: Any) -> FloatArray:  # noqa: ANN401 - what a file holds
         raise PydanticCustomError("numbers", "numbers below 1e308") from error
 
 
-def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - what a file holds
+def _as_values(value: Any) -> npt.NDArray[Any]:  # noqa: ANN401 - as read from a file
     if isinstance(value, np.ndarray) and value.dtype.kind in "bU":
         return value
     entries = value if isinstance(value, list | tuple) else [value]
@@ -107,7 +107,7 @@ STRICT = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 def settings(kind: Class) -> Class:
     """Make a class a frozen dataclass whose fields are checked on construction.
 
-    Construction raises a `ValueError` of one line that names the field, what was wanted and what came.
+    Construction raises a `ValueError` of one line that names the field, the wanted and the given value.
     """
     checked: Any = dataclass(frozen=True, config=STRICT)(kind)
     construct, names = checked.__init__, [item.name for item in fields(checked)]
@@ -159,21 +159,21 @@ def override(name: str, default: Config, values: Mapping[str, Any]) -> Config:
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """Return what to say after an unknown word: the nearest known one, then all of them, or the first of many."""
+    """Return a remedy for an unknown word: the nearest known one, then all of them, or the first of many."""
     names = sorted(known)
     near = nearest(word, names)
     return f"{f'did you mean {near!r}? ' if near else ''}valid: {listed(names)}"
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is most like a word that somebody may have mistyped; None if none is like it."""
+    """Return the known word that is most like a possibly mistyped word; None if none is like it."""
     by_letters = {each.lower(): each for each in known}
     near = difflib.get_close_matches(word.lower(), by_letters, n=1)
     return by_letters[near[0]] if near else None
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return what to say after a list of known words: the nearest one; nothing if none is like `word`."""
+    """Return a remedy to follow a list of known words: the nearest one; nothing if none is like `word`."""
     near = nearest(word, known)
     return f"; did you mean {near!r}?" if near else ""
 
@@ -185,7 +185,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _suggest_setting(key: str, section: object) -> str:
-    """Return what to say after an unknown key: where in a nested section it stands, or the nearest one."""
+    """Return a remedy for an unknown key: where in a nested section it stands, or the nearest one."""
     known = [item.name for item in fields(cast(Any, section))]
     for name in known:
         part = getattr(section, name)
@@ -207,18 +207,18 @@ def _with_tuples(value: object) -> object:
 
 @cache
 def _adapters(kind: type) -> dict[str, TypeAdapter[Any]]:
-    """Return what checks a value of each field that is not a section."""
+    """Return a validator for each field that is not a section."""
     hints = get_type_hints(kind, include_extras=True)
     types = {item.name: hints[item.name] for item in fields(kind)}
     return {key: TypeAdapter(hint, config=STRICT) for key, hint in types.items() if not is_dataclass(hint)}
 
 
 def describe(error: ValidationError, name: str = "") -> str:
-    """Return the first complaint of pydantic as one line: field, what was wanted, what came.
+    """Return the first complaint of pydantic as one line: field, wanted and given value.
 
     Args:
-        error: what pydantic raised.
-        name: of what was checked, in front of the field.
+        error: raised by pydantic.
+        name: of the checked object, in front of the field.
     """
     first = error.errors(include_url=False)[0]
     name = ".".join([name] * bool(name) + [str(part) for part in first["loc"]])

@@ -153,7 +153,7 @@ class PlantSpec:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What a controller sees at an instant.
+    """The measurements that a controller gets at an instant.
 
     Many runs side by side share one observation, whose arrays have a leading axis; the bench makes it.
 
@@ -186,7 +186,7 @@ class Observation:
         object.__setattr__(self, "valid", valid)
         object.__setattr__(self, "feature_valid", bool(valid.all()))
 
-    def seen_as(self, joint_position: FloatArray, feature: FloatArray) -> Observation:
+    def with_values(self, joint_position: FloatArray, feature: FloatArray) -> Observation:
         """Return this observation with other joint positions and another feature, which are finite."""
         return trusted_observation(self.time, joint_position, feature, self.feature_valid, self.valid)
 

@@ -20,7 +20,7 @@ TIME_TOLERANCE: Final = 1e-9  # [s] within which two times are equal
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of the bench in sub-steps, of which number i ends at the time i h.
+    """Times of the bench in sub-steps of length h; sub-step i ends at the time i h.
 
     Attributes:
         steps: in a control period, N.
@@ -62,7 +62,7 @@ class Timing:
         return step % self.frames == self.phase
 
     def under_way(self) -> list[int]:
-        """Return when the frames are due that are on their way at the start, as numbers of sub-steps above 0."""
+        """Return the sub-steps, above 0, at which the frames are due that were exposed before the start."""
         begins = range(1 - self.latency, 1)
         return [begin + self.latency for begin in begins if self.exposes(begin)]
 

@@ -1,6 +1,6 @@
 """Extracts an .fmu archive once: into the user's cache, under a name that is a hash of the archive's content.
 
-All processes share the folder, nobody writes into it, and a second plant of the same FMU only looks it up. An archive
+All processes share the folder and none writes into it; a second plant of the same FMU finds it there. An archive
 is judged by its table of contents before a byte is unpacked; Python's reader never unpacks more than that says.
 """
 
@@ -24,7 +24,7 @@ MAX_DESCRIPTION: Final = 32_000_000  # [bytes] of the model description, which i
 MAX_RATIO: Final = 100.0  # of the unpacked size to that of the archive; libraries reach 5, tables of numbers 20
 SMALL: Final = 16_000_000  # [bytes] unpacked, below which the ratio does not matter
 DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EACCES)  # not of the archive
-DAMAGES: Final = (  # what Python's reader of archives raises
+DAMAGES: Final = (  # raised by Python's reader of archives
     zipfile.BadZipFile,
     zlib.error,
     lzma.LZMAError,
@@ -93,7 +93,7 @@ def _check_names(path: Path, entries: list[zipfile.ZipInfo]) -> None:
 
 
 def _check_sizes(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse an archive that is built, or damaged, to fill the disk or the memory."""
+    """Refuse an archive that would fill the disk or the memory."""
     if len(entries) > MAX_FILES:
         raise ValueError(f"fmu file {path} holds {len(entries)} files; at most {MAX_FILES} are unpacked")
     description = max(entry.file_size for entry in entries if entry.filename == DESCRIPTION)

@@ -112,7 +112,7 @@ class FmuDescription:
 
         Args:
             name: of a scalar, of an array, or of a family of scalars.
-            role: what the mapping uses it for, for the message.
+            role: its use in the mapping, for the message.
             types: that may be used there; None for all.
 
         Raises:
@@ -144,7 +144,7 @@ class FmuDescription:
 
 
 def total_size(variables: Iterable[Variable]) -> int:
-    """Return how many numbers the variables hold together."""
+    """Return the total number of values of the variables."""
     return sum(variable.size for variable in variables)
 
 
@@ -180,7 +180,7 @@ def read_description(path: Path, root: Path) -> FmuDescription:
 
 
 def _step(root: Path, tag: str, name: str) -> float | None:
-    """Return a step size, s, that the FMU names, as fmpy does not read all of them."""
+    """Return a step size of the description, s; fmpy does not read all of them."""
     element = ET.parse(root / DESCRIPTION).getroot().find(tag)
     try:
         step = float("nan" if element is None else element.get(name, "nan"))
@@ -206,7 +206,7 @@ def read_exchange(path: Path, root: Path) -> None:
         raise ValueError(f"fmu file {path} has no directional derivatives, so its Jacobian cannot be read; {wanted}")
     if exchange.canBeInstantiatedOnlyOncePerProcess:
         raise ValueError(
-            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read beside a run"
+            f"fmu file {path} allows one instance in a process, so its Jacobian cannot be read during a run"
         )
 
 
@@ -231,7 +231,7 @@ def parse_description(path: Path, root: Path) -> Any:  # noqa: ANN401 - fmpy's c
 
 
 def _line(words: object) -> str:
-    """Return words of a foreign file as one line of a length that can be read."""
+    """Return text of a foreign file as one line of limited length."""
     return shorten(" ".join(str(words).split()) or type(words).__name__, 300, placeholder=" ...")
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol, TypeAlias, final
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -88,72 +88,17 @@ class FmuState:
     integrated: FloatArray
 
 
-class Stateful(Protocol):
-    """The part of an instance that is used here."""
-
-    state: ClassVar[str]
-    deserialise: ClassVar[str]
-
-    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
-        """Call a function of the library and check its status; raises FmuError."""
-
-
-@final
-class States:
-    """The states of one instance."""
-
-    def __init__(self, instance: Stateful) -> None:
-        """Take the instance."""
-        self._instance, self._word = instance, instance.state
-
-    def save(self) -> ctypes.c_void_p:
-        """Return the present state; it has to be given to `free`."""
-        state = ctypes.c_void_p()
-        self._instance.call(f"Get{self._word}", ctypes.byref(state))
-        return state
-
-    def restore(self, state: ctypes.c_void_p) -> None:
-        """Return to a saved state."""
-        self._instance.call(f"Set{self._word}", state)
-
-    def free(self, state: ctypes.c_void_p) -> None:
-        """Free a saved state."""
-        self._instance.call(f"Free{self._word}", ctypes.byref(state))
-
-    def save_bytes(self) -> bytes:
-        """Return the present state as bytes that another process understands."""
-        state = self.save()
-        try:
-            size = ctypes.c_size_t()
-            self._instance.call(f"Serialized{self._word}Size", state, ctypes.byref(size))
-            content = (ctypes.c_char * size.value)()
-            self._instance.call(f"Serialize{self._word}", state, content, size)
-            return bytes(content)
-        finally:
-            self.free(state)
-
-    def restore_bytes(self, content: bytes) -> None:
-        """Return to a state from `save_bytes`."""
-        state = ctypes.c_void_p()
-        place = ctypes.c_size_t(len(content)), ctypes.byref(state)
-        self._instance.call(f"{self._instance.deserialise}{self._word}", content, *place)
-        try:
-            self.restore(state)
-        finally:
-            self.free(state)
-
-
 class Instance(ABC):
-    """One instance of a co-simulation FMU; `states` saves and restores it.
+    """One instance of an FMU.
 
     Attributes:
         prefix: of the names of all functions in the library.
-        real: what the functions that read and write real numbers call these.
-        kinds: what they call variables of each numeric type, and how these lie in memory.
-        state: what the functions for states call these.
+        real: word for real numbers in the names of the functions that read and write them.
+        kinds: the same word for each numeric type, and how its numbers lie in memory.
+        state: word for states in the names of their functions.
         deserialise: the verb of the function that reads a state from bytes.
         early: word for a step that ended early.
-        derivatives: what the function that reads the states' derivatives is called.
+        derivatives: name of the function that reads the states' derivatives.
     """
 
     prefix: ClassVar[str]
@@ -169,7 +114,7 @@ class Instance(ABC):
         description: FmuDescription,
         root: Path,
         library: Any = None,  # noqa: ANN401 - ctypes
-        asked: InstanceOptions = NO_OPTIONS,
+        options: InstanceOptions = NO_OPTIONS,
     ) -> None:
         """Make an instance.
 
@@ -177,7 +122,7 @@ class Instance(ABC):
             description: of the FMU.
             root: folder to which it is extracted.
             library: from `load_library`, which the caller unloads; None: the instance loads one of its own.
-            asked: what the user asks of it.
+            options: of the instance.
 
         Raises:
             ValueError: no library for this machine, or one that cannot be loaded.
@@ -185,9 +130,8 @@ class Instance(ABC):
         """
         self.description = description
         self.root = root
-        self.asked = asked
-        self.states = States(self)
-        self.log = MessageLog(description.path.name, asked.debug_log)
+        self.options = options
+        self.log = MessageLog(description.path.name, options.debug_log)
         self._begun = False  # whether it has to be terminated before it is freed
         self._owns_library = library is None
         self._library = load_library(description, root) if library is None else library
@@ -222,7 +166,7 @@ class Instance(ABC):
 
     @abstractmethod
     def step_call(self, now: ctypes.c_double, step: ctypes.c_double) -> RawCall:
-        """Return a function that takes a step of size `step`, s, at the time `now`, s, as both are at every call.
+        """Return a function that takes a step of size `step`, s, at the time `now`, s; both are read at every call.
 
         It returns 0 where the step was taken without anything to report; any other result is for `finish`.
         """
@@ -246,14 +190,14 @@ class Instance(ABC):
 
     @abstractmethod
     def _reached(self, status: int, time: float) -> float | None:
-        """Return where a step from `time`, s, ended if it ended early, by the result of its `step_call`.
+        """Return the time [s] at which a step from `time` ended early, by the result of its `step_call`; else None.
 
         Raises:
             FmuError: it failed.
         """
 
     def stepper(self, step: float) -> Callable[[float], None]:
-        """Return a function that advances from the time it is given, s, by `step`, s; it raises FmuError."""
+        """Return a function that advances by `step`, s, from its argument, a time in s; it raises FmuError."""
         now = ctypes.c_double()
         call = self.step_call(now, ctypes.c_double(step))
 
@@ -362,6 +306,41 @@ class Instance(ABC):
         buffers = (*self._row(knowns, 0), *self._row(unknowns, 0))
         self.call("GetDirectionalDerivative", *unknowns.variables, *knowns.variables, *buffers)
 
+    def save(self) -> ctypes.c_void_p:
+        """Return the present state; it has to be given to `free`."""
+        state = ctypes.c_void_p()
+        self.call(f"Get{self.state}", ctypes.byref(state))
+        return state
+
+    def restore(self, state: ctypes.c_void_p) -> None:
+        """Return to a saved state."""
+        self.call(f"Set{self.state}", state)
+
+    def free(self, state: ctypes.c_void_p) -> None:
+        """Free a saved state."""
+        self.call(f"Free{self.state}", ctypes.byref(state))
+
+    def save_bytes(self) -> bytes:
+        """Return the present state as bytes that another process understands."""
+        state = self.save()
+        try:
+            size = ctypes.c_size_t()
+            self.call(f"Serialized{self.state}Size", state, ctypes.byref(size))
+            content = (ctypes.c_char * size.value)()
+            self.call(f"Serialize{self.state}", state, content, size)
+            return bytes(content)
+        finally:
+            self.free(state)
+
+    def restore_bytes(self, content: bytes) -> None:
+        """Return to a state from `save_bytes`."""
+        state = ctypes.c_void_p()
+        self.call(f"{self.deserialise}{self.state}", content, ctypes.c_size_t(len(content)), ctypes.byref(state))
+        try:
+            self.restore(state)
+        finally:
+            self.free(state)
+
     def close(self) -> None:
         """End and free the instance and unload a library of its own; calling it twice is allowed."""
         if self._component.value and not self.fatal:
@@ -388,7 +367,7 @@ class Instance(ABC):
                 condemn(self._library)
             raise self.log.failure(function, status)
 
-    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
+    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - types of C
         """Call a function of the library on the instance and check its status; not for the inner loop."""
         if self.fatal:
             raise FmuError(f"{self.description.path.name} reported a fatal error before, so it cannot be called again")

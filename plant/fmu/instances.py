@@ -57,21 +57,21 @@ class Lane:
     def save(self, *, as_bytes: bool) -> bytes | ctypes.c_void_p:
         """Return the state as bytes, or as a handle of this instance for an FMU that cannot serialise."""
         if as_bytes:
-            return self.instance.states.save_bytes()
-        self.states.append(self.instance.states.save())
+            return self.instance.save_bytes()
+        self.states.append(self.instance.save())
         return self.states[-1]
 
     def restore(self, saved: bytes | ctypes.c_void_p) -> None:
         """Return to a state from `save`."""
         if isinstance(saved, bytes):
-            self.instance.states.restore_bytes(saved)
+            self.instance.restore_bytes(saved)
         else:
-            self.instance.states.restore(saved)
+            self.instance.restore(saved)
 
     def close(self) -> None:
         """Free the instance and its states."""
         while self.states and not self.instance.fatal:
-            self.instance.states.free(self.states.pop())
+            self.instance.free(self.states.pop())
         self.instance.close()
 
 
@@ -88,7 +88,7 @@ class Instances:
         description: FmuDescription,
         root: Path,
         fail: Callable[[int, FmuError], None],
-        asked: InstanceOptions = NO_OPTIONS,
+        options: InstanceOptions = NO_OPTIONS,
     ) -> None:
         """Load the library; `open` makes the instances.
 
@@ -96,12 +96,12 @@ class Instances:
             description: of the FMU.
             root: folder to which it is extracted.
             fail: takes the fault of a lane, or raises it.
-            asked: what the user asks of each.
+            options: of each instance.
 
         Raises:
             ValueError: see `load_library`.
         """
-        self._description, self._root, self._fail, self._asked = description, root, fail, asked
+        self._description, self._root, self._fail, self._options = description, root, fail, options
         self._library = None if description.once_per_process else load_library(description, root)
         self.lanes: list[Lane] = []
         self.live: list[Lane] = []
@@ -109,7 +109,7 @@ class Instances:
     def open(self, count: int, connect: Callable[[Instance, int], Lane]) -> None:
         """Make `count` instances; `connect` makes the lane of an instance with the row of its buffers."""
         for row in range(count):
-            instance = open_instance(self._description, self._root, self._library, self._asked)
+            instance = open_instance(self._description, self._root, self._library, self._options)
             try:
                 self.lanes.append(connect(instance, row))
             except BaseException:
@@ -122,7 +122,7 @@ class Instances:
         self.live = list(self.lanes)
 
     def each(self, act: Callable[[Lane], None]) -> None:
-        """Do something outside the inner loop with each lane that has not failed."""
+        """Call `act`, outside the inner loop, with each lane that has not failed."""
         for i, lane in enumerate(self.live):
             if lane is self.lanes[i]:
                 try:
@@ -149,7 +149,7 @@ class Instances:
                     self.drop(i, fault)
 
     def drop(self, i: int, fault: FmuError) -> None:
-        """Call an instance no more, because of a fault, nor any other if it is fatal; that of a single run raises."""
+        """Stop calling an instance after a fault, and all others if the fault is fatal; that of a single run raises."""
         for j in range(len(self.lanes)) if self.lanes[i].instance.fatal else (i,):
             if self.live[j] is self.lanes[j]:
                 self._fail(j, fault)
@@ -175,11 +175,11 @@ def open_instance(
     description: FmuDescription,
     root: Path,
     library: Any = None,  # noqa: ANN401 - ctypes
-    asked: InstanceOptions = NO_OPTIONS,
+    options: InstanceOptions = NO_OPTIONS,
 ) -> Instance:
     """Return an instance of the FMU that is extracted to `root`, which the caller closes; see `Instance`."""
     kind: type[Instance2 | Instance3] = Instance2 if description.version == 2 else Instance3
-    return kind(description, root, library, asked)
+    return kind(description, root, library, options)
 
 
 def _nothing() -> int:
@@ -187,36 +187,12 @@ def _nothing() -> int:
 
 
 _Logger = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
-_Allocate = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_size_t, ctypes.c_size_t)
-_Free = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
-
-
-class _EventInfo(ctypes.Structure):
-    _fields_ = (
-        ("again", ctypes.c_int),
-        ("ends", ctypes.c_int),
-        ("nominals_changed", ctypes.c_int),
-        ("states_changed", ctypes.c_int),
-        ("has_next", ctypes.c_int),
-        ("next_time", ctypes.c_double),
-    )
-
-
-class _Callbacks(ctypes.Structure):
-    _fields_ = (
-        ("logger", _Logger),
-        ("allocate", _Allocate),
-        ("free", _Free),
-        ("step_finished", ctypes.c_void_p),
-        ("environment", ctypes.c_void_p),
-    )
-
 
 _logs: weakref.WeakValueDictionary[int, MessageLog] = weakref.WeakValueDictionary()
 
 
 def _log_message(environment: int | None, _name: bytes, status: int, _category: bytes, message: bytes) -> None:
-    """Pass a message to the log of the instance that it came from; the environment says which."""
+    """Pass a message to the log of the instance that it came from; the environment identifies it."""
     log = _logs.get(environment or 0) or MessageLog("fmu")
     log.add(status, (message or b"").decode("utf-8", errors="replace"))
 
@@ -247,12 +223,12 @@ class Instance2(Instance):
             (self.root / "resources").as_uri().encode(),
             ctypes.byref(self._callbacks),
             ctypes.c_int(0),
-            ctypes.c_int(self.asked.debug_log is not None),
+            ctypes.c_int(self.options.debug_log is not None),
         )
         return address
 
     def _initialise(self, time: float) -> None:
-        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.asked.tolerance
+        no, nothing, tolerance = ctypes.c_int(0), ctypes.c_double(0.0), self.options.tolerance
         wanted = ctypes.c_int(tolerance is not None), ctypes.c_double(tolerance or 0.0)
         self.call("SetupExperiment", *wanted, ctypes.c_double(time), no, nothing)
         self.call("EnterInitializationMode")
@@ -266,17 +242,20 @@ class Instance2(Instance):
 
     def update_discrete_states(self) -> tuple[bool, bool, float]:
         """See `Instance.update_discrete_states`."""
-        info = _EventInfo()
+        from fmpy.fmi2 import fmi2EventInfo  # noqa: PLC0415 - see parse_description
+
+        info = fmi2EventInfo()
         self.call("NewDiscreteStates", ctypes.byref(info))
-        return bool(info.again), bool(info.ends), info.next_time if info.has_next else math.inf
+        following = info.nextEventTime if info.nextEventTimeDefined else math.inf
+        return bool(info.newDiscreteStatesNeeded), bool(info.terminateSimulation), following
 
     def _reached(self, status: int, time: float) -> float | None:
         if status != DISCARD:
             self.check("fmi2DoStep", status)
             return None
         reached = ctypes.c_double()
-        asked = ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
-        if self.function("GetRealStatus")(self._component, *asked) != OK:
+        query = ctypes.c_int(LAST_SUCCESSFUL_TIME), ctypes.byref(reached)
+        if self.function("GetRealStatus")(self._component, *query) != OK:
             raise self.log.failure("fmi2DoStep", "discard and not how far it came")
         return reached.value
 
@@ -284,15 +263,16 @@ class Instance2(Instance):
         return (pointer,)
 
 
-def _callbacks(log: MessageLog) -> _Callbacks:
+def _callbacks(log: MessageLog) -> Any:  # noqa: ANN401 - fmpy's structures carry no types
     """Return the callbacks of an instance; fmpy's proxy formats messages with printf arguments, which ctypes cannot."""
     import fmpy  # noqa: PLC0415 - see parse_description
+    from fmpy import fmi2  # noqa: PLC0415
 
-    callbacks = _Callbacks(
+    callbacks = fmi2.fmi2CallbackFunctions(
         logger=_on_message,
-        allocate=ctypes.cast(fmpy.calloc, _Allocate),
-        free=ctypes.cast(fmpy.free, _Free),
-        environment=id(log),
+        allocateMemory=ctypes.cast(fmpy.calloc, fmi2.fmi2CallbackAllocateMemoryTYPE),
+        freeMemory=ctypes.cast(fmpy.free, fmi2.fmi2CallbackFreeMemoryTYPE),
+        componentEnvironment=id(log),
     )
     _logs[id(log)] = log
     try:
@@ -336,14 +316,14 @@ class Instance3(Instance):
         create.restype = ctypes.c_void_p
         no, null = ctypes.c_bool(False), ctypes.c_void_p()
         names = self.description.model_name, self.description.token, str(self.root / "resources") + os.sep
-        common = [*(name.encode() for name in names), no, ctypes.c_bool(self.asked.debug_log is not None)]
+        common = [*(name.encode() for name in names), no, ctypes.c_bool(self.options.debug_log is not None)]
         early_return = [no, ctypes.c_bool(True), null, ctypes.c_size_t(0)]  # without event mode
         end = [null, self._on_message]
         address: int | None = create(*common, *end) if exchange else create(*common, *early_return, *end, null)
         return address
 
     def _initialise(self, time: float) -> None:
-        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.asked.tolerance
+        nothing, no, tolerance = ctypes.c_double(0.0), ctypes.c_bool(False), self.options.tolerance
         wanted = ctypes.c_bool(tolerance is not None), ctypes.c_double(tolerance or 0.0)
         self.call("EnterInitializationMode", *wanted, ctypes.c_double(time), no, nothing)
         self.call("ExitInitializationMode")

@@ -24,9 +24,9 @@ class Exchanging(Protocol):
     """The part of an instance of model exchange that is used here."""
 
     description: FmuDescription
-    asked: InstanceOptions
+    options: InstanceOptions
 
-    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - what C takes
+    def call(self, name: str, *arguments: Any) -> None:  # noqa: ANN401 - types of C
         """Call a function of the library and check its status; raises FmuError."""
 
     def update_discrete_states(self) -> tuple[bool, bool, float]:
@@ -73,7 +73,7 @@ class Integrator:
         self._instance.call("EnterEventMode")
 
     def _settle(self) -> float:
-        """Update the discrete states until they rest; return the time of the next event, which may be infinite."""
+        """Update the discrete states until they are settled; return the time of the next event, or infinity."""
         for _ in range(MAX_EVENT_ITERATIONS):
             again, ends, following = self._instance.update_discrete_states()
             if ends:
@@ -81,7 +81,7 @@ class Integrator:
             if not again:
                 self._instance.call("EnterContinuousTimeMode")
                 return following
-        raise FmuError(f"{self._instance.description.path.name}: discrete states find no rest at an event")
+        raise FmuError(f"{self._instance.description.path.name}: discrete states do not settle at an event")
 
     def _asks_for_event(self) -> bool:
         enter, ends = ctypes.c_int(), ctypes.c_int()
@@ -99,7 +99,7 @@ class Integrator:
         self._raise_fault()
 
     def _solve(self, time: float, until: float) -> tuple[bool, float]:
-        """Return whether a state event ended the way to `until`, and where."""
+        """Return whether a state event ended the integration before `until`, and the time reached."""
         try:
             event, _, reached = self._solver.step(time, until)
         except RuntimeError as error:
@@ -131,7 +131,7 @@ class Integrator:
             set_time=self._guarded(lambda now: self._instance.call("SetTime", ctypes.c_double(now))),
             input=_Held(),
             startTime=time,
-            relativeTolerance=self._instance.asked.tolerance or RELATIVE_TOLERANCE,
+            relativeTolerance=self._instance.options.tolerance or RELATIVE_TOLERANCE,
             maxNumSteps=MAX_SOLVER_STEPS,
         )
 
@@ -139,7 +139,7 @@ class Integrator:
         return self._guarded(lambda values, size: self._instance.call(name, values, ctypes.c_size_t(size)))
 
     def _guarded(self, act: Callable[..., None]) -> Callable[..., None]:
-        """Return a function for C, through which no exception passes: the first one is kept."""
+        """Return a callback for C that stores the first exception in place of raising it."""
 
         def guarded(*arguments: Any) -> None:  # noqa: ANN401 - of the solver
             if self._fault is None:

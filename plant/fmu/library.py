@@ -19,7 +19,7 @@ _fatal: set[int] = set()  # handles of libraries that may never be called again;
 
 
 def condemn(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Take note that an instance reported a fatal error: no instance of this library may be called again."""
+    """Record a fatal error of an instance: no instance of this library may be called again."""
     _fatal.add(library._handle)
 
 
@@ -60,13 +60,13 @@ def load_library(description: FmuDescription, root: Path) -> Any:  # noqa: ANN40
 
 
 def _load_copy(file: Path) -> ctypes.CDLL:
-    """Load a copy of a library and of what lies beside it, so that it shares no variables with another instance."""
+    """Load a copy of a library and of its folder, so that it shares no variables with another instance."""
     with tempfile.TemporaryDirectory(prefix="servobench-", ignore_cleanup_errors=True) as folder:
         return ctypes.CDLL(str(shutil.copytree(file.parent, Path(folder) / "library") / file.name))
 
 
 def unload_library(library: Any) -> None:  # noqa: ANN401 - a ctypes library
-    """Give the library back to the system, unless it may never be called again, not even to unload it."""
+    """Unload the library, unless a fatal error forbids any further call."""
     if is_condemned(library):
         return
     from fmpy import freeLibrary  # noqa: PLC0415 - see parse_description
@@ -114,7 +114,7 @@ class MessageLog:
                 file.write(f"{line}\n")
 
     def failure(self, function: str, outcome: int | str) -> FmuError:
-        """Return the error of a call that returned a bad status, or what else the words say, with the last messages.
+        """Return the error of a failed call, with its status or another outcome in words, and the last messages.
 
         The messages are forgotten.
         """
@@ -128,10 +128,10 @@ class MessageLog:
 
 @dataclass(frozen=True)
 class InstanceOptions:
-    """Wishes with which an instance is made and begun.
+    """Options of an instance.
 
     Attributes:
-        tolerance: relative one of its own solver, or of CVode in model exchange; None: what it takes by itself.
+        tolerance: relative one of its own solver, or of CVode in model exchange; None: the solver's own.
         debug_log: file to which all of its messages are appended, with its debug log turned on; None: it is off.
     """
 

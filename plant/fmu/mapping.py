@@ -30,7 +30,7 @@ STEP_TOLERANCE: Final = 1e-6  # share of a step by which it may differ from a mu
 
 @settings
 class TruthMapping:
-    """What tells the truth, for the log and for upper bounds."""
+    """Sources of the truth, for the log and for upper bounds."""
 
     features: Names = ()
     """Features without noise; without them, `features`."""
@@ -89,7 +89,7 @@ class FmuMapping:
     inputs: Annotated[Names, MinLen(1)]
     """Joint velocity commands, rad/s; they give n."""
     features: Annotated[Names, MinLen(1)]
-    """What the controller sees; they give m."""
+    """The features that the controller gets; they give m."""
     joints: Names = ()
     """Joint positions, rad; without them, commands are integrated."""
     seen: Names = ()
@@ -105,11 +105,11 @@ class FmuMapping:
     parameters: Mapping[str, Values] = nested(dict)
     """Values by name, set before every run: numbers, `true` and `false`, or texts, as the FMU declares them."""
     nominal: Mapping[str, Numbers] | None = None
-    """What controllers believe where it differs; needs directional derivatives. None: there is no nominal model."""
+    """Nominal values of parameters, for controllers; needs directional derivatives. None: there is no nominal model."""
     period: Positive | None = None
     """[s] the FMU's step; None for the control period."""
     tolerance: Positive | None = None
-    """[1] relative one of the FMU's own solver, or of CVode in model exchange; None for what it takes by itself."""
+    """[1] relative one of the FMU's own solver, or of CVode in model exchange; None for the solver's own."""
     debug_log: File | None = None
     """A file to which all messages of the FMU are appended, with its debug log turned on; None: it is off."""
     limits: JointLimits = nested(JointLimits)
@@ -120,7 +120,7 @@ class FmuMapping:
     def __post_init__(self) -> None:
         """Check that something takes the start."""
         if self.start is not None and self.joints and self.home is None:
-            raise ValueError("start needs home, the parameter that takes it: the FMU tells its joints itself")
+            raise ValueError("start needs home, the parameter that takes it: the FMU has joints of its own")
 
 
 def read_mapping(path: Path) -> FmuMapping:
@@ -178,7 +178,7 @@ def mapping_spec(mapping: FmuMapping, description: FmuDescription, period: float
 
 
 def unusual_step(mapping: FmuMapping, description: FmuDescription, period: float) -> str:
-    """Return a remark where an FMU takes longer steps than it is meant to; empty where it does not.
+    """Return a remark if an FMU takes longer steps than intended, else an empty text.
 
     One of model exchange is integrated with steps of its solver's.
     """

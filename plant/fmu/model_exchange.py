@@ -2,8 +2,8 @@
 
     q -> (y, ∂y/∂q)
 
-The result answers like `plant.cameras.symbolic.feature_and_jacobian`, so that whatever is built on the project's own
-equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU whose equations nobody has.
+The result answers like `plant.cameras.symbolic.feature_and_jacobian`, so that a model that is built on the project's
+own equations (the true Jacobian, a calibrated nonlinear MPC) can be built on an FMU with unknown equations.
 """
 
 from __future__ import annotations
@@ -135,18 +135,18 @@ def _feature_function(
 
 
 def _starts(builder: Any, names: list[str]) -> list[float]:  # noqa: ANN401 - a casadi.DaeBuilder
-    """Return start values; what has none, such as a state that a parameter places, starts at 0."""
+    """Return start values; a variable without one, such as a state that a parameter sets, starts at 0."""
     starts = [float(np.ravel(builder.start(name))[0]) for name in names]
     return [start if np.isfinite(start) else 0.0 for start in starts]
 
 
-def _resolve(role: str, names: Sequence[str], known: list[str], what: str) -> list[str]:
+def _resolve(role: str, names: Sequence[str], known: list[str], group: str) -> list[str]:
     """Return the variables that `names` stand for, in the FMU's order of each family."""
     found: list[str] = []
     for name in names:
         members = [name] if name in known else [each for each in known if each.startswith(f"{name}[")]
         if not members:
             families = dict.fromkeys(each.partition("[")[0] for each in known)
-            raise ValueError(f"{role} names {name!r}, which is none of the {what}: {', '.join(families) or 'none'}")
+            raise ValueError(f"{role} names {name!r}, which is none of the {group}: {', '.join(families) or 'none'}")
         found += members
     return found

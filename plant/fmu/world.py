@@ -1,6 +1,6 @@
 """Any FMI 2 or FMI 3 FMU as a plant; delay, noise, latency and lost frames are those of the bench.
 
-An `FmuMapping` says which variables are commands, joints and features; names are looked up once, at construction. The
+An `FmuMapping` says which variables are commands, joints and features; names are resolved once, at construction. The
 FMU is stepped with its own period, which divides that of the world; commands are held meanwhile. Parameters of any type
 are set before every run.
 """
@@ -33,9 +33,9 @@ from servobench.plant.fmu.library import InstanceOptions, logger
 from servobench.plant.fmu.mapping import FmuMapping, mapping_spec, read_mapping, unusual_step
 from servobench.plant.fmu.model_exchange import mapped_model
 from servobench.plant.robot.arm import rpy_from_rotation
-from servobench.plant.robot.hand_eye import SensedArm
+from servobench.plant.robot.hand_eye import RobotModel
 
-SEEN_ABOVE = 0.5  # a number that says whether a feature is seen
+SEEN_ABOVE = 0.5  # threshold of an FMU's variable above which a feature is valid
 STRUCTURAL: Final = "structuralParameter"
 BITS: Final = {
     "Integer": 32,
@@ -71,9 +71,9 @@ class FmuWorld(World):
         start: FloatArray | None,
         period: float,
         lag: float | None = None,
-        model: SensedArm | None = None,
+        model: RobotModel | None = None,
     ) -> None:
-        """Extract and load the FMU and look all names up.
+        """Extract and load the FMU and resolve all names.
 
         Args:
             mapping: the roles of its variables; values of parameters may have leading axes.
@@ -81,7 +81,7 @@ class FmuWorld(World):
                 own home, or 0. Its leading axis says how many runs there are.
             period: of `advance`, s.
             lag: time constant of the FMU's joints, s; None where it is unknown.
-            model: what the FMU is known to be, for names, unit and natural size of its features.
+            model: of the FMU, where it is known, for names, unit and natural size of its features.
 
         Raises:
             ValueError: an FMU that cannot be used, or a name or size that does not fit.
@@ -105,8 +105,8 @@ class FmuWorld(World):
         self.lead = np.shape(start)[:-1]
         self._start = as_array("start", start, (*self.lead, self.spec.n))
         self._rows: Any = np.arange(*self.lead) if self.lead else ()
-        asked = InstanceOptions(mapping.tolerance, mapping.debug_log)
-        self._instances = Instances(self.description, root, self.fail, asked)
+        options = InstanceOptions(mapping.tolerance, mapping.debug_log)
+        self._instances = Instances(self.description, root, self.fail, options)
         try:
             self._connect(mapping)
             self._instances.open(prod(self.lead), self._lane)
@@ -226,11 +226,11 @@ class FmuWorld(World):
         return FmuError(f"{self.description.path.name} returned something that is not finite for {', '.join(bad)}")
 
     def see(self) -> FloatArray:
-        """Return the FMU's feature as read after the last step."""
+        """Return the FMU's features as read after the last step."""
         return self._feature
 
     def visible(self) -> BoolArray | None:
-        """Return which features the FMU says are seen; see `World.visible`."""
+        """Return which features are valid by the FMU; see `World.visible`."""
         return self._seen
 
     def move_camera(self, X_BC: FloatArray) -> None:
@@ -336,7 +336,7 @@ def check_value(variables: list[Variable], name: str, value: npt.NDArray[Any]) -
     """Check that a value fits the type of the parameter that a mapping names.
 
     Raises:
-        ValueError: it does not; says what was wanted.
+        ValueError: it does not; names the wanted type.
     """
     kind, given = variables[0].type, np.asarray(value)
     if len({variable.type for variable in variables}) > 1:
@@ -392,7 +392,7 @@ def build_fmu(
     command_delay: float,
     sensing: SensingConfig,
     lag: float | None = None,
-    model: SensedArm | None = None,
+    model: RobotModel | None = None,
 ) -> Bench:
     """Return the plant of an FMU, for a registry.
 
@@ -402,7 +402,7 @@ def build_fmu(
         command_delay: between a command and its first effect, s.
         sensing: noise, latency, frame period and lost frames.
         lag: time constant of the FMU's joints, s; None where it is unknown.
-        model: what the FMU is known to be, for names, unit and natural size of its features.
+        model: of the FMU, where it is known, for names, unit and natural size of its features.
 
     Raises:
         ValueError: an FMU or mapping that cannot be used; also if the FMU itself says so.

@@ -1,1 +1,1 @@
-"""What the plants that render images have in common: the scene, the drives, and the ball found in an image."""
+"""Plants that render the images of their cameras: engines, drives, bodies and detectors."""

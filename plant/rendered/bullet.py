@@ -1,8 +1,8 @@
 """PyBullet: a scene for the cameras, rendered by TinyRenderer, and the moving arm as rigid bodies.
 
 The world frame W is the arm's base frame B. The drives of `servobench.plant.rendered.drives` integrate the motion;
-PyBullet gives inertia, gravity torques and contact, in a physics world without looks: the arm with its true load, the
-arm as the drives believe it, and the table, the floor and the boxes around it.
+PyBullet gives inertia, gravity torques and contact, in a physics world without visual shapes: the arm with its true
+load, the arm as the drives assume it, and the table, the floor and the boxes around it.
 
 PyBullet's C library prints a banner, past `sys.stderr`, so the file descriptor is redirected during the import. All
 other output that is written to it in the meantime is passed on afterwards.
@@ -17,34 +17,26 @@ import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.detection import ByteArray, Window
 from servobench.plant.rendered.drives import Drives, DriveState, RigidBody
 from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
-from servobench.plant.rendered.urdf import Box, arm_mechanics, boxes_urdf, room_boxes
+from servobench.plant.rendered.room import Room
+from servobench.plant.rendered.urdf import arm_mechanics, boxes_urdf, room_boxes
 from servobench.plant.robot.camera import PinholeCamera, view_matrix
 from servobench.plant.robot.robot import GRAVITY
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from servobench.plant.contract.checks import FloatArray
-    from servobench.plant.rendered.detection import ByteArray, Window
-    from servobench.plant.rendered.room import Room
-    from servobench.plant.robot.arm import SerialArm
-    from servobench.plant.robot.robot import Robot
-
-BANNER = b"pybullet build time:"  # what the line begins with
+BANNER = b"pybullet build time:"  # the beginning of the line
 STANDARD_ERROR = 2  # file descriptor
 CONTACT_DISTANCE = 8  # place of the distance in a contact point of PyBullet; negative where bodies overlap
 
 
 @contextlib.contextmanager
 def without_banner(descriptor: int = STANDARD_ERROR) -> Iterator[None]:
-    """Let nothing reach a file descriptor within the context, and afterwards all that came but the banner."""
+    """Hold back the output to a file descriptor within the context, and write it afterwards without the banner."""
     try:
         kept = os.dup(descriptor)
     except OSError:  # it is closed, so nothing can be printed
@@ -68,7 +60,7 @@ with without_banner():
 
 
 def describe_renderer() -> str:
-    """Return which engine renders images, its version, and how they arrive from it."""
+    """Return the engine that renders images, its version, and a note if its images arrive slowly."""
     images = "" if pybullet.isNumpyEnabled() else ", built without numpy: images arrive as tuples, which is slower"
     return f"PyBullet {version('pybullet')}, software renderer TinyRenderer{images}"
 
@@ -164,92 +156,34 @@ class BulletScene(Scene):
 
 
 class BulletSimulation(Simulation):
-    """The cascade of `servobench.plant.rendered.drives`, stepped at 1 kHz on the rigid bodies of `Mechanics`."""
+    """The cascade of `servobench.plant.rendered.drives`, stepped at 1 kHz on PyBullet's rigid bodies."""
 
     def __init__(self, machine: Machine) -> None:
-        """Open a world with the arm in it.
+        """Open a world without visual shapes and load the arm twice, with the true and with the assumed load.
 
         Raises:
             ValueError: a list of the drives that does not fit the joints.
             ConnectionError: PyBullet opens no world, as too many are open.
         """
-        drives = machine.drives
-        self._dynamics = drives.dynamics
-        self._mechanics = Mechanics(
-            machine.arm,
-            payload=drives.payload,
-            assumed_payload=drives.assumed_payload,
-            boxes=machine.boxes,
-            robot=machine.robot,
-        )
-        try:
-            self._drives = Drives(drives, machine.lag, self._mechanics.assumed_inertia(machine.start), machine.stops)
-        except BaseException:
-            self._mechanics.close()
-            raise
-
-    def start(self, angle: FloatArray) -> DriveState:
-        """See `Simulation.start`."""
-        return self._drives.start(angle, self._mechanics.body(angle, np.zeros(len(angle))))
-
-    def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
-        """See `Simulation.advance`."""
-        drives = self._drives
-        drives.take(joints, speed)
-        for _ in range(steps):
-            if self._dynamics:
-                drives.drive(self._mechanics.body(drives.angle, drives.speed))
-            else:
-                drives.track()
-        return drives.give()
-
-    def overlaps(self, angle: FloatArray) -> Iterator[Overlap]:
-        """See `Simulation.overlaps`."""
-        return self._mechanics.overlaps(angle)
-
-    def close(self) -> None:
-        """See `Simulation.close`."""
-        self._mechanics.close()
-
-
-class Mechanics:
-    """An arm in a PyBullet world without looks; joint angles here are the true ones, θ."""
-
-    def __init__(
-        self,
-        arm: SerialArm,
-        *,
-        payload: float,
-        assumed_payload: float,
-        robot: Robot,
-        boxes: tuple[Box, ...] = (),
-    ) -> None:
-        """Open a world and load the arm twice, with the true and with the assumed load.
-
-        Args:
-            arm: the true kinematics.
-            payload: kg, point load at the ball.
-            assumed_payload: kg, that of the drives' model.
-            robot: by its maker's description, for masses and shapes.
-            boxes: obstacles beside table and floor.
-
-        Raises:
-            ConnectionError: PyBullet opens no world, as too many are open.
-        """
+        arm, robot, drives = machine.arm, machine.robot, machine.drives
         self._client: int = pybullet.connect(pybullet.DIRECT)
         if self._client < 0:
             raise ConnectionError("PyBullet could not open a physics world")
         try:
             pybullet.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=self._client)
             pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self._client)
-            loaded = arm_mechanics(arm, payload, shapes=True, robot=robot)
+            loaded = arm_mechanics(arm, drives.payload, shapes=True, robot=robot)
             self._arm = self._load(loaded, pybullet.URDF_USE_SELF_COLLISION)
-            self._assumed = self._load(arm_mechanics(arm, assumed_payload, shapes=False, robot=robot), 0)
-            room = (*room_boxes(robot.workspace.scale), *boxes)
+            self._assumed = self._load(arm_mechanics(arm, drives.assumed_payload, shapes=False, robot=robot), 0)
+            room = (*room_boxes(robot.workspace.scale), *machine.boxes)
             self._boxes = {self._load(boxes_urdf((box,)), 0): box.name for box in room}
+            start = machine.start.tolist()
+            inertia = np.array(pybullet.calculateMassMatrix(self._assumed, start, physicsClientId=self._client))
+            self._drives = Drives(drives, machine.lag, inertia, machine.stops)
         except BaseException:
             self.close()
             raise
+        self._dynamics = drives.dynamics
         self._joints = list(range(arm.n))
         self._rest = [0.0] * arm.n
 
@@ -266,9 +200,20 @@ class Mechanics:
                 )
             )
 
-    def assumed_inertia(self, angle: FloatArray) -> FloatArray:
-        """Return the inertia by the drives' model at joint angles (n,) [rad], (n, n) [kg m²]."""
-        return np.array(pybullet.calculateMassMatrix(self._assumed, angle.tolist(), physicsClientId=self._client))
+    def start(self, angle: FloatArray) -> DriveState:
+        """See `Simulation.start`."""
+        return self._drives.start(angle, self.body(angle, np.zeros(len(angle))))
+
+    def advance(self, joints: DriveState, speed: FloatArray, steps: int) -> DriveState:
+        """See `Simulation.advance`."""
+        drives = self._drives
+        drives.take(joints, speed)
+        for _ in range(steps):
+            if self._dynamics:
+                drives.drive(self.body(drives.angle, drives.speed))
+            else:
+                drives.track()
+        return drives.give()
 
     def body(self, angle: FloatArray, speed: FloatArray) -> RigidBody:
         """Return inertia and torques at joint angles (n,) [rad] and speeds (n,) [rad/s]."""
@@ -291,7 +236,7 @@ class Mechanics:
                 yield Overlap(link, self._boxes.get(point[2], other))
 
     def close(self) -> None:
-        """Leave the world; calling it twice is allowed."""
+        """See `Simulation.close`."""
         if self._client >= 0:
             client, self._client = self._client, -1
             if pybullet.isConnected(client):

@@ -34,7 +34,7 @@ COLOUR_MARGIN = 4  # [px] around all of a colour, in which colour noise can matt
 RED_RANGE: HueRange = (111, 120, 40), (129, 255, 255)
 FULL_BOX = 0.6  # share of red pixels above which a box holds one patch; a disc fills π/4
 MIN_PIXELS = 16  # fewer pixels do not determine three coordinates under noise
-MIN_VISIBLE = 0.4  # share of the ball's disc that must be seen
+MIN_VISIBLE = 0.4  # share of the ball's disc that must be visible
 MAX_VISIBLE = 1.4  # a larger red patch is not the ball
 INNER_COSINE = 0.4  # of the angle between ray and surface normal, below which a pixel counts as silhouette
 OUTLIER_SCALE = 4.0  # robust standard deviations beyond which a depth is an outlier
@@ -46,7 +46,7 @@ MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-5  # [m] the error after such a step is far smaller
 RIDGE = 1e-9 * np.eye(3)  # keeps the normal matrix of a degenerate patch invertible
 OUTLINE = (40, 255, 80)  # RGB of the drawn detection
-MARGIN = COLOUR_MARGIN + 2  # [px] and two for what rounding and the sampling point of a pixel make of an edge
+MARGIN = COLOUR_MARGIN + 2  # [px] and two for the shift of an edge by rounding and by the sampling point of a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Patch:
     columns: IntArray
 
     def shifted(self, rows: int, columns: int) -> Patch:
-        """Return the patch so many pixels further down and to the right."""
+        """Return the patch shifted by numbers of pixels down and to the right."""
         return Patch(self.rows + rows, self.columns + columns)
 
 
@@ -99,7 +99,7 @@ def largest_patch(mask: ByteArray) -> Patch | None:
     """Return the largest connected part of a mask.
 
     Args:
-        mask: (h, w), above 0 where pixels have the colour that is looked for.
+        mask: (h, w), above 0 where pixels have the wanted colour.
 
     Returns:
         The patch, or None where there is none, it is too small, or the image's border cuts it.
@@ -107,7 +107,7 @@ def largest_patch(mask: ByteArray) -> Patch | None:
     x, y, width, height = cv2.boundingRect(mask)
     if width * height < MIN_PIXELS:
         return None
-    # Only the box around all of the colour is looked at. A full one holds one patch; to search for parts is slow.
+    # Only the box around all of the colour is searched. A full box holds one patch, and the search for parts is slow.
     coloured = mask[y : y + height, x : x + width] > 0
     if np.count_nonzero(coloured) < FULL_BOX * width * height:
         _, labels, statistics, _ = cv2.connectedComponentsWithStats(coloured.astype(np.uint8), connectivity=8)
@@ -158,7 +158,7 @@ def locate_ball(patch: Patch, depth: FloatArray, camera: PinholeCamera, radius: 
         radius: m, of the ball.
 
     Returns:
-        The ball, or None where too little of it is seen or no ball of this radius explains the depths.
+        The ball, or None where too little of it is visible or no ball of this radius explains the depths.
     """
     rays = camera.rays(patch.columns, patch.rows)
     middle = np.array([np.median(rays[:, 0]), np.median(rays[:, 1]), 1.0])
@@ -181,7 +181,7 @@ def find_ball(
     sense: Callable[[FloatArray, Patch], FloatArray] | None = None,
     corner: tuple[int, int] = (0, 0),
 ) -> Detection | None:
-    """Return the ball in a rendered image, or in a part of one around it, or None where none is seen.
+    """Return the ball in a rendered image, or in a part of one around it, or None where none is found.
 
     Args:
         rgb: (h, w, 3 or 4).
@@ -200,7 +200,7 @@ def find_ball(
 
 
 def disc_area(centre: FloatArray, camera: PinholeCamera, radius: float) -> float:
-    """Return the area, px², of the ellipse as which a sphere at `centre` (3,) m appears; it stretches off the axis."""
+    """Return the area, px², of the ellipse of a sphere at `centre` (3,) m, which is stretched off the optical axis."""
     nearest2 = centre[2] ** 2 - radius**2
     return float(np.pi * (camera.focal * radius) ** 2 * np.sqrt((centre @ centre - radius**2) / nearest2**3))
 
@@ -256,7 +256,7 @@ def choose_depths(rays: FloatArray, depth: FloatArray, centre: FloatArray, radiu
         return inner
     size = np.abs(depth[inner] - t[inner])
     middle = len(inner) // 2
-    # 1.4826 times the median size estimates the standard deviation, whatever the outliers.
+    # 1.4826 times the median size estimates the standard deviation in spite of outliers.
     gate = max(OUTLIER_FLOOR, OUTLIER_SCALE * 1.4826 * float(np.partition(size, middle)[middle]))
     return inner[size <= gate]
 
@@ -316,6 +316,14 @@ def whole(camera: PinholeCamera) -> Window:
 
 def window_around(centre: FloatArray, radius: float, camera: PinholeCamera) -> Window | None:
     """Return the window outside of which no pixel shows a ball, with a margin for noise; None where none does.
+
+    A sphere of radius R about (x, y, z) in the camera frame appears between the columns and rows at which the planes
+    through the lens that contain one axis of the image touch it:
+
+        (x z ± R √(x² + z² − R²)) / (z² − R²)        of x/z, and likewise of y/z
+
+    Nothing else in a rendered room has the ball's colour, so an image that is cut to this window gives the same
+    detection as all of it.
 
     Args:
         centre: (3,) [m], of the ball in the camera frame.

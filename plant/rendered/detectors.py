@@ -1,8 +1,13 @@
-"""Sensing set-ups of a rendered plant: the ball or coloured discs, found in the images of each camera.
+"""Detectors of a rendered plant: the ball or coloured discs, found in the images of each camera.
 
-A point of the target that is found at (u, v) lies on the ray through it, and the features are those of the points at a
+The sensing `position` is the ball's centre in 3-D, fitted to noisy depths of an RGB-D camera. For other set-ups, a
+point of the target that is found at (u, v) lies on the ray through it, and the features are those of the points at a
 depth of 1 m on these rays. A set-up whose features change with that depth needs cameras with depth, and gets the ball's
-centre as fitted to depths. Nothing of what is found stems from the true robot but its image.
+centre as fitted to depths. A detector uses nothing of the true robot but its images.
+
+Engines render pinholes with square pixels and the principal point in the middle. A `Lens` makes an image with another
+focal length, principal point or distortion of such an ideal image, which is larger where the lens has a wider view, by
+taking each pixel (u, v) from where the ray through it meets the ideal image.
 """
 
 from __future__ import annotations
@@ -10,6 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final, Generic, TypeAlias, TypeVar, final
 
@@ -17,9 +23,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics, locate
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import BoolArray, Truth
@@ -37,59 +43,17 @@ from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
 from servobench.plant.rendered.settings import RenderedConfig
 from servobench.plant.robot.camera import PinholeCamera
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel
 from servobench.plant.robot.robot import Robot
 
+MAX_SIZE: Final = 1024  # [px] of an ideal image's side: a lens with a wider view is black at its edges
 NOWHERE: Final = (0.0, 0.0, 1.0)  # stands for a point that is not found, whose features are not valid
-CROSS: Final = 5  # [px] half size of what marks a point that is found
+CROSS: Final = 5  # [px] half size of the cross that marks a point in a picture
+DEPTH, COLOUR = "depth_noise", "colour_noise"  # names of the random streams
 
-
-Model = TypeVar("Model", bound=SensedArm)
-
-
-Generators: TypeAlias = tuple[np.random.Generator, np.random.Generator]
-
-
-MAX_SIZE = 1024  # [px] of an ideal picture's side: a lens that sees more is black at its edges
-
-
-class Sight(ABC, Generic[Model]):
-    """Cameras whose images are rendered and searched; arm and cameras are given as they are now.
-
-    All methods take `model`, the true arm and cameras, and `q`, (n,) rad, exact joint positions at which the scene is.
-    """
-
-    @abstractmethod
-    def reset(self, seed: int) -> None:
-        """Draw all randomness from `seed`."""
-
-    @abstractmethod
-    def see(self, model: Model, q: FloatArray) -> FloatArray | None:
-        """Return the features as seen now, (m,); None if nothing is found."""
-
-    def visible(self) -> BoolArray | None:
-        """Return which features of what was seen last are measured, (m,); None for all of them."""
-        return None
-
-    @abstractmethod
-    def truth(self, model: Model, q: FloatArray) -> Truth:
-        """Return the true features and their Jacobian."""
-
-    @abstractmethod
-    def why_unseen(self, model: Model, q: FloatArray) -> str:
-        """Return why a feature is not seen at the start, with evidence."""
-
-    @abstractmethod
-    def picture(self, model: Model, q: FloatArray) -> ByteArray:
-        """Return what the cameras see with what is found marked, (h, w, 3)."""
-
-    @abstractmethod
-    def save(self) -> Any:  # noqa: ANN401 - each sight has a state of its own
-        """Return the state of what is random, as a value."""
-
-    @abstractmethod
-    def restore(self, state: Any) -> None:  # noqa: ANN401 - what `save` returned
-        """Return to a state."""
+Model = TypeVar("Model", bound=RobotModel)
+Generators: TypeAlias = Mapping[str, np.random.Generator]
+"""Random generators by the names of their streams."""
 
 
 @final
@@ -97,7 +61,7 @@ class Lens:
     """One camera of a set-up."""
 
     def __init__(self, planned: PinholeCamera, optics: Optics, camera: int) -> None:
-        """Prepare where pixels are taken from.
+        """Prepare the map from the pixels to those of the ideal image.
 
         Args:
             planned: the camera as planned, whose picture needs no lens.
@@ -123,7 +87,7 @@ class Lens:
         self._map = at[..., 0], at[..., 1]
 
     def render(self, scene: Scene, X_BC: FloatArray) -> ByteArray:
-        """Return what the camera sees from X_BC (4, 4), (h, w, 3 or 4)."""
+        """Return the image of the camera at X_BC (4, 4), (h, w, 3 or 4)."""
         rgb, _ = scene.render(self._ideal, X_BC)
         return rgb if self._map is None else np.asarray(cv2.remap(rgb, *self._map, cv2.INTER_LINEAR))
 
@@ -138,7 +102,7 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
     """Return the ray (x/z, y/z, 1) through each pixel of an image, (h w, 3)."""
     columns, rows = np.meshgrid(np.arange(planned.width), np.arange(planned.height))
     half = np.array([planned.width, planned.height]) / 2.0
-    # Where a pixel is sampled, counted from the upper left corner, is what the planned camera says.
+    # The planned camera says where a pixel is sampled, counted from the upper left corner.
     pixels = half + planned.focal * planned.rays(columns.ravel(), rows.ravel())[:, :2]
     rays: FloatArray = locate(pixels[None], np.ones((1, 1)), optics)[0]
     return rays
@@ -146,10 +110,9 @@ def _rays(planned: PinholeCamera, optics: Optics) -> FloatArray:
 
 @final
 class DepthCamera:
-    """The noise of an RGB-D camera and the ball in its images; depth and colour noise have random streams of their own.
+    """An RGB-D camera that finds the ball in its noisy images; noise is drawn only at pixels of the ball's colour."""
 
-    Noise is drawn only where the ball's colour is.
-    """
+    streams = (DEPTH, COLOUR)
 
     def __init__(self, scene: Scene, config: RenderedConfig, camera: PinholeCamera, radius: float) -> None:
         """Take a scene and the radius of its ball [m]."""
@@ -157,70 +120,100 @@ class DepthCamera:
         self._scene, self._depth_noise = scene, config.noise()
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
-    def reset(self, seed: int) -> None:
-        """Draw all noise from `seed`."""
-        self._noise, self._colour_noise = named_generator(seed, "depth_noise"), named_generator(seed, "colour_noise")
-
-    def save(self) -> Generators:
-        """Return the state of the noise."""
-        return copy.deepcopy((self._noise, self._colour_noise))
-
-    def restore(self, state: Generators) -> None:
-        """Return to a state of the noise."""
-        self._noise, self._colour_noise = copy.deepcopy(state)
-
-    def find(self, X_BC: FloatArray, ball: FloatArray) -> Detection | None:
-        """Return the ball as a camera sees it, or None.
+    def find(self, X_BC: FloatArray, ball: FloatArray, noise: Generators) -> Detection | None:
+        """Return the ball as found in an image of the camera, or None.
 
         Args:
             X_BC: (4, 4), the camera.
-            ball: (3,) [m], where it is in the base frame: no more of the image is rendered than what can show it.
+            ball: (3,) [m], its true place in the base frame: only the part of the image around it is rendered.
+            noise: of depths and colours.
         """
         window = window_around(X_BC[:3, :3].T @ (ball - X_BC[:3, 3]), self.radius, self.camera)
         if window is None:
             return None
         rgba, buffer = self._scene.render(self.camera, X_BC, window)
         if self._deviation > 0.0:
-            rgba = add_colour_noise(rgba, self._deviation, self._colour_noise)
-        return find_ball(rgba, buffer, self.camera, self.radius, self._sense, (window.top, window.left))
+            rgba = add_colour_noise(rgba, self._deviation, noise[COLOUR])
+
+        def with_noise(depth: FloatArray, patch: Patch) -> FloatArray:
+            return self._depth_noise.apply(depth, (patch.rows, patch.columns), self.camera, noise[DEPTH])
+
+        return find_ball(rgba, buffer, self.camera, self.radius, with_noise, (window.top, window.left))
 
     def picture(self, X_BC: FloatArray) -> ByteArray:
-        """Return what a camera at X_BC (4, 4) sees without noise, with the detected ball marked, (h, w, 3)."""
+        """Return the image from X_BC (4, 4) without noise, with the detected ball marked, (h, w, 3)."""
         rgba, buffer = self._scene.render(self.camera, X_BC)
         found = find_ball(rgba, buffer, self.camera, self.radius)
         return draw_detection(rgba[..., :3], found, self.camera, self.radius)
 
-    def _sense(self, depth: FloatArray, patch: Patch) -> FloatArray:
-        return self._depth_noise.apply(depth, (patch.rows, patch.columns), self.camera, self._noise)
+
+class Detector(ABC, Generic[Model]):
+    """Measures features in rendered images, with random streams for the noise of the images.
+
+    The methods take `model`, the true arm and cameras, and `q`, (n,) rad, the exact joint positions of the scene.
+    """
+
+    def __init__(self, streams: tuple[str, ...]) -> None:
+        """Take the names of the random streams; `reset` begins them."""
+        self._streams = streams
+        self.noise: Generators = {}
+
+    def reset(self, seed: int) -> None:
+        """Draw all randomness from `seed`."""
+        self.noise = {name: named_generator(seed, name) for name in self._streams}
+
+    def save(self) -> Generators:
+        """Return the state of the noise, as a value."""
+        return copy.deepcopy(self.noise)
+
+    def restore(self, state: Generators) -> None:
+        """Return to a state of the noise."""
+        self.noise = copy.deepcopy(state)
+
+    @abstractmethod
+    def measure(self, model: Model, q: FloatArray) -> tuple[FloatArray | None, BoolArray | None]:
+        """Return the measured features, (m,), and which are valid, (m,).
+
+        No features mean that nothing was found, no mask that all features are valid.
+        """
+
+    @abstractmethod
+    def truth(self, model: Model, q: FloatArray) -> Truth:
+        """Return the true features and their Jacobian."""
+
+    @abstractmethod
+    def why_missing(self, model: Model, q: FloatArray, valid: BoolArray | None) -> str:
+        """Return why features are missing at the start, with evidence, of a measurement with the mask `valid`."""
+
+    @abstractmethod
+    def picture(self, model: Model, q: FloatArray) -> ByteArray:
+        """Return the images of the cameras with the detected points marked, (h, w, 3)."""
 
 
 @final
-class BallSight(Sight[HandEyeModel]):
+class BallDetector(Detector[HandEyeModel]):
     """A fixed RGB-D camera; y = centre of the ball on the flange."""
 
     def __init__(self, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
         """Take a scene with a ball on the flange."""
-        self._scene, self._eye = scene, DepthCamera(scene, config, config.camera(), ball_radius)
+        super().__init__(DepthCamera.streams)
+        self._scene, self._camera = scene, DepthCamera(scene, config, config.camera(), ball_radius)
 
-    def reset(self, seed: int) -> None:
-        """See `Sight.reset`."""
-        self._eye.reset(seed)
-
-    def see(self, model: HandEyeModel, q: FloatArray) -> FloatArray | None:
-        """Return the ball's centre as the sensor sees it, (3,) m, or None."""
-        found = self._eye.find(model.X_BC, self._scene.ball_position())
+    def measure(self, model: HandEyeModel, q: FloatArray) -> tuple[FloatArray | None, None]:
+        """Return the ball's centre as fitted to the depths, (3,) m, or None."""
+        found = self._camera.find(model.X_BC, self._scene.ball_position(), self.noise)
         if found is None:
-            return None
+            return None, None
         found.centre.setflags(write=False)
-        return found.centre
+        return found.centre, None
 
     def truth(self, model: HandEyeModel, q: FloatArray) -> Truth:
         """Return the feature by the simulator's own ball, and the Jacobian of the true model."""
         return Truth(model.to_camera(self._scene.ball_position()), model.jacobian(q))
 
-    def why_unseen(self, model: HandEyeModel, q: FloatArray) -> str:
+    def why_missing(self, model: HandEyeModel, q: FloatArray, valid: BoolArray | None) -> str:
         """Return where the ball is and would appear."""
-        true, camera = model.to_camera(self._scene.ball_position()), self._eye.camera
+        true, camera = model.to_camera(self._scene.ball_position()), self._camera.camera
         return (
             f"the ball is not visible at the start {q.round(6).tolist()}: it is at {true.round(3).tolist()} m in "
             f"the camera frame, column and row {camera.project(true).round(1).tolist()} of an image of "
@@ -229,115 +222,32 @@ class BallSight(Sight[HandEyeModel]):
         )
 
     def picture(self, model: HandEyeModel, q: FloatArray) -> ByteArray:
-        """See `Sight.picture`."""
-        return self._eye.picture(model.X_BC)
-
-    def save(self) -> Generators:
-        """See `Sight.save`."""
-        return self._eye.save()
-
-    def restore(self, state: Generators) -> None:
-        """See `Sight.restore`."""
-        self._eye.restore(state)
-
-
-def open_sight(model: SensedArm, scene: Scene, config: RenderedConfig, robot: Robot) -> Sight[Any]:
-    """Return what the cameras of a true robot measure.
-
-    Raises:
-        ValueError: cameras that cannot be rendered.
-    """
-    if isinstance(model, HandEyeModel):
-        return BallSight(scene, config, robot.workspace.ball_radius)
-    if not isinstance(model, EyeModel):
-        raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
-    if config.camera() != CAMERA:
-        raise ValueError(
-            f"width, height and vertical_fov are those of sensing position; the images of {model.eye.name} have "
-            f"{CAMERA.width} x {CAMERA.height} px and {CAMERA.vertical_fov:g} deg"
-        )
-    if needs_depth(model.eye, model.optics):
-        return DepthSight(model, scene, config, robot.workspace.ball_radius)
-    return MarkSight(model, scene, config)
-
-
-def needs_depth(eye: Eye, optics: Optics) -> bool:
-    """Return whether the features change when points move along the rays on which they are seen."""
-    near = _some_points(eye)
-    return not np.allclose(eye.measure(near, optics), eye.measure(2.0 * near, optics), rtol=1e-9, atol=1e-9)
-
-
-def _some_points(eye: Eye) -> FloatArray:
-    """Return points (c, p, 3) m that all cameras see, no two alike."""
-    count = eye.cameras * len(eye.target)
-    points = np.stack([0.1 * np.sin(np.arange(count)), 0.1 * np.cos(np.arange(count)), np.ones(count)], axis=-1)
-    return points.reshape(eye.cameras, len(eye.target), 3)
-
-
-class EyeSight(Sight[EyeModel]):
-    """Features of points that are found."""
-
-    _seen: BoolArray | None = None
-
-    def visible(self) -> BoolArray | None:
-        """See `Sight.visible`."""
-        return self._seen
-
-    def truth(self, model: EyeModel, q: FloatArray) -> Truth:
-        """Return the features of the true model in closed form, and their Jacobian."""
-        feature, jacobian, _ = model.look(q)
-        return Truth(feature, jacobian)
-
-    def why_unseen(self, model: EyeModel, q: FloatArray) -> str:
-        """Return which features are not seen, and where they would be."""
-        seen = np.zeros(model.eye.m, dtype=np.bool_) if self._seen is None else self._seen
-        names, true = np.array(model.eye.features)[~seen], model.feature(q)[~seen]
-        wide, high = model.optics.size
-        return (
-            f"{', '.join(names)} cannot be seen at the start {q.round(6).tolist()}: without anything in between they "
-            f"would be {true.round(1).tolist()} {model.eye.unit} in images of {wide:g} x {high:g}; the target is "
-            "hidden, out of sight, too small or cut by the border"
-        )
-
-    def _measured(self, points: FloatArray, found: BoolArray, model: EyeModel) -> FloatArray:
-        """Return the features, (m,), of points (c, p, 3) of which some are found, (c, p)."""
-        self._seen = model.eye.valid(found)
-        feature = model.eye.measure(points, model.optics)
-        feature.setflags(write=False)
-        return feature
-
-
-def camera_poses(model: EyeModel, q: FloatArray) -> FloatArray:
-    """Return the cameras in the base frame, (c, 4, 4), with the arm at `q` (n,) rad."""
-    if model.mount == "fixed":
-        return model.cameras
-    return np.asarray(model.arm.frames(q)[-1] @ model.cameras)
+        """See `Detector.picture`."""
+        return self._camera.picture(model.X_BC)
 
 
 @final
-class MarkSight(EyeSight):
+class MarkCameras:
     """Cameras without depth, in whose images marks are found."""
 
-    def __init__(self, model: EyeModel, scene: Scene, config: RenderedConfig) -> None:
+    streams = (COLOUR,)
+
+    def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig) -> None:
         """Take a scene with the target of a set-up."""
         self._scene = scene
-        self._lenses = [Lens(CAMERA, model.optics, camera) for camera in range(model.eye.cameras)]
+        self._lenses = [Lens(CAMERA, model.optics, camera) for camera in range(model.setup.cameras)]
         self._colours = MARK_COLOURS[: len(model.target)]
         self._centre = sphere_centre if len(model.target) == 1 else disc_centre
         self._deviation = config.colour_noise * config.sensing.noise_factor
 
-    def reset(self, seed: int) -> None:
-        """See `Sight.reset`."""
-        self._noise = named_generator(seed, "colour_noise")
-
-    def see(self, model: EyeModel, q: FloatArray) -> FloatArray:
-        """Return the features as seen now, (m,); `visible` says which are measured."""
-        found, pixels = self._find([self._noisy(image) for image in self._images(model, q)])
+    def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
+        """Return the points in the frame of each camera, (c, p, 3) m at a depth of 1 m, and which are found, (c, p)."""
+        found, pixels = self._find([self._noisy(image, noise) for image in self._images(model, q)])
         points = locate(pixels, np.ones(found.shape), model.optics)
         points[~found] = NOWHERE
-        return self._measured(points, found, model)
+        return points, found
 
-    def picture(self, model: EyeModel, q: FloatArray) -> ByteArray:
+    def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
         """Return the images of all cameras side by side, with a cross at each mark that is found, (h, w, 3)."""
         images = [np.ascontiguousarray(image[..., :3]) for image in self._images(model, q)]
         for image, found, pixels in zip(images, *self._find(images), strict=True):
@@ -345,23 +255,14 @@ class MarkSight(EyeSight):
                 cv2.drawMarker(image, (u, v), OUTLINE, cv2.MARKER_CROSS, 2 * CROSS)
         return np.concatenate(images, axis=1)
 
-    def save(self) -> dict[str, Any]:
-        """See `Sight.save`."""
-        return dict(self._noise.bit_generator.state)
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """See `Sight.restore`."""
-        self._noise = named_generator(0, "colour_noise")
-        self._noise.bit_generator.state = state
-
-    def _images(self, model: EyeModel, q: FloatArray) -> list[ByteArray]:
+    def _images(self, model: SetupModel, q: FloatArray) -> list[ByteArray]:
         poses = camera_poses(model, q)
         return [lens.render(self._scene, pose) for lens, pose in zip(self._lenses, poses, strict=True)]
 
-    def _noisy(self, image: ByteArray) -> ByteArray:
+    def _noisy(self, image: ByteArray, noise: Generators) -> ByteArray:
         """Return an image with colour noise around each mark."""
         for colour in self._colours if self._deviation > 0.0 else ():
-            image = add_colour_noise(image, self._deviation, self._noise, colour.hues)
+            image = add_colour_noise(image, self._deviation, noise[COLOUR], colour.hues)
         return image
 
     def _find(self, images: list[ByteArray]) -> tuple[BoolArray, FloatArray]:
@@ -373,46 +274,109 @@ class MarkSight(EyeSight):
 
 
 @final
-class DepthSight(EyeSight):
+class BallCameras:
     """Cameras with depth, which fit a sphere to the ball."""
 
-    def __init__(self, model: EyeModel, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
+    streams = DepthCamera.streams
+
+    def __init__(self, model: SetupModel, scene: Scene, config: RenderedConfig, ball_radius: float) -> None:
         """Take a scene with a ball.
 
         Raises:
             ValueError: another target than a ball, or features that depend on intrinsics that are not as planned.
         """
-        name = model.eye.name
+        name = model.setup.name
         if len(model.target) > 1:
             raise ValueError(f"sensing {name} needs the depth of {len(model.target)} points; only a ball's is measured")
-        points, planned = _some_points(model.eye), ideal_optics(CAMERA, model.eye.cameras)
-        if (model.eye.measure(points, model.optics) != model.eye.measure(points, planned)).any():
+        points, planned = _some_points(model.setup), ideal_optics(CAMERA, model.setup.cameras)
+        if (model.setup.measure(points, model.optics) != model.setup.measure(points, planned)).any():
             raise ValueError(f"sensing {name} needs depth, and the intrinsics of cameras with depth are as planned")
-        self._eye = DepthCamera(scene, config, CAMERA, ball_radius)
+        self._camera = DepthCamera(scene, config, CAMERA, ball_radius)
 
-    def reset(self, seed: int) -> None:
-        """See `Sight.reset`."""
-        self._eye.reset(seed)
-
-    def see(self, model: EyeModel, q: FloatArray) -> FloatArray:
-        """Return the features as seen now, (m,); `visible` says which are measured."""
+    def find(self, model: SetupModel, q: FloatArray, noise: Generators) -> tuple[FloatArray, BoolArray]:
+        """Return the ball in the frame of each camera, (c, 1, 3) m, and which cameras found it, (c, 1)."""
         ball = model.target[0] if model.mount == "hand" else model.points(q)[0]
-        balls = [self._eye.find(pose, ball) for pose in camera_poses(model, q)]
-        found = np.array([[ball is not None] for ball in balls])
+        balls = [self._camera.find(pose, ball, noise) for pose in camera_poses(model, q)]
         points = np.array([[NOWHERE if ball is None else ball.centre] for ball in balls])
-        return self._measured(points, found, model)
+        return points, np.array([[ball is not None] for ball in balls])
 
-    def picture(self, model: EyeModel, q: FloatArray) -> ByteArray:
-        """See `Sight.picture`."""
-        return np.concatenate([self._eye.picture(pose) for pose in camera_poses(model, q)], axis=1)
-
-    def save(self) -> Any:  # noqa: ANN401
-        """See `Sight.save`."""
-        return self._eye.save()
-
-    def restore(self, state: Any) -> None:  # noqa: ANN401
-        """See `Sight.restore`."""
-        self._eye.restore(state)
+    def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
+        """Return the images of all cameras side by side, with the detected ball marked, (h, w, 3)."""
+        return np.concatenate([self._camera.picture(pose) for pose in camera_poses(model, q)], axis=1)
 
 
-"""Of the depth and of the colour noise."""
+@final
+class SetupDetector(Detector[SetupModel]):
+    """The features of a sensing set-up, from the points that its cameras find."""
+
+    def __init__(self, cameras: MarkCameras | BallCameras) -> None:
+        """Take the cameras."""
+        super().__init__(cameras.streams)
+        self._cameras = cameras
+
+    def measure(self, model: SetupModel, q: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """See `Detector.measure`."""
+        points, found = self._cameras.find(model, q, self.noise)
+        feature = model.setup.measure(points, model.optics)
+        feature.setflags(write=False)
+        return feature, model.setup.valid(found)
+
+    def truth(self, model: SetupModel, q: FloatArray) -> Truth:
+        """Return the features of the true model in closed form, and their Jacobian."""
+        feature, jacobian, _ = model.observe(q)
+        return Truth(feature, jacobian)
+
+    def why_missing(self, model: SetupModel, q: FloatArray, valid: BoolArray | None) -> str:
+        """Return which features are missing, and where they would be."""
+        valid = np.zeros(model.setup.m, dtype=np.bool_) if valid is None else valid
+        names, true = np.array(model.setup.features)[~valid], model.feature(q)[~valid]
+        wide, high = model.optics.size
+        return (
+            f"{', '.join(names)} cannot be seen at the start {q.round(6).tolist()}: without anything in between they "
+            f"would be {true.round(1).tolist()} {model.setup.unit} in images of {wide:g} x {high:g}; the target is "
+            "hidden, out of sight, too small or cut by the border"
+        )
+
+    def picture(self, model: SetupModel, q: FloatArray) -> ByteArray:
+        """See `Detector.picture`."""
+        return self._cameras.picture(model, q)
+
+
+def open_detector(model: RobotModel, scene: Scene, config: RenderedConfig, robot: Robot) -> Detector[Any]:
+    """Return the detector for the cameras of a true robot.
+
+    Raises:
+        ValueError: cameras that cannot be rendered.
+    """
+    if isinstance(model, HandEyeModel):
+        return BallDetector(scene, config, robot.workspace.ball_radius)
+    if not isinstance(model, SetupModel):
+        raise ValueError(f"model must be of an arm and its cameras, got {type(model).__name__}")  # noqa: TRY004
+    if config.camera() != CAMERA:
+        raise ValueError(
+            f"width, height and vertical_fov are those of sensing position; the images of {model.setup.name} have "
+            f"{CAMERA.width} x {CAMERA.height} px and {CAMERA.vertical_fov:g} deg"
+        )
+    if needs_depth(model.setup, model.optics):
+        return SetupDetector(BallCameras(model, scene, config, robot.workspace.ball_radius))
+    return SetupDetector(MarkCameras(model, scene, config))
+
+
+def needs_depth(setup: SensingSetup, optics: Optics) -> bool:
+    """Return whether the features change when points move along the rays on which they are found."""
+    near = _some_points(setup)
+    return not np.allclose(setup.measure(near, optics), setup.measure(2.0 * near, optics), rtol=1e-9, atol=1e-9)
+
+
+def _some_points(setup: SensingSetup) -> FloatArray:
+    """Return points (c, p, 3) m in front of all cameras, no two alike."""
+    count = setup.cameras * len(setup.target)
+    points = np.stack([0.1 * np.sin(np.arange(count)), 0.1 * np.cos(np.arange(count)), np.ones(count)], axis=-1)
+    return points.reshape(setup.cameras, len(setup.target), 3)
+
+
+def camera_poses(model: SetupModel, q: FloatArray) -> FloatArray:
+    """Return the cameras in the base frame, (c, 4, 4), with the arm at `q` (n,) rad."""
+    if model.mount == "fixed":
+        return model.cameras
+    return np.asarray(model.arm.frames(q)[-1] @ model.cameras)

@@ -32,10 +32,8 @@ from servobench.plant.robot.robot import Robot
 
 SX: TypeAlias = Any  # casadi.SX; its own annotations do not cover element access
 PHYSICS_STEP = 0.001  # [s] it divides every control period of 10, 20, 50, 125 and 250 Hz
-POSITION_SHARE, INTEGRAL_SHARE = (
-    0.25,
-    0.1,
-)  # [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
+# [1] of the velocity loop's bandwidth; poles stay damped at twice the inertia
+POSITION_SHARE, INTEGRAL_SHARE = 0.25, 0.1
 STICKING_SPEED = 1e-3  # [rad/s] below it Coulomb friction falls to 0 in proportion
 RATED_PAYLOAD = 5.0  # [kg] of a UR5
 MAX_FOLLOWING_ERROR = 0.1  # [rad] the reference waits for a joint that falls behind further
@@ -60,7 +58,7 @@ class DriveConfig:
     friction_compensation: Share = 0.8
     """[1] of friction, by the reference's speed; 0.7 to 0.9 by default in Universal Robots' torque control."""
     payload: NonNegative = 2.5
-    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and what it holds."""
+    """[kg] true load, a point at the ball: half of the UR5's rated 5 kg, a gripper of 0.9 kg and its load."""
     assumed_payload: NonNegative = 0.9
     """[kg] load by which the drives compensate gravity: the gripper alone (0.9 kg, Robotiq 2F-85)."""
 
@@ -115,7 +113,7 @@ class DriveState(NamedTuple):
 
 
 class RigidBody(NamedTuple):
-    """What the links and the load ask of the drives in one state.
+    """Inertia and torques of the links and the load in one state, as the drives have to overcome them.
 
     Attributes:
         inertia: M, (n, n) [kg m²].
@@ -129,7 +127,7 @@ class RigidBody(NamedTuple):
 
 
 class InPlace:
-    """A function of CasADi on arrays, which it reads and writes where they are."""
+    """A function of CasADi that reads its arguments and writes its results in place."""
 
     def __init__(
         self, function: casadi.Function, arguments: Sequence[FloatArray], results: Sequence[FloatArray]
@@ -152,8 +150,8 @@ class Drives:
     """The cascade of one arm, tuned to its inertia at the start of a run.
 
     The equations are one function of CasADi, which works in arrays: a step of all loops takes a few microseconds, where
-    numpy takes twenty, most of them for calls. Attributes are those arrays, (n,): whoever steps the loops writes the
-    first four and reads the others.
+    numpy takes twenty, most of them for calls. Attributes are those arrays, (n,): the caller of `step` writes the first
+    four and reads the others.
 
     Attributes:
         command: [rad/s], commanded speed of the true angles.
@@ -204,12 +202,12 @@ class Drives:
         self._step = InPlace(self._law(n), arguments, (self._next.ravel(), self.torque, self.drag))
 
     def start(self, angle: FloatArray, body: RigidBody) -> DriveState:
-        """Return joints at rest at `angle` (n,) [rad] whose integrals carry what gravity compensation lacks."""
+        """Return joints at rest at `angle` (n,) [rad] whose integrals carry the rest of the gravity."""
         rest = np.zeros(len(angle))
         return DriveState(angle, rest, angle, rest, body.bias - body.assumed_gravity)
 
     def take(self, state: DriveState, command: FloatArray) -> None:
-        """Go on from a state of joints and loops under a command (n,) [rad/s]."""
+        """Set the state of joints and loops, and the command (n,) [rad/s]."""
         self.command[:], self.angle[:], self.speed[:] = command, state.angle, state.speed
         self._loops[:] = state[2:]
 
@@ -232,7 +230,7 @@ class Drives:
         """Advance joints and loops by a physics step under the loops' torques.
 
         Args:
-            body: what the links and the load ask in the present state.
+            body: inertia and torques of links and load in the present state.
         """
         self.assumed_gravity[:] = body.assumed_gravity
         self.step()
@@ -245,7 +243,7 @@ class Drives:
         self.speed[:] = np.where(self.angle == moved, speed, 0.0)
 
     def _reference_law(self, n: int) -> casadi.Function:
-        """Return (blend, u, loops) -> loops with the reference one physics step further."""
+        """Return (blend, u, loops) -> loops with the reference one physics step later."""
         arguments = blend, u, loops = _symbols(blend=1, u=n, loops=3 * n)
         r, c, z = casadi.vertsplit(loops, n)
         return casadi.Function("reference", arguments, [casadi.vertcat(*self._followed(blend, u, r, c), z)])
@@ -266,9 +264,9 @@ class Drives:
         return casadi.Function("step", arguments, [after, torque, self._drag(omega)])
 
     def _followed(self, blend: SX, u: SX, r: SX, c: SX) -> tuple[SX, SX]:
-        """Return the reference r and its speed c one physics step further; it stops at the stops.
+        """Return the reference r and its speed c one physics step later, limited to the stops.
 
-        `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would cancel what then cancels.
+        `blend`, 1 − e^(−h/τ), is no constant: without a lag it is 1, and CasADi would then simplify the sum.
         """
         c = c + blend * (u - c)
         wanted = r + PHYSICS_STEP * c

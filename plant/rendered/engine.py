@@ -1,4 +1,4 @@
-"""The contract of a physics engine under a rendered plant: it shows an arm, and it moves one.
+"""The contract of a physics engine under a rendered plant: it renders an arm, and it moves one.
 
 Joint angles here are the true ones, θ; the world frame W is the arm's base frame B.
 """
@@ -8,24 +8,22 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from servobench.plant.contract.checks import FloatArray
+from servobench.plant.rendered.detection import ByteArray, Window
+from servobench.plant.rendered.drives import DriveConfig
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import Box
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.camera import PinholeCamera
 from servobench.plant.robot.robot import Robot
 
-if TYPE_CHECKING:
-    from servobench.plant.rendered.detection import ByteArray, Window
-    from servobench.plant.rendered.drives import DriveConfig
-    from servobench.plant.rendered.room import Room
-
 MIN_OVERLAP = 0.01  # [m] less is no contact, as the shapes are schematic
 
 
 class Scene(ABC):
-    """An arm with a ball on its flange that is only looked at."""
+    """An arm with a ball on its flange, for rendering only."""
 
     @abstractmethod
     def place(self, theta: FloatArray) -> None:
@@ -39,14 +37,14 @@ class Scene(ABC):
     def render(
         self, camera: PinholeCamera, X_BC: FloatArray, window: Window | None = None
     ) -> tuple[ByteArray, FloatArray]:
-        """Return what a camera at X_BC (4, 4) sees: colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
+        """Return the image of a camera at X_BC (4, 4): colours (h, w, 3 or 4) uint8, OpenGL depths (h, w) in [0, 1].
 
         With a window only this part of the image, the same pixels as in all of it.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the engine's world; calling it twice is allowed."""
+        """Close the engine's world; calling it twice is allowed."""
 
 
 class OpenScene(Protocol):
@@ -56,7 +54,7 @@ class OpenScene(Protocol):
         """Open a world and load the room.
 
         Args:
-            room: what there is to see.
+            room: the bodies.
             window: whether to open the engine's window.
 
         Raises:
@@ -66,12 +64,12 @@ class OpenScene(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """What a simulation is built from.
+    """The parts that a simulation is built from.
 
     Attributes:
         arm: the true kinematics.
         robot: by its maker's description, for masses and shapes.
-        boxes: obstacles beside table and floor.
+        boxes: obstacles other than table and floor.
         drives: loops, torque limits, friction and load of the joints.
         lag: [s] by which the drives smooth commanded velocities, 0 for none.
         start: (n,) [rad], joint angles at which the loops are tuned.
@@ -88,7 +86,7 @@ class Machine:
 
 
 class Joints(Protocol):
-    """The state of a simulation: an immutable value with whatever the engine needs to go on."""
+    """The state of a simulation: an immutable value from which the engine can continue."""
 
     @property
     def angle(self) -> FloatArray:
@@ -108,11 +106,11 @@ class Overlap(NamedTuple):
 
 
 class Simulation(ABC):
-    """An arm with mass and drives among obstacles; its state is a value that goes in and comes out."""
+    """An arm with mass and drives among obstacles; methods take its state and return a new one."""
 
     @abstractmethod
     def start(self, angle: FloatArray) -> Any:  # noqa: ANN401 - `Joints` of its own, as below
-        """Return joints at rest at `angle` (n,) [rad] whose drives carry the arm's weight."""
+        """Return joints at rest at `angle` (n,) [rad] with drives that carry the arm's weight."""
 
     @abstractmethod
     def advance(self, joints: Any, speed: FloatArray, steps: int) -> Any:  # noqa: ANN401
@@ -134,7 +132,7 @@ class Simulation(ABC):
 
 
 class Engine(NamedTuple):
-    """A physics engine: how its scenes and simulations are opened.
+    """A physics engine, by the constructors of its scenes and simulations.
 
     Attributes:
         scene: for the camera.

@@ -1,7 +1,7 @@
-"""Coloured marks, the ball or discs, in an image: which one is where, by nothing but its pixels.
+"""Coloured marks, the ball or discs, found in an image by nothing but its pixels.
 
-Colour tells marks apart, so none is taken for another. A mark is seen if its pixels fill an ellipse. With their mean μ
-and covariance Σ, the pixels x of a whole ellipse are those with
+Each mark has a colour of its own, so none is taken for another. A mark is found if its pixels fill an ellipse. With
+their mean μ and covariance Σ, the pixels x of a whole ellipse are those with
 
     (x − μ)ᵀ Σ⁻¹ (x − μ) ≤ 4
 
@@ -69,7 +69,7 @@ class Mark(NamedTuple):
 
 
 def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | None]:
-    """Return the mark of each colour, or None where it is not wholly seen.
+    """Return the mark of each colour, or None where it is not wholly visible.
 
     Args:
         rgb: (h, w, 3 or 4).
@@ -89,7 +89,7 @@ def find_marks(rgb: ByteArray, colours: tuple[MarkColour, ...]) -> list[Mark | N
 
 
 def fills_ellipse(patch: Patch) -> bool:
-    """Return whether pixels are all that is in an ellipse and nothing beyond it, up to `EDGE`."""
+    """Return whether pixels fill an ellipse and nothing outside of it, to within `EDGE`."""
     x = np.stack([patch.columns, patch.rows], axis=-1).astype(np.float64)
     middle = x.mean(axis=0)
     sizes, axes = np.linalg.eigh(np.cov(x.T, bias=True))
@@ -107,7 +107,7 @@ def fills_ellipse(patch: Patch) -> bool:
 
 
 def _with_shares(patch: Patch, rgb: ByteArray, paint: Colour) -> Mark:
-    """Return the mark that a patch shows, with the share that it has of each pixel of the patch and beside it."""
+    """Return the mark of a patch, with its share of each pixel of the patch and of their neighbours."""
     top, left = patch.rows.min() - 1, patch.columns.min() - 1
     box = rgb[top : patch.rows.max() + 2, left : patch.columns.max() + 2, :3].astype(np.float64)
     towards = np.array(paint[:3]) - np.mean(paint[:3])
@@ -138,7 +138,7 @@ def _in_image(direction: FloatArray, camera: PinholeCamera) -> FloatArray:
 
 
 def _touches(patch: Patch, others: list[ByteArray]) -> bool:
-    """Return whether a pixel beside those of a patch, which the border does not cut, belongs to another mark."""
+    """Return whether a neighbour of a pixel of a patch, which the border does not cut, belongs to another mark."""
     return any(
         other[patch.rows + down, patch.columns + right].any()
         for other in others

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import mujoco
@@ -27,24 +27,20 @@ import numpy as np
 import numpy.typing as npt
 
 from servobench.plant.contract.checks import FloatArray
-from servobench.plant.rendered.detection import Window, whole
+from servobench.plant.rendered.detection import ByteArray, Window, whole
 from servobench.plant.rendered.drives import PHYSICS_STEP, Drives, DriveState
 from servobench.plant.rendered.engine import MIN_OVERLAP, Machine, Overlap, Scene, Simulation
+from servobench.plant.rendered.room import Room
 from servobench.plant.rendered.urdf import BALL_LINK, LIGHT_PART, arm_mechanics, room_boxes
 from servobench.plant.robot.camera import PIXEL_CENTRE, PinholeCamera
 from servobench.plant.robot.robot import GRAVITY
 
-if TYPE_CHECKING:
-    from servobench.plant.contract.checks import FloatArray
-    from servobench.plant.rendered.detection import ByteArray
-    from servobench.plant.rendered.room import Room
-
 if mujoco.get_mju_user_warning() is None:
-    # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; what is wrong shows in the joints.
+    # MuJoCo would write warnings into a file MUJOCO_LOG.TXT of the current folder; a wrong motion shows in the joints.
     mujoco.set_mju_user_warning(lambda _: None)
 
 LIBRARIES: Final = {"egl": "libEGL.so.1", "osmesa": "libOSMesa.so.8"}  # on Linux, the first choice first
-ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # what other systems bring
+ELSEWHERE: Final = {"darwin": "cgl", "win32": "glfw"}  # part of other systems
 INSTALL: Final = "install OpenGL for EGL (Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri)"
 SLICES, STACKS = 24, 6  # of a cylinder or sphere; MuJoCo's default of 28 × 16 takes twice the time
 AMBIENT, DIFFUSE = 0.55, 0.45  # [1] light from everywhere and from above
@@ -55,12 +51,12 @@ COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_FOG", "mjRN
 STIFF: float = 2.0 * PHYSICS_STEP  # [s] time constant of stops and friction, the shortest that MuJoCo integrates well
 
 
-# MuJoCo would leave out what is only drawn, and join what does not move against each other.
+# MuJoCo would leave out shapes that are only drawn, and join bodies that do not move against each other.
 KEEP_ALL = '<mujoco><compiler discardvisual="false" fusestatic="{fuse}" strippath="true"/></mujoco>'
 
 
 def renderer_name() -> str:
-    """Return by what MuJoCo gets at OpenGL: the word of MUJOCO_GL, or else the first one that this machine has.
+    """Return the OpenGL platform: the word of MUJOCO_GL, or else the first one that this machine has.
 
     Raises:
         ValueError: the machine has none.
@@ -83,22 +79,22 @@ def open_context(width: int, height: int) -> Any:  # noqa: ANN401 - of the class
     """Return an OpenGL context for images of up to width × height [px]; it is current within `as_current()`.
 
     Raises:
-        ValueError: the machine cannot render; says what to install.
+        ValueError: the machine cannot render; names the package to install.
     """
     name = renderer_name()
     try:
         context = import_module(f"mujoco.{name}").GLContext(width, height)
         with context.as_current():
             return context
-    except Exception as error:  # what is missing shows in many ways, by library and by driver
+    except Exception as error:  # a missing part shows in many ways, by library and by driver
         why = " ".join(str(error).split())
         raise ValueError(f"MuJoCo cannot render through {name} ({type(error).__name__}: {why}): {INSTALL}") from error
 
 
 @contextmanager
 def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
-    """Let OpenGL fill no pixel of the current context outside of a rectangle, counted from the lower left corner."""
-    from OpenGL import GL  # noqa: PLC0415 - chooses its platform by what `open_context` has loaded
+    """Restrict OpenGL in the current context to a rectangle of pixels, counted from the lower left corner."""
+    from OpenGL import GL  # noqa: PLC0415 - chooses the platform that `open_context` has loaded
 
     GL.glEnable(GL.GL_SCISSOR_TEST)
     GL.glScissor(left, bottom, width, height)
@@ -110,7 +106,7 @@ def scissors(left: int, bottom: int, width: int, height: int) -> Iterator[None]:
 
 @cache
 def missing_renderer() -> str:
-    """Return a line about what this machine lacks for images; empty if nothing."""
+    """Return a line about missing parts of this machine for images; empty if nothing is missing."""
     try:
         open_context(16, 16).free()
     except ValueError as error:
@@ -120,7 +116,7 @@ def missing_renderer() -> str:
 
 @cache
 def describe_renderer() -> str:
-    """Return which engine computes, and what renders its images."""
+    """Return which engine computes, and which library renders its images."""
     from OpenGL import GL  # noqa: PLC0415 - as above
 
     if missing_renderer():
@@ -186,8 +182,8 @@ class MujocoScene(Scene):
         mujoco.mjv_updateScene(
             self._model, self._data, self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL, self._drawn
         )
-        for eye in self._drawn.camera:
-            _aim(eye, camera, X_BC)
+        for gl_camera in self._drawn.camera:
+            _aim(gl_camera, camera, X_BC)
         shape, context = (window.bottom - window.top, window.right - window.left), self._context
         part = (window.left, camera.height - window.bottom, *shape[::-1])
         rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
@@ -200,14 +196,14 @@ class MujocoScene(Scene):
         return rgb, depth
 
     def _leave_out(self, camera: PinholeCamera, X_BC: FloatArray, window: Window) -> None:
-        """Let the parts be drawn whose bounding sphere reaches into the pyramid of rays through a window."""
+        """Hide the parts whose bounding spheres are outside of the pyramid of rays through a window."""
         columns, rows = (window.left, window.right), (window.top, window.bottom)
         (left, top, _), (right, bottom, _) = camera.rays(columns, rows).tolist()
         inwards = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
         inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
         centres = (self._data.geom_xpos - X_BC[:3, 3]) @ (X_BC[:3, :3] @ inwards.T)
-        seen = (centres >= -self._model.geom_rbound[:, None]).all(axis=1)
-        self._model.geom_group[:] = np.where(seen, SHOWN, HIDDEN)
+        reached = (centres >= -self._model.geom_rbound[:, None]).all(axis=1)
+        self._model.geom_group[:] = np.where(reached, SHOWN, HIDDEN)
 
     def close(self) -> None:
         """See `Scene.close`."""
@@ -219,7 +215,7 @@ class MujocoScene(Scene):
 
 
 def _compile(room: Room) -> Any:  # noqa: ANN401
-    """Return the model of all that is drawn, an `MjModel`."""
+    """Return the model of all drawn bodies, an `MjModel`."""
     files = room.files()
     (_, spec), *around = [(name, read_urdf(text, files)) for name, text in files.items() if name.endswith(".urdf")]
     for name, body in around:
@@ -232,26 +228,26 @@ def _compile(room: Room) -> Any:  # noqa: ANN401
         specular=[0.0] * 3,
         castshadow=False,
     )
-    looks = spec.visual
-    looks.headlight.active = 0
-    looks.quality.offsamples, looks.quality.shadowsize = 0, 0
-    looks.quality.numslices, looks.quality.numstacks, looks.quality.numquads = SLICES, STACKS, 1
+    visual = spec.visual
+    visual.headlight.active = 0
+    visual.quality.offsamples, visual.quality.shadowsize = 0, 0
+    visual.quality.numslices, visual.quality.numstacks, visual.quality.numquads = SLICES, STACKS, 1
     return spec.compile()
 
 
-def _aim(eye: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # noqa: ANN401 - an `MjvGLCamera`
-    """Let a camera of OpenGL see what `camera` sees from X_BC (4, 4), pixel by pixel."""
-    eye.pos, eye.forward, eye.up = X_BC[:3, 3], X_BC[:3, 2], -X_BC[:3, 1]
+def _aim(gl_camera: Any, camera: PinholeCamera, X_BC: FloatArray) -> None:  # noqa: ANN401 - an `MjvGLCamera`
+    """Give a camera of OpenGL the pose X_BC (4, 4) and the pixels of `camera`."""
+    gl_camera.pos, gl_camera.forward, gl_camera.up = X_BC[:3, 3], X_BC[:3, 2], -X_BC[:3, 1]
     pixel = camera.near / camera.focal  # [m] of a pixel on the near plane
     right, down = pixel * (PIXEL_CENTRE[0] - 0.5), pixel * (PIXEL_CENTRE[1] - 0.5)
     half = 0.5 * camera.height * pixel
-    eye.frustum_center, eye.frustum_width = right, 0.5 * camera.width * pixel
-    eye.frustum_bottom, eye.frustum_top = -half - down, half - down
-    eye.frustum_near, eye.frustum_far, eye.orthographic = camera.near, camera.far, 0
+    gl_camera.frustum_center, gl_camera.frustum_width = right, 0.5 * camera.width * pixel
+    gl_camera.frustum_bottom, gl_camera.frustum_top = -half - down, half - down
+    gl_camera.frustum_near, gl_camera.frustum_far, gl_camera.orthographic = camera.near, camera.far, 0
 
 
 class MujocoState(NamedTuple):
-    """The joints, their loops, and what MuJoCo takes from one step to the next; arrays never change.
+    """The joints, their loops, and MuJoCo's own state between steps; arrays never change.
 
     Attributes:
         loops: angles and speeds of the joints with their loops.
@@ -268,7 +264,16 @@ class MujocoState(NamedTuple):
 
 
 class MujocoSimulation(Simulation):
-    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next."""
+    """An arm with its true load in a MuJoCo model, whose data hold nothing from one call to the next.
+
+    A physics step is MuJoCo's own, with the implicit integrator `implicitfast`:
+
+        M(θ) ω̇ = T − b(θ, ω) − B ω + τ,        τ: of dry friction and of the stops, solved as constraints
+
+    T is the torque of `servobench.plant.rendered.drives`, M includes the rotors and b the true load. The gravity torque
+    by which the drives compensate is MuJoCo's, too, as if the load were the assumed one. Contact is only detected:
+    bodies do not push each other.
+    """
 
     def __init__(self, machine: Machine) -> None:
         """Load the arm.
@@ -367,7 +372,7 @@ def _assumed_inertia(machine: Machine) -> FloatArray:
 
 
 def _solid(machine: Machine) -> tuple[Any, dict[int, str]]:
-    """Return the model of all that can be met, an `MjModel`, and the names of its boxes by number."""
+    """Return the model of all collision shapes, an `MjModel`, and the names of its boxes by number."""
     spec = read_urdf(arm_mechanics(machine.arm, 0.0, shapes=True, robot=machine.robot))
     boxes = (*room_boxes(machine.robot.workspace.scale), *machine.boxes)
     for box in boxes:

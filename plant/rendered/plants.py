@@ -21,7 +21,7 @@ def build_bullet(config: RenderedConfig, setup: PlantSetup) -> Bench:
 
 
 def bullet_renderer() -> str:
-    """Return which engine renders the images, and how they arrive."""
+    """Return the engine that renders the images, with its version."""
     from servobench.plant.rendered.bullet import describe_renderer  # noqa: PLC0415
 
     return describe_renderer()

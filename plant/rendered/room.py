@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.rendered.marks import MARK_COLOURS, RED
 from servobench.plant.rendered.urdf import (
@@ -41,15 +41,18 @@ DISC_RADIUS: Final = 0.02  # [m] for a UR5
 PAD_RADIUS: Final = 0.035  # [m] of the white pad behind a disc, for a UR5
 LAYER: Final = 0.001  # [m] thickness of discs and pads, for a UR5
 ROD_RADIUS: Final = 0.004  # [m] for a UR5
-HOUSING: Final = (0.02, 0.06)  # [m] radius and length of a camera on the hand, for a UR5; too near to see itself
-EYE: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
-TARGET: Final = (0.40, 0.0, 0.26)  # [m] what it looks at
+HOUSING: Final = (
+    0.02,
+    0.06,
+)  # [m] radius and length of a camera on the hand, for a UR5; too near to be in its own image
+POSITION: Final = (1.75, -1.35, 1.35)  # [m] base frame of a UR5: from the front right
+TARGET: Final = (0.40, 0.0, 0.26)  # [m] the point on its optical axis
 CAMERA: Final = PinholeCamera(640, 480, 38.0, near=0.1, far=8.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Where target and cameras of a set-up are.
+    """Positions of the target and the cameras of a set-up.
 
     Attributes:
         target: (p, 3) [m], in the flange frame, or with cameras on the hand in the base frame.
@@ -64,7 +67,7 @@ class Rig:
     ball_radius: float
 
     @classmethod
-    def of(cls, model: EyeModel, robot: Robot) -> Rig | None:
+    def of(cls, model: SetupModel, robot: Robot) -> Rig | None:
         """Return the rig of a set-up; None where it is the ball on the flange, which every arm carries.
 
         Raises:
@@ -76,7 +79,7 @@ class Rig:
             return None
         if count > len(MARK_COLOURS) or (count > 1 and not np.any(_normal(model.target))):
             raise ValueError(
-                f"sensing {model.eye.name} has a target of {count} points, and what can be drawn is a ball, of one "
+                f"sensing {model.setup.name} has a target of {count} points; only these can be drawn: a ball, of one "
                 "point, or a plate with three or four discs that are not in line"
             )
         return cls(model.target, model.cameras if on_hand else None, robot.workspace.scale, robot.workspace.ball_radius)
@@ -84,12 +87,12 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """An arm among the things around it; the base frame is the world frame.
+    """An arm and the bodies around it; the base frame is the world frame.
 
     Attributes:
         arm: the true kinematics.
         scenery: whether the table and the floor are there.
-        robot: by its maker's description, for the looks.
+        robot: by its maker's description, for the visual shapes.
         boxes: obstacles.
         rig: target and cameras of a sensing set-up; None for the ball on the flange.
     """
@@ -115,7 +118,7 @@ class Room:
 
 
 def arm_files(arm: SerialArm, robot: Robot, rig: Rig | None) -> dict[str, str]:
-    """Return the files, text by name, of an arm with what is on it, `arm.urdf`, and of a target in the world, if any.
+    """Return the files, text by name, of an arm with its target or cameras, `arm.urdf`, and of a target in the world.
 
     Args:
         arm: the kinematics, mismatch included.
@@ -157,7 +160,7 @@ def _draw_target(link: ET.Element, rig: Rig, points: FloatArray) -> None:
 
 
 def _normal(points: FloatArray) -> FloatArray:
-    """Return the unit normal of a plate, (3,), away from whoever sees its discs; zeros where there is none."""
+    """Return the unit normal of a plate, (3,), away from the side of its discs; zeros where there is none."""
     normal = np.cross(points[1] - points[0], points[2] - points[0]) if len(points) > 2 else np.zeros(3)
     length = np.linalg.norm(normal)
     return np.asarray(normal / length if length > 1e-9 else np.zeros(3))
@@ -165,7 +168,7 @@ def _normal(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Overview:
-    """A camera that sees the whole arm.
+    """A camera with the whole arm in its image, for films and environments.
 
     Attributes:
         camera: its optics.
@@ -177,14 +180,14 @@ class Overview:
 
     @classmethod
     def of(cls, scale: float, fineness: float = 1.0) -> Self:
-        """Return the view of an arm.
+        """Return the overview of an arm.
 
         Args:
             scale: of its workspace, over that of a UR5.
             fineness: pixels for one pixel of `CAMERA`, along each side; above 1 edges become smooth once scaled down.
         """
         size = {"width": round(fineness * CAMERA.width), "height": round(fineness * CAMERA.height)}
-        return cls(replace(CAMERA, **size), _look_at(scale * np.array(EYE), scale * np.array(TARGET)))
+        return cls(replace(CAMERA, **size), _look_at(scale * np.array(POSITION), scale * np.array(TARGET)))
 
     def pixels(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return where points (k, 3) m of the base frame appear, (k, 2) px, and their depths, (k,) m."""
@@ -192,12 +195,12 @@ class Overview:
         return self.camera.project(p_C), p_C[:, 2]
 
 
-def _look_at(eye: FloatArray, target: FloatArray) -> FloatArray:
-    """Return X_BC, (4, 4), of a camera at `eye` that looks at `target`, both (3,) m, with the horizon level."""
-    z = (target - eye) / np.linalg.norm(target - eye)
+def _look_at(position: FloatArray, target: FloatArray) -> FloatArray:
+    """Return X_BC, (4, 4), of a camera at `position` directed at `target`, both (3,) m, with the horizon level."""
+    z = (target - position) / np.linalg.norm(target - position)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=-1)
-    pose[:3, 3] = eye
+    pose[:3, 3] = position
     return pose

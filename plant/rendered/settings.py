@@ -21,7 +21,7 @@ BoxNumbers = Annotated[tuple[Number, ...], Len(6, 6)]
 
 @settings
 class RenderedConfig:
-    """Settings of a rendered plant; those of masses, loads and drives are a UR5's, and change with the robot."""
+    """Settings of a rendered plant; the defaults of loads and drives are a UR5's, and change with the robot."""
 
     max_joint_speed: Positive = 1.0
     """[rad/s] limit of every joint, in addition to its maker's; a cautious share of a UR5's π."""

@@ -1,11 +1,11 @@
 """URDF of an arm with a ball on its flange, and of the table and floor on which it stands, with their meshes.
 
 The body frame of link i is frame i of `SerialArm` (after the rotation of joint i); the next joint sits at the arm's
-fixed transform. A mismatched arm therefore turns into a mismatched simulation. The rendered arm has looks and no
-collision shapes, the simulated one the same cylinders and spheres as collision shapes and no looks.
+fixed transform. A mismatched arm therefore turns into a mismatched simulation. The rendered arm has visual and no
+collision shapes, the simulated one the same cylinders and spheres as collision shapes only.
 
 Numbers are written with `repr`, so that none loses a digit. Meshes are Wavefront OBJ text: PyBullet's own sphere is so
-coarse that its front lies 6 % of the radius too deep, and its boxes draw six faces of which one can be seen.
+coarse that its front lies 6 % of the radius too deep, and its boxes draw six faces where one is enough.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ TABLE_THICKNESS = 0.04  # [m] of its top as an obstacle
 FLOOR_DROP, TILE = 0.75, 0.4  # [m] floor below the table's top; side of a floor tile
 LIGHT_PART = (0.001, (1e-6, 1e-6))  # [kg], [kg m²] of flange and ball; PyBullet's default is 1 kg
 BASE_PART = (4.0, (0.01, 0.01))  # [kg], [kg m²]; fixed to the world, so without effect
-BALL_MESH = "ball.obj"  # file in which URDFs look for the unit sphere
+BALL_MESH = "ball.obj"  # file of the unit sphere in URDFs
 BALL_SUBDIVISIONS = 4  # 5120 triangles: the front lies 0.05 % of the radius too deep
 
 
 def text(robot: ET.Element) -> str:
-    """Return a URDF as text."""
+    """Return the text of a URDF."""
     ET.indent(robot)
     return ET.tostring(robot, encoding="unicode")
 
 
 def numbers(values: npt.ArrayLike) -> str:
-    """Return numbers as URDF writes them, with spaces between."""
+    """Return numbers in the notation of URDF, separated by spaces."""
     return " ".join(repr(value) for value in np.asarray(values, dtype=np.float64).tolist())
 
 
@@ -193,7 +193,7 @@ class Box(NamedTuple):
 
 
 def arm_urdf(arm: SerialArm, robot: Robot) -> str:
-    """Return the URDF of an arm with masses and looks of a robot; its joint angles are the true ones, θ.
+    """Return the URDF of an arm with masses and visual shapes of a robot; its joint angles are the true ones, θ.
 
     Args:
         arm: the kinematics, mismatch included.
@@ -210,7 +210,7 @@ def arm_urdf(arm: SerialArm, robot: Robot) -> str:
 
 
 def arm_mechanics(arm: SerialArm, payload: float, *, robot: Robot, shapes: bool) -> str:
-    """Return the URDF of an arm without looks, with a point load at the ball.
+    """Return the URDF of an arm without visual shapes, with a point load at the ball.
 
     Args:
         arm: the kinematics, mismatch included.
@@ -334,7 +334,7 @@ def _draw_base(link: ET.Element, step: FloatArray, radius: float) -> None:
 
 
 def _draw_link(link: ET.Element, step: FloatArray, radius: float, side: float) -> None:
-    """Draw a link: a capped housing about its joint, a tube beside it, and the way over to the next joint."""
+    """Draw a link: a capped housing about its joint, a tube beside it, and the connection to the next joint."""
     top, corner, end = np.array([0.0, 0.0, side]), np.array([step[0], step[1], side]), step
     far_aside = abs(side) > radius
     # The cap closes the housing's free end: beyond the tube, or opposite to where the link before comes in.

@@ -19,12 +19,12 @@ import numpy as np
 
 from servobench.plant.bench.bench import Bench, build_bench
 from servobench.plant.bench.plant import PlantSetup, World
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.checks import FloatArray, as_vector, whole_steps
 from servobench.plant.contract.faults import Collision, PlantDiverged
 from servobench.plant.contract.signals import BoolArray, Truth
 from servobench.plant.rendered.detection import ByteArray
-from servobench.plant.rendered.detectors import open_sight
+from servobench.plant.rendered.detectors import open_detector
 from servobench.plant.rendered.drives import PHYSICS_STEP
 from servobench.plant.rendered.engine import Engine, Joints, Machine, Overlap
 from servobench.plant.rendered.room import Rig, Room
@@ -35,7 +35,7 @@ from servobench.plant.robot.hand_eye import hand_eye_spec
 from servobench.plant.robot.robot import Robot
 from servobench.plant.robot.ur5 import UR5
 
-CONTACT_STEPS = 10  # physics steps between two looks for contact, 10 mm at 1 m/s; and at the end of a period
+CONTACT_STEPS = 10  # physics steps between two checks for contact, 10 mm at 1 m/s; and at the end of a period
 LAST_ON_TABLE = 1  # base and shoulder stand on the table
 BUILT_INTO_EACH_OTHER = (0, 2)  # base and upper arm, whose housings meet inside the shoulder in every pose
 
@@ -90,7 +90,7 @@ class RenderedState:
         joints: angles, speeds and loops of the joints.
         periods: number of periods since the reset.
         camera: (4, 4), pose of the first camera.
-        noise: of the sight.
+        noise: of the detector.
     """
 
     joints: Joints
@@ -103,7 +103,7 @@ class RenderedWorld(World):
     """An arm with drives and its cameras."""
 
     def __init__(self, engine: Engine, config: RenderedConfig, setup: PlantSetup) -> None:
-        """Open worlds of its own and load the arm.
+        """Open a scene and a simulation with the arm.
 
         Raises:
             ValueError: a start of the wrong size, a period that physics steps do not divide, a list that does not
@@ -118,14 +118,15 @@ class RenderedWorld(World):
         if not arm.gear_ratio.all():
             raise ValueError(f"gear_ratio must not be zero, got {arm.gear_ratio.tolist()}")
         self._camera = model.camera
+        self._valid: BoolArray | None = None
         boxes, robot = config.boxes(), setup.nominal or find_robot(UR5)
-        rig = Rig.of(model, robot) if isinstance(model, EyeModel) else None
+        rig = Rig.of(model, robot) if isinstance(model, SetupModel) else None
         self._scene = engine.scene(Room(arm, config.scenery, robot, boxes, rig), window=config.view)
         stops = arm.joint_angle(self.spec.joint_lower), arm.joint_angle(self.spec.joint_upper)
         ordered = np.minimum(*stops), np.maximum(*stops)
         angle = arm.joint_angle(self._start)
         try:
-            self._sight = open_sight(model, self._scene, config, robot)
+            self._detector = open_detector(model, self._scene, config, robot)
             self._simulation = engine.simulation(Machine(arm, robot, boxes, config.drives, config.lag, angle, ordered))
         except BaseException:
             self._scene.close()
@@ -138,7 +139,7 @@ class RenderedWorld(World):
         Raises:
             Collision: the arm overlaps with itself or the room at the start.
         """
-        self._sight.reset(seed)
+        self._detector.reset(seed)
         self.move_camera(self._camera)
         self._periods = 0
         angle = self._model.arm.joint_angle(self._start)
@@ -166,7 +167,7 @@ class RenderedWorld(World):
         return self._reported()
 
     def _check_state(self, step: int) -> None:
-        """Raise the fault of joints that are not finite or of an arm that touches something, at a physics step."""
+        """Raise a fault, at a physics step, if joints are not finite or the arm touches a body."""
         if not np.isfinite(self._joints.angle).all():
             raise PlantDiverged(f"joint positions are not finite: {self._joints.angle.tolist()}")
         self._check_contact(step)
@@ -179,27 +180,28 @@ class RenderedWorld(World):
             raise Collision(f"{touching[0]} meets {touching[1]} at {seconds:.3f} s")
 
     def see(self) -> FloatArray | None:
-        """Return the features as the cameras see them now, (m,); None if nothing is found."""
-        return self._sight.see(self._model, self._joint_position())
+        """Return the features as measured now, (m,); None if nothing is found."""
+        feature, self._valid = self._detector.measure(self._model, self._joint_position())
+        return feature
 
     def visible(self) -> BoolArray | None:
-        """Return which features of what was seen last are measured, (m,); None for all of them."""
-        return self._sight.visible()
+        """See `World.visible`."""
+        return self._valid
 
     def why_unseen(self) -> str:
         """Return where the target is and would appear."""
-        return self._sight.why_unseen(self._model, self._joint_position())
+        return self._detector.why_missing(self._model, self._joint_position(), self._valid)
 
     def save(self) -> RenderedState:
         """See `Plant.save`; measured: joints, detections and images continue with the same bits."""
-        return RenderedState(self._joints, self._periods, self._model.camera, self._sight.save())
+        return RenderedState(self._joints, self._periods, self._model.camera, self._detector.save())
 
     def restore(self, state: RenderedState) -> None:
         """See `Plant.restore`."""
         self._joints, self._periods = state.joints, state.periods
         self._scene.place(state.joints.angle)
         self.move_camera(state.camera)
-        self._sight.restore(state.noise)
+        self._detector.restore(state.noise)
 
     def move_camera(self, X_BC: FloatArray) -> None:
         """See `Plant.move_camera`."""
@@ -207,14 +209,14 @@ class RenderedWorld(World):
 
     def truth(self) -> Truth:
         """Return true features and Jacobian at the present joints."""
-        return self._sight.truth(self._model, self._joint_position())
+        return self._detector.truth(self._model, self._joint_position())
 
     def picture(self) -> ByteArray:
-        """Return what the cameras see now with what is found marked, (h, w, 3)."""
-        return self._sight.picture(self._model, self._joint_position())
+        """Return the present images of the cameras with the detected points marked, (h, w, 3)."""
+        return self._detector.picture(self._model, self._joint_position())
 
     def close(self) -> None:
-        """Leave the engine's worlds."""
+        """Close the scene and the simulation."""
         self._scene.close()
         self._simulation.close()
 
@@ -225,7 +227,7 @@ class RenderedWorld(World):
         return q
 
     def _reported(self) -> FloatArray:
-        """Return the joint positions in steps of the encoders, (n,) rad; a stop is the end of the scale."""
+        """Return the joint positions in steps of the encoders, (n,) rad; the scale ends at the stops."""
         q, resolution = self._joint_position(), self._config.encoder_resolution
         if resolution == 0.0:
             return q
@@ -234,7 +236,7 @@ class RenderedWorld(World):
         return np.where(q <= lower + half, lower, steps)
 
     def _keep_pace(self) -> None:
-        """Wait until the wall clock has come as far as the run; only with a window."""
+        """Wait until the wall clock has reached the time of the run; only with a window."""
         time.sleep(max(0.0, self._started + self._periods * self.spec.period - time.perf_counter()))
 
 

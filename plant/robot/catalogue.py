@@ -21,7 +21,6 @@ from servobench.plant.contract.settings import suggest
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_dh
 from servobench.plant.robot.makers import UNIVERSAL_ROBOTS, panda, universal_robot
 from servobench.plant.robot.robot import Robot, estimate_links
-from servobench.plant.robot.ur5 import UR5
 from servobench.plant.robot.workspace import find_workspace, with_ball
 
 ROBOTS: Final[Mapping[str, Callable[[], Robot]]] = {
@@ -59,11 +58,6 @@ def find_robot(text: str) -> Robot:
     return _read(text, changed)
 
 
-def nominal_ur5() -> Robot:
-    """Return the robot of every run that names none."""
-    return _known(UR5)
-
-
 @cache
 def _known(name: str) -> Robot:
     return ROBOTS[name]()
@@ -93,7 +87,7 @@ MAX_DRAWS: Final = 200
 
 
 def random_robot(number: int) -> Robot:
-    """Return the arm of a number, the same for ever.
+    """Return the random arm with a number; a number always gives the same arm.
 
     Raises:
         ValueError: a number out of its bounds.

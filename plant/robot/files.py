@@ -38,7 +38,7 @@ from servobench.plant.robot.workspace import find_workspace, with_ball
 
 
 def read_robot(text: str) -> Robot:
-    """Return the robot that a file describes; its kind is told by its ending.
+    """Return the robot that a file describes; the suffix decides how it is read.
 
     Args:
         text: the path; that of a URDF may end in `#LINK`, the link that carries the ball.
@@ -170,7 +170,7 @@ def _given(name: str, values: tuple[float, ...], n: int) -> FloatArray | None:
 
 
 def estimated(mass: tuple[float, ...], name: str) -> str:
-    """Return the line that says what was estimated."""
+    """Return the line that names the estimated values."""
     return "" if mass else f"{name}: masses, inertia and torque limits are estimated from the lengths of the links"
 
 
@@ -179,7 +179,7 @@ DEFAULT_SPEED: Final = pi  # [rad/s] of a joint whose limit is not given
 
 
 class Joint(NamedTuple):
-    """A turning joint of the chain.
+    """A rotating joint of the chain.
 
     Attributes:
         joint: as yourdfpy reads it.
@@ -226,7 +226,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
         import yourdfpy  # noqa: PLC0415 - only the extra urdf brings it
     except ImportError as error:
         raise ValueError(f"robot file {path}: a URDF needs yourdfpy: pip install 'servobench[urdf]'") from error
-    said: list[str] = []  # of a text that is no XML, of which yourdfpy goes on to read what it can
+    said: list[str] = []  # of a text that is no XML, of which yourdfpy reads the rest nevertheless
 
     def collect(record: logging.LogRecord) -> bool:
         if record.levelno >= logging.ERROR:
@@ -239,7 +239,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
         read = yourdfpy.URDF.load(
             str(path), build_scene_graph=False, load_meshes=False, build_collision_scene_graph=False
         ).robot
-    except Exception as error:  # noqa: BLE001 - whatever it raises, the line says it
+    except Exception as error:  # noqa: BLE001 - the line repeats any error
         said.append(str(error) or type(error).__name__)
     finally:
         log.removeFilter(collect)
@@ -249,7 +249,7 @@ def _read(path: Path) -> Any:  # noqa: ANN401 - yourdfpy is not typed
 
 
 def _chain(tree: Any, tip: str) -> tuple[list[Joint], FloatArray, str]:  # noqa: ANN401
-    """Return the turning joints from the base to a tip, the flange after the last one, and the name of the tip."""
+    """Return the rotating joints from the base to a tip, the flange after the last one, and the name of the tip."""
     above = {joint.child: joint for joint in tree.joints}
     links = [link.name for link in tree.links]
     for joint in tree.joints:
@@ -290,7 +290,7 @@ def _way(link: str, above: dict[str, Any]) -> list[Any]:
 
 
 def _after_last(way: list[Any]) -> int:
-    """Return how many joints follow the last one that turns."""
+    """Return the number of joints after the last rotating one."""
     return next((i for i, joint in enumerate(reversed(way)) if _turns(joint)), len(way))
 
 
@@ -299,7 +299,7 @@ def _is_last_body(ways: dict[str, list[Any]], tip: str) -> bool:
 
 
 def _flange(ways: dict[str, list[Any]], last: str) -> str:
-    """Return the link that is fixed to the last turning one, if there is one, else that one itself."""
+    """Return the link that is fixed to the last rotating one, or else the rotating one itself."""
     fixed = [
         name for name, way in ways.items()
         if len(way) == len(ways[last]) + 1 and way[:-1] == ways[last] and way[-1].type == "fixed"
@@ -308,7 +308,7 @@ def _flange(ways: dict[str, list[Any]], last: str) -> str:
 
 
 def _along(axis: FloatArray) -> FloatArray:
-    """Return a frame (4, 4) whose z axis is `axis` (3,); no turn where that is z already."""
+    """Return a frame (4, 4) whose z axis is `axis` (3,); the identity if that is z already."""
     z = axis / np.linalg.norm(axis)
     frame = np.eye(4)
     if z[2] < 1.0 - 1e-12:
@@ -338,7 +338,7 @@ def _limits(chain: list[Joint]) -> JointLimits:
 
 
 def _links(tree: Any, chain: list[Joint], arm: SerialArm) -> tuple[Links, str]:  # noqa: ANN401
-    """Return the links, estimated where the file says nothing, and a line about what was."""
+    """Return the links, estimated where the file has no values, and a line about the estimates."""
     inertials = {link.name: link.inertial for link in tree.links}
     own = [inertials[link.joint.child] for link in chain]
     efforts = [0.0 if link.joint.limit is None else link.joint.limit.effort or 0.0 for link in chain]

@@ -25,10 +25,10 @@ from servobench.plant.robot.arm import JointLimits, SerialArm, narrowed
 FEATURE_NAMES = ("x", "y", "z")
 FEATURE = Channel(FEATURE_NAMES, "m", 1.0, np.full(3, -np.inf), np.full(3, np.inf))  # the ball centre, camera frame
 ROTATION_TOLERANCE = 1e-9  # [1] of the entries of R Rᵀ
-WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are looked for
+WAY_FROM_HOME: Final = np.linspace(1.0, 0.0, 21)  # shares of the way to a posture at which features are sought
 
 
-class SensedArm(ABC):
+class RobotModel(ABC):
     """An arm and its cameras, y = h(q) and J = ∂h/∂q; pure, over leading axes.
 
     The robots of many runs side by side are one model, whose arrays have leading axes (`plant.contract.lanes.stack`).
@@ -49,13 +49,13 @@ class SensedArm(ABC):
 
     @property
     def noise_unit(self) -> float:
-        """What a metre of noise is in the unit of the features."""
+        """A metre of noise in the unit of the features."""
         return 1.0
 
     @property
     @abstractmethod
     def camera(self) -> FloatArray:
-        """The pose of the first camera, (..., 4, 4), in the frame of what it is mounted on: the base or the flange."""
+        """The pose of the first camera, (..., 4, 4), in the frame of its mount, the base or the flange."""
 
     @abstractmethod
     def with_camera(self, pose: FloatArray) -> Self:
@@ -81,30 +81,30 @@ class SensedArm(ABC):
         """Return ∂feature/∂(joint position), (..., m, n), for joint positions (..., n) in rad."""
         return self.feature_and_jacobian(joint_position)[1]
 
-    def visible(self, joint_position: npt.ArrayLike) -> BoolArray | None:
-        """Return which features a camera sees, (..., m); None where nothing can hide them."""
+    def valid(self, joint_position: npt.ArrayLike) -> BoolArray | None:
+        """Return which features can be measured, (..., m); None where nothing can hide them."""
         del joint_position
         return None
 
-    def look(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray | None]:
-        """Return `feature`, `jacobian` and `visible` at the cost of one forward kinematics."""
-        return (*self.feature_and_jacobian(joint_position), self.visible(joint_position))
+    def observe(self, joint_position: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray | None]:
+        """Return `feature`, `jacobian` and `valid` at the cost of one forward kinematics."""
+        return (*self.feature_and_jacobian(joint_position), self.valid(joint_position))
 
-    def jacobian_in_view(self, joint_position: npt.ArrayLike, home: FloatArray) -> FloatArray:
-        """Return `jacobian`, or where a feature is out of view that of the last posture on the way there from home.
+    def valid_jacobian(self, joint_position: npt.ArrayLike, home: FloatArray) -> FloatArray:
+        """Return `jacobian`, or where a feature is not valid that of the last posture on the way there from home.
 
         Args:
             joint_position: (..., n) [rad].
-            home: (n,), a posture at which all features are in view [rad].
+            home: (n,), a posture at which all features are valid [rad].
         """
         q = np.asarray(joint_position, dtype=np.float64)
-        if self.visible(home) is None:
+        if self.valid(home) is None:
             return self.jacobian(q)
         nearer, reached = q, np.zeros(q.shape[:-1], dtype=np.bool_)
         for share in WAY_FROM_HOME:
             tried = home + share * (q - home)
-            seen = self.visible(tried)
-            here = ~reached if seen is None else seen.all(axis=-1) & ~reached
+            valid = self.valid(tried)
+            here = ~reached if valid is None else valid.all(axis=-1) & ~reached
             nearer, reached = np.where(here[..., None], tried, nearer), reached | here
         return self.jacobian(np.where(reached[..., None], nearer, home))
 
@@ -126,8 +126,8 @@ def turn_about(pose: FloatArray, rotation: FloatArray, point: FloatArray) -> Flo
 
 
 @dataclass(frozen=True, eq=False)
-class HandEyeModel(SensedArm):
-    """A serial arm seen by a fixed camera.
+class HandEyeModel(RobotModel):
+    """A serial arm under a fixed camera, eye to hand.
 
     Attributes:
         arm: the arm with the ball on its flange.
@@ -203,7 +203,7 @@ class TrueJacobian:
         model: arm and camera.
     """
 
-    model: SensedArm
+    model: RobotModel
 
     def __call__(self, joint_position: npt.ArrayLike) -> FloatArray:
         """Return ∂feature/∂(joint position), (..., m, n), for joint positions (..., n) in rad."""
@@ -211,7 +211,7 @@ class TrueJacobian:
 
 
 def hand_eye_spec(
-    model: SensedArm, period: float, max_joint_speed: float, joint_range: float, limits: JointLimits | None = None
+    model: RobotModel, period: float, max_joint_speed: float, joint_range: float, limits: JointLimits | None = None
 ) -> PlantSpec:
     """Return the spec of a plant built on `model`.
 

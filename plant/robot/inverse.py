@@ -15,6 +15,7 @@ The pose of the flange, from one start, with the geometric Jacobian J (6×n) and
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.lanes import norm, plus_diagonal, transposed
+from servobench.plant.contract.signals import BoolArray
 from servobench.plant.robot.arm import SerialArm
 
 STARTS: Final = 16
@@ -36,7 +38,7 @@ SHRINK, GROW = 0.3, 4.0  # of the damping after a step that is taken, and after 
 def closest_distance(
     arm: SerialArm, point: npt.ArrayLike, lower: npt.ArrayLike, upper: npt.ArrayLike, starts: int = STARTS
 ) -> FloatArray:
-    """Return how near the ball can be brought to a point.
+    """Return the distance to which the ball can approach a point.
 
     Args:
         arm: one arm, or arms whose leading axes are the last ones of the points'.
@@ -49,27 +51,15 @@ def closest_distance(
         (...) [m]; of a point that can be reached, at most `CLOSE_ENOUGH`.
     """
     target, low, high = (np.asarray(value, dtype=np.float64) for value in (point, lower, upper))
-    q = _starts(starts, target.shape[:-1], low, high)
-    error, J = _error(arm, target, q)
-    distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
-    for _ in range(ITERATIONS):
-        found = distance.min(axis=0) <= CLOSE_ENOUGH
-        if found.all():
-            break
-        tried = _step(q, error, J, damping, low, high)
-        new_error, new_J = _error(arm, target, tried)
-        nearer = (norm(new_error) < distance) & ~found
-        q = np.where(nearer[..., None], tried, q)
-        error, J = np.where(nearer[..., None], new_error, error), np.where(nearer[..., None, None], new_J, J)
-        distance = norm(error)
-        damping = np.clip(damping * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
+    first = _starts(starts, target.shape[:-1], low, high)
+    _, distance = _search(arm, target, first, low, high, lambda distance: distance.min(axis=0) <= CLOSE_ENOUGH)
     return np.asarray(distance.min(axis=0))
 
 
 def reach_for(
     arm: SerialArm, point: FloatArray, starts: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return where the search ends that begins at each of many joint positions.
+    """Return joint positions near a point, found from each of many starts.
 
     Args:
         arm: one arm.
@@ -81,24 +71,46 @@ def reach_for(
     Returns:
         Joint positions (k, n) [rad], and how far the ball is from the point (k,) [m].
     """
-    q, target = starts, np.broadcast_to(point, (len(starts), 3))
+    target = np.broadcast_to(point, (len(starts), 3))
+    return _search(arm, target, starts, lower, upper, lambda distance: ~(distance > CLOSE_ENOUGH))
+
+
+def _search(
+    arm: SerialArm,
+    target: FloatArray,
+    q: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    find: Callable[[FloatArray], BoolArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Return joint positions (starts, ..., n) [rad] near the target and their distances from it, (starts, ...) [m].
+
+    Args:
+        arm: one arm, or arms.
+        target: (..., 3) [m].
+        q: (starts, ..., n) [rad], where the search begins.
+        lower: (n,) [rad].
+        upper: (n,) [rad].
+        find: from the distances to where the search is over.
+    """
     error, J = _error(arm, target, q)
-    damping = np.full(len(starts), FIRST_DAMPING)
+    distance, damping = norm(error), np.full(q.shape[:-1], FIRST_DAMPING)
     for _ in range(ITERATIONS):
-        open_ = norm(error) > CLOSE_ENOUGH
-        if not open_.any():
+        found = find(distance)
+        if found.all():
             break
         tried = _step(q, error, J, damping, lower, upper)
         new_error, new_J = _error(arm, target, tried)
-        nearer = (norm(new_error) < norm(error)) & open_
-        q = np.where(nearer[:, None], tried, q)
-        error, J = np.where(nearer[:, None], new_error, error), np.where(nearer[:, None, None], new_J, J)
+        nearer = (norm(new_error) < distance) & ~found
+        q = np.where(nearer[..., None], tried, q)
+        error, J = np.where(nearer[..., None], new_error, error), np.where(nearer[..., None, None], new_J, J)
+        distance = norm(error)
         damping = np.clip(damping * np.where(nearer, SHRINK, GROW), *DAMPING_BOUNDS)
-    return q, np.asarray(norm(error))
+    return q, distance
 
 
 def _starts(count: int, lead: tuple[int, ...], lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Return where the search begins, (count, ..., n) rad: the same joint positions for every point, within a turn."""
+    """Return the starts of the search, (count, ..., n) rad: the same for every point, within a turn."""
     drawn = np.random.default_rng(0).uniform(np.maximum(lower, -np.pi), np.minimum(upper, np.pi), (count, len(lower)))
     return np.broadcast_to(drawn.reshape(count, *(1,) * len(lead), -1), (count, *lead, len(lower))).copy()
 
@@ -129,7 +141,7 @@ POSE_SHRINK, POSE_GROW = 0.2, 5.0  # of the damping after a step that is taken, 
 def reach_pose(
     arm: SerialArm, pose: FloatArray, start: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Return joint positions near a start at which the flange has a pose.
+    """Return joint positions near a start that give the flange a pose.
 
     Args:
         arm: one arm.

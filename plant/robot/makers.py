@@ -23,7 +23,7 @@ from servobench.plant.contract.files import user_path
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import JointLimits, SerialArm, arm_from_calibration, arm_from_dh, arm_from_modified_dh
 from servobench.plant.robot.robot import Links, Robot, at_far_end, cylinder_inertia
-from servobench.plant.robot.workspace import Workspace, find_workspace, length_scale, with_ball
+from servobench.plant.robot.workspace import CENTRE, Workspace, find_workspace, length_scale, with_ball
 
 Triple = tuple[float, float, float]
 NO_BALL: Final = (0.0, 0.0, 0.0)
@@ -116,14 +116,14 @@ def universal_robot(title: str) -> Robot:
 
 
 def _ur5() -> Robot:
-    """Return the UR5, whose bench was laid out by hand."""
+    """Return the UR5, with the workspace of its sheet."""
     links = Links(
         np.array(ur5.MASS), np.array(ur5.CENTRE_OF_MASS), np.array(ur5.INERTIA), np.array(ur5.MAX_TORQUE),
         np.array(ur5.TUBE_RADIUS), np.array(ur5.SIDE_STEP), UNIVERSAL_ROBOTS["UR5"].payload,
     )  # fmt: skip
     workspace = Workspace(
         scale=1.0,
-        centre=np.array(ur5.WORKSPACE_CENTRE),
+        centre=np.array(CENTRE),
         shoulder=np.array(ur5.SHOULDER),
         home=np.array(ur5.HOME),
         lower=np.array(ur5.TRAINING_LOWER),
@@ -229,17 +229,17 @@ def read_calibration(path: Path | None, tool: FloatArray) -> SerialArm:
 
 
 def nearest_title(arm: SerialArm) -> tuple[str, float]:
-    """Return which arm of Universal Robots has the lengths of a calibrated one, and by how much they differ [m]."""
+    """Return the title of the arm of Universal Robots that is nearest to a calibrated one, and its deviation [m]."""
     deviations = {title: deviation_from(arm, title) for title in UNIVERSAL_ROBOTS}
     title = min(deviations, key=lambda each: deviations[each])
     return title, deviations[title]
 
 
 def deviation_from(arm: SerialArm, title: str) -> float:
-    """Return by how much the lengths of a calibrated arm differ from a data sheet at most [m].
+    """Return the largest deviation of a calibrated arm's flange from that of a data sheet [m].
 
     The parallel axes of shoulder lift, elbow and wrist 1 leave the split of d2, d3 and d4 open, so that calibrations
-    differ in it by metres and mean the same arm; the ball's place in a few postures tells arms apart.
+    differ in it by metres and mean the same arm, so arms are compared by the position of the flange in a few postures.
     """
     nominal = UNIVERSAL_ROBOTS[title].arm()
     postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, nominal.n))

@@ -1,8 +1,8 @@
-"""Named, seeded differences between the true robot and the nominal model that controllers know.
+"""Named, seeded deviations of the true robot from the nominal model that controllers know.
 
 A mismatch is written as words joined by `+`: a profile (`none`, `factory`, `moderate`, `severe`), single axes with a
 magnitude (`camera_rotation=60deg`, `links=10%`, `joint_offsets=3deg`, `tool=20mm`, `gear_ratio=5%`,
-`camera_move=90deg`; of cameras that see pixels `focal=10%`, `centre=10px`, `distortion=10%`; of cameras on the hand
+`camera_move=90deg`; of cameras in pixels `focal=10%`, `centre=10px`, `distortion=10%`; of cameras on the hand
 `mount=5deg`), or both (`moderate+gear_ratio=5%`). `factory` takes the arm from a calibration file (`factory=FILE`;
 without a file, that of one real UR5).
 Words for the sensor (`outliers=40%`; see `plant.contract.sensing`) stand among the axes; they change settings of
@@ -12,9 +12,9 @@ Links, joint offsets, gear ratios and the three components of the tool offset ar
 minus the magnitude. The camera turns about an axis drawn at random; by an angle drawn from plus or minus the
 magnitude in a profile, and by exactly the magnitude as a single axis. It turns about the middle of the workspace,
 which therefore stays where it was in the image, and the axis is drawn among those that tilt the optical axis by at
-most 45°: a camera tilted further would look from below the table. `camera_move` turns the camera in the same way, by
+most 45°: a camera tilted further would be below the table. `camera_move` turns the camera in the same way, by
 exactly the magnitude and with a tilt of at most 30°, but in the middle of the run. Every axis draws from a random
-stream of its own, so the same seed gives the same directions at all magnitudes. The axes of cameras that see pixels are
+stream of its own, so the same seed gives the same directions at all magnitudes. The axes of cameras in pixels are
 drawn by `servobench.plant.cameras.placement`.
 """
 
@@ -32,7 +32,7 @@ from servobench.plant.contract.checks import FloatArray, check_number
 from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.sensing import SENSOR_AXES, SensingConfig, disturbed
 from servobench.plant.contract.settings import nearest, suggest
-from servobench.plant.robot.hand_eye import HandEyeModel, SensedArm, turn_about
+from servobench.plant.robot.hand_eye import HandEyeModel, RobotModel, turn_about
 from servobench.plant.robot.makers import measured_arm
 from servobench.plant.robot.robot import Robot
 
@@ -42,7 +42,7 @@ MAX_MAGNITUDES = 10_000  # of a range
 
 
 def _unknown_word(text: str, word: str) -> ValueError:
-    """Return what is wrong with one word of a mismatch: mistyped, out of place, or unknown."""
+    """Return the error about one word of a mismatch: mistyped, out of place, or unknown."""
     name = word.partition("=")[0]
     if name in PROFILES:
         remedy = "a profile stands first, and there is one at most"
@@ -60,7 +60,7 @@ def _unknown_word(text: str, word: str) -> ValueError:
 
 @dataclass(frozen=True)
 class Mismatch:
-    """How far the true robot may be from the nominal one; `str` gives back the text that `parse` reads."""
+    """Bounds of the deviation of the true robot from the nominal one; `str` returns the text that `parse` reads."""
 
     profile: str = "none"
     """A key of `PROFILES`; empty where only axes are given."""
@@ -110,7 +110,7 @@ class Mismatch:
         return "+".join([profile] * bool(profile) + [f"{axis}={magnitude}" for axis, magnitude in self.axes])
 
     def with_axis(self, axis: str, magnitude: Magnitude) -> Mismatch:
-        """Return this mismatch with one axis put on top of it.
+        """Return this mismatch with one axis added.
 
         Raises:
             ValueError: it has this axis already.
@@ -129,7 +129,7 @@ class Mismatch:
         return tuple((axis, magnitude) for axis, magnitude in self.axes if axis in SENSOR_AXES)
 
     def disturbed(self, sensing: SensingConfig) -> SensingConfig:
-        """Return the settings of a sensor with the axes of the sensor put on top.
+        """Return the settings of a sensor with the axes of the sensor applied.
 
         Raises:
             ValueError: a magnitude out of the bounds of its setting, or two families of noise.
@@ -201,7 +201,7 @@ class MismatchSample:
     move_axis: FloatArray
     move_angle: float
 
-    def moved(self, model: SensedArm, robot: Robot) -> SensedArm | None:
+    def moved(self, model: RobotModel, robot: Robot) -> RobotModel | None:
         """Return the true `robot`, `model`, after its camera was moved in the middle of the run; None if it is not."""
         if self.move_angle == 0.0:
             return None
@@ -233,7 +233,7 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
         return named_generator(seed, f"mismatch.{name}").uniform(-1.0, 1.0, shape)
 
     def factors(name: str, *shape: int) -> FloatArray:
-        """A magnitude of 0 gives factors of 1 whatever is drawn, which saves a generator."""
+        """A magnitude of 0 gives factors of 1 for any draw, which saves a generator."""
         return 1.0 + size(name) * draw(name, *shape) if size(name) > 0.0 else np.ones(shape)
 
     angle, move = size("camera_rotation"), size("camera_move")
@@ -262,7 +262,7 @@ def sample_mismatch(mismatch: Mismatch, robot: Robot, seed: int) -> tuple[HandEy
 
 
 def draw_camera_axis(angle: float, max_tilt: float, generator: np.random.Generator) -> FloatArray:
-    """Draw an axis about which a turn by up to `angle` tilts the optical axis by at most `max_tilt`.
+    """Draw an axis such that a turn about it by up to `angle` tilts the optical axis by at most `max_tilt`.
 
     A turn by φ about an axis at γ from the optical axis tilts that by τ with sin(τ/2) = sin(φ/2) sin γ.
     """
@@ -323,7 +323,7 @@ PROFILES: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class Magnitude:
-    """How far one axis goes, such as 60deg; `str` gives it back with its unit."""
+    """The magnitude of one axis, such as 60deg; `str` returns it with its unit."""
 
     number: float
     """In the unit, 0 or above."""

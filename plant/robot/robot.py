@@ -3,7 +3,7 @@
 A controller may know all of this. The true robot of a run differs from it by a mismatch, and for a robot that is given
 by a factory calibration also by that calibration.
 
-Masses, inertia and torque limits that nobody has published are estimated. An estimated link is a solid cylinder of its
+Unpublished masses, inertia and torque limits are estimated. An estimated link is a solid cylinder of its
 tube's radius, as long as the distance of its joints plus a joint housing of one diameter, with the mean density of the
 UR5's links. A joint's torque limit is 1.5 times the torque that holds the stretched arm with its rated load against
 gravity; a UR5 has 1.2 times this torque in its shoulder and more in its wrists.
@@ -70,7 +70,7 @@ class Robot:
         links: masses and shapes.
         workspace: where it works, and where the camera hangs.
         measured: the arm as its factory measured it; None where only the nominal one is known.
-        note: a line for the user about what was assumed; empty for none.
+        note: a line for the user about assumptions; empty for none.
         known: whether controllers may know it; of another one they know joints and features alone.
     """
 
@@ -106,7 +106,7 @@ PAYLOAD_SHARE: Final = 0.27  # rated load over the arm's own mass, that of a UR5
 
 
 def link_lengths(arm: SerialArm) -> FloatArray:
-    """Return how far each joint is from the next one, or the flange, (n,) m."""
+    """Return the distance of each joint from the next one, or the flange, (n,) m."""
     return norm(arm.translation[1:])
 
 
@@ -129,7 +129,7 @@ def estimate_links(
     torque: FloatArray | None = None,
     bodies: tuple[FloatArray, FloatArray] | None = None,
 ) -> Links:
-    """Return links with what is known of them, and estimates in place of the rest.
+    """Return links with their known values, and estimates in place of the rest.
 
     Args:
         arm: the nominal arm.

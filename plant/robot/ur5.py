@@ -6,15 +6,12 @@ and torques); inertia tensors by the cylinder approximation that the vendor's RO
 
 from __future__ import annotations
 
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
-from servobench.plant.contract.checks import FloatArray
-from servobench.plant.robot.arm import SerialArm, arm_from_calibration, arm_from_dh
-from servobench.plant.robot.hand_eye import HandEyeModel
+from servobench.plant.robot.arm import SerialArm, arm_from_dh
 
 UR5 = "ur5"  # the name of the robot, by which it is found
 JOINT_NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -51,12 +48,11 @@ SIDE_STEP = (0.0, 0.136, 0.0165, 0.0, 0.0, 0.0)  # m
 
 # The ball stands off the flange so that the wrist does not hide it from above.
 TOOL = (0.0, 0.0, 0.10)  # m, ball centre in the flange frame
-BALL_RADIUS = 0.035  # m
 
 # The start of most runs: elbow up, flange forward, the ball at (0.5, 0, 0.3) m in the base frame.
 HOME = (0.35, -1.69, -2.34, 0.89, 1.22, 0.0)  # rad
 
-# Start and target of the moves as joint positions [rad]; beside them the ball on the nominal robot, base frame.
+# Start and target of the moves as joint positions [rad]; the comments give the ball on the nominal robot, base frame.
 MOVES = {
     "exp1": (
         (0.169, -1.669, -2.250, 0.893, 1.156, 0.0),  # (0.50, -0.10, 0.35) m
@@ -75,7 +71,7 @@ MOVES = {
         (0.403, -1.847, -2.248, 0.826, 1.231, 0.0),  # (0.55, 0.05, 0.25) m
     ),
 }
-# The arm stretched level over the table, the ball at (1.03, 0, 0.09) m: its Jacobian has lost the way out and back.
+# The arm stretched level over the table, the ball at (1.03, 0, 0.09) m; its Jacobian is nearly singular.
 STRETCHED = (0.132772, -3.141593, 0.0, -0.483504, 1.421076, -0.000417)  # rad
 
 SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
@@ -84,40 +80,12 @@ SHOULDER = (0.0, 0.0, 0.09)  # m, base frame
 TRAINING_LOWER = (-0.25, -2.29, -3.04, 0.39, 0.92, -0.3)
 TRAINING_UPPER = (0.85, -1.09, -1.54, 1.39, 1.92, 0.3)
 
-WORKSPACE_CENTRE = (0.5, 0.0, 0.25)  # m, base frame
-CAMERA_DISTANCE = 1.3  # m, from the camera to the workspace's centre
-# The camera hangs above the workspace and looks straight down; image up is +x of the base.
-R_BC_DOWN = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-
 
 def ur5_arm() -> SerialArm:
     """Return the UR5 by its data sheet."""
     return arm_from_dh(DH_A, DH_D, DH_ALPHA, TOOL, JOINT_NAMES)
 
 
-def ur5_arm_from_calibration(path: Path | None = None) -> SerialArm:
-    """Return a UR5 by its factory calibration; without a path, that of one real UR5 which the package brings.
-
-    Raises:
-        ValueError: the file is missing or malformed.
-    """
-    return arm_from_calibration(shipped_calibration() if path is None else path, TOOL, JOINT_NAMES)
-
-
 def shipped_calibration() -> Path:
-    """Return the calibration file of one real UR5 which the package brings."""
+    """Return the calibration file of one real UR5, which is part of the package."""
     return Path(str(files("servobench.plant") / "data" / "ur5_factory_calibration.yaml"))
-
-
-def camera_pose(R_BC: FloatArray) -> FloatArray:
-    """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3) that looks at the workspace's centre."""
-    pose = np.eye(4)
-    pose[:3, :3] = R_BC
-    pose[:3, 3] = np.asarray(WORKSPACE_CENTRE) - CAMERA_DISTANCE * R_BC[:, 2]
-    return pose
-
-
-@cache
-def nominal_ur5() -> HandEyeModel:
-    """Return the nominal robot that controllers may know: the data-sheet arm under the camera as planned."""
-    return HandEyeModel(ur5_arm(), camera_pose(np.array(R_BC_DOWN)))

@@ -38,7 +38,7 @@ Move = tuple[FloatArray, FloatArray]  # start and target, (n,) and (n,) [rad]
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """The part of a robot's reach in which tasks are taught.
+    """The part of a robot's reach in which tasks are placed.
 
     Attributes:
         scale: of all lengths, over those of a UR5's bench.
@@ -49,8 +49,8 @@ class Workspace:
         upper: (n,) [rad].
         moves: start and target of the moves by name.
         stretched: (n,) [rad], a start at which the Jacobian is nearly singular.
-        clear: tells for joint positions (..., n) whether the arm is free of contact and the ball in view; None where
-            all of the box is.
+        clear: returns for joint positions (..., n) whether the arm is free of contact and the ball in the image; None
+            where all of the box is.
     """
 
     scale: float
@@ -65,21 +65,21 @@ class Workspace:
 
     @property
     def camera_distance(self) -> float:
-        """From the camera to the centre [m]."""
+        """Distance of the camera from the centre [m]."""
         return CAMERA_DISTANCE * self.scale
 
     @property
     def ball_radius(self) -> float:
-        """Of the ball, which looks as large in every image [m]."""
+        """Radius of the ball, which has the same size in the image of every arm [m]."""
         return BALL_RADIUS * self.scale
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Distances of the ball from the shoulder that are easily reached [m]."""
+        """Least and largest easily reached distance of the ball from the shoulder [m]."""
         return REACH[0] * self.scale, REACH[1] * self.scale
 
     def camera_pose(self, R_BC: npt.ArrayLike = R_BC_DOWN) -> FloatArray:
-        """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3) that looks at the centre."""
+        """Return X_BC, (4, 4), of a camera with rotation `R_BC` (3, 3), directed at the centre."""
         return camera_pose(R_BC, self.centre, self.camera_distance)
 
 
@@ -93,7 +93,7 @@ def camera_pose(R_BC: npt.ArrayLike, centre: npt.ArrayLike, distance: float) -> 
 
 BoolArray = npt.NDArray[np.bool_]
 
-HEIGHT: Final = 0.03  # [m] of a link above the table, beside its radius; of a UR5
+HEIGHT: Final = 0.03  # [m] of a link above the table, in addition to its radius; of a UR5
 BALL_HEIGHT: Final = 0.08  # [m] of the ball's centre above the table; of a UR5
 OVERLAP: Final = 0.02  # [m] less is no contact, as the tubes are schematic; of a UR5
 BUILT_IN: Final = 0.4  # share of random postures from which on two tubes are built into each other
@@ -125,7 +125,7 @@ class Tubes:
 
 
 def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
-    """Return the tubes of links with a `radius`, (n,) m, that lie `aside`, (n,) m, of their joints."""
+    """Return the tubes of links with a `radius`, (n,) m, at an offset `aside`, (n,) m, from their joints."""
     link, ends, radii = [], [], []
     for i in range(arm.n):
         step = arm.translation[i + 1]
@@ -140,7 +140,7 @@ def link_tubes(arm: SerialArm, radius: FloatArray, aside: FloatArray) -> Tubes:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """The judge of postures; `scale` is that of the workspace.
+    """Decides whether postures are fit to work in; `scale` is that of the workspace.
 
     Attributes:
         arm: the nominal arm.
@@ -188,18 +188,18 @@ class Clearance:
         return np.asarray(segment_distance(first, second) - self.tubes.radius[pairs].sum(axis=-1))
 
     def _above_table(self, placed: FloatArray) -> BoolArray:
-        """The first two links stand on the table."""
+        """Return whether all links but the first two, which stand on the table, are above it."""
         chosen = self.tubes.link >= 1
         low = placed[..., 2][..., chosen, :].min(axis=-1) - self.tubes.radius[chosen]
         return np.asarray((low >= HEIGHT * self.scale).all(axis=-1))
 
     def _in_view(self, ball: FloatArray, placed: FloatArray) -> BoolArray:
         """Return whether the ball is in the image and no link is between it and the camera."""
-        seen = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
+        p_C = np.vecmat(ball - self.X_BC[:3, 3], self.X_BC[:3, :3])
         half = IMAGE_SHARE * np.array([CAMERA.width, CAMERA.height]) / (2.0 * CAMERA.focal)
-        inside = (np.abs(seen[..., :2]) <= half * seen[..., 2:]).all(axis=-1) & (seen[..., 2] > 0.0)
-        sight = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
-        free = segment_distance(placed, sight[..., None, :, :]) - self.tubes.radius
+        inside = (np.abs(p_C[..., :2]) <= half * p_C[..., 2:]).all(axis=-1) & (p_C[..., 2] > 0.0)
+        line = np.stack([ball, np.broadcast_to(self.X_BC[:3, 3], ball.shape)], axis=-2)
+        free = segment_distance(placed, line[..., None, :, :]) - self.tubes.radius
         return np.asarray(inside & (free >= self.ball_radius).all(axis=-1))
 
     def _apart(self, placed: FloatArray) -> BoolArray:
@@ -207,7 +207,7 @@ class Clearance:
 
 
 def watched_pairs(clearance: Clearance, postures: FloatArray) -> npt.NDArray[np.intp]:
-    """Return the pairs of tubes, (p, 2), that can meet: not of neighbouring links, and apart in most of (k, n) rad."""
+    """Return the pairs of tubes, (p, 2), that can collide: not of neighbours, and separate in most of (k, n) rad."""
     link = clearance.tubes.link
     i, j = np.triu_indices(len(link), 1)
     pairs = np.stack([i, j], axis=-1)[link[j] - link[i] > 1]
@@ -247,7 +247,7 @@ MOVES: Final = {
 }
 
 STARTS: Final = 512  # of the search for a home
-CANDIDATES: Final = 12  # homes whose surroundings are looked at
+CANDIDATES: Final = 12  # homes whose surroundings are sampled
 WINDING: Final = 0.03  # [m/rad²] of a UR5: by how much a home is worse whose joints are far from zero
 NEIGHBOURS: Final = 192  # postures that say how fit a box is
 NEAR_STARTS: Final = 96  # of the search for a posture near the home
@@ -262,7 +262,7 @@ WITHDRAWALS: Final = 8  # steps of a tenth towards the home for a place that no 
 
 
 def length_scale(arm: SerialArm) -> float:
-    """Return how long an arm is from its shoulder to its flange, over a UR5."""
+    """Return the length of an arm from its shoulder to its flange, over that of a UR5."""
     return float(norm(arm.translation[2:]).sum()) / LENGTH_OF_UR5
 
 
@@ -299,7 +299,7 @@ def find_workspace(
 def _at_height(
     arm: SerialArm, limits: tuple[FloatArray, FloatArray], shapes: tuple[FloatArray, FloatArray], height: float
 ) -> tuple[float, Workspace] | None:
-    """Return the workspace at a height and the share of its box that is fit; None where no home is."""
+    """Return the workspace at a height and the fit share of its box; None where no home is found."""
     scale = length_scale(arm)
     centre = scale * (np.array(CENTRE) + np.array([0.0, 0.0, height]))
     pose = camera_pose(R_BC_DOWN, centre, CAMERA_DISTANCE * scale)
@@ -342,7 +342,7 @@ def _within_a_turn(q: FloatArray, clear: Clearance) -> FloatArray:
 
 
 def _find_box(clear: Clearance, home: FloatArray) -> tuple[float, tuple[FloatArray, FloatArray]]:
-    """Return the largest box around a home of which enough is fit, with the share of it that is."""
+    """Return the largest box around a home with enough fit postures, and their share."""
     half = np.full(clear.arm.n, HALF_BOX)
     half[-1] = LAST_HALF
     unit = np.random.default_rng(1).uniform(-1.0, 1.0, (NEIGHBOURS, clear.arm.n))
@@ -379,7 +379,7 @@ def _move(clear: Clearance, home: FloatArray, start: FloatArray, target: FloatAr
 
 
 def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> FloatArray:
-    """Return the postures, (k+1, s, n) rad, on straight ways of the ball from (s, n) rad to a target (3,) m."""
+    """Return the postures, (k+1, s, n) rad, on straight paths of the ball from (s, n) rad to a target (3,) m."""
     q, ways = starts, [starts]
     for left in range(WAY_STEPS, 0, -1):
         ball, J = clear.arm.ball_and_jacobian(q)
@@ -389,7 +389,7 @@ def _straight_ways(clear: Clearance, starts: FloatArray, target: FloatArray) -> 
 
 
 def _stretch(clear: Clearance, home: FloatArray, point: FloatArray, postures: FloatArray) -> FloatArray:
-    """Return the posture with the least gain that is otherwise fit, of those that point at a place out of reach."""
+    """Return the otherwise fit posture with the least gain, of those that point at a position out of reach."""
     near = home + NEAR * np.random.default_rng(3).standard_normal((NEAR_STARTS, clear.arm.n))
     starts = np.clip(np.vstack([near, postures[: 2 * NEAR_STARTS]]), clear.lower, clear.upper)
     q, _ = reach_for(clear.arm, point, starts, clear.lower + 0.1, clear.upper - 0.1)

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from kit.plants import nominal_ur5
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate
 from servobench.controllers.laws.mpc.mpc import MpcConfig, MpcLaw
@@ -18,7 +19,7 @@ from servobench.controllers.networks.fit import train
 from servobench.controllers.stages.limit import scale_to_limit
 from servobench.plant.contract.signals import Observation
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
+from servobench.plant.robot.ur5 import HOME, TRAINING_LOWER, TRAINING_UPPER
 
 pytestmark = pytest.mark.xdist_group("rates")  # one process makes what these tests share
 

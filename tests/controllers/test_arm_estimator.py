@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kit.plants import nominal_ur5
 from servobench.controllers.camera_model import CameraModel
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.estimators.arm import ArmConfig, ArmEstimator, ArmState
@@ -16,7 +17,7 @@ from servobench.plant.contract.checks import FloatArray
 from servobench.plant.contract.faults import FilterDiverged
 from servobench.plant.contract.lanes import stack, take
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
-from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER, nominal_ur5
+from servobench.plant.robot.ur5 import TRAINING_LOWER, TRAINING_UPPER
 
 GEARS = np.array([1.1, 0.95, 1.05, 0.9, 1.08, 1.0])
 OFFSETS = np.array([0.0, 0.05, -0.08, 0.06, 0.1, 0.0])  # a turn of the first joint is one of the camera

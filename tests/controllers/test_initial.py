@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kit.plants import configure
+from kit.plants import configure, nominal_ur5
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.initial import InitialConfig, initial_jacobian
@@ -14,7 +14,6 @@ from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import ControllerDiverged
 from servobench.plant.contract.signals import Command, Observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
-from servobench.plant.robot.ur5 import nominal_ur5
 
 START = np.array([0.35, -1.69, -2.34, 0.89, 1.22, 0.0])
 

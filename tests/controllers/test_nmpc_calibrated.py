@@ -4,6 +4,7 @@ import casadi
 import numpy as np
 import pytest
 
+from kit.plants import nominal_ur5
 from kit.toy import plant_spec
 from servobench.controllers.controller import RobotKnowledge
 from servobench.controllers.laws.law import Estimate
@@ -15,7 +16,6 @@ from servobench.plant.contract.faults import SolverFailed
 from servobench.plant.contract.signals import Observation
 from servobench.plant.kinematic import KinematicConfig, build_kinematic
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.ur5 import nominal_ur5
 
 MODEL = nominal_ur5()
 SYMBOLIC = symbolic_feature(MODEL)

@@ -148,7 +148,9 @@ class Watching:
         arm, sample = sample_mismatch(mismatch, robot, seed)
         self.true, _ = sensing.true(robot, arm, sample, mismatch, seed)
         nominal = sensing.nominal(robot)
-        cameras = CameraModel(nominal.eye.cameras, len(nominal.eye.target), nominal.point_motions, nominal.interaction)
+        cameras = CameraModel(
+            nominal.setup.cameras, len(nominal.setup.target), nominal.point_motions, nominal.interaction
+        )
         spec = hand_eye_spec(nominal, PERIOD, 1.0, 6.0)
         self.knowledge = in_natural_units(RobotKnowledge(spec, 0, nominal.jacobian, nominal_cameras=cameras))
         config = AidsConfig(**{"model": "map", "delay": "given", "noise": "identified", **aids})
@@ -162,7 +164,7 @@ class Watching:
         rates, phases = rng.uniform(2.0, 5.0, 6), rng.uniform(0.0, 6.0, 6)
         for k in range(round(seconds / PERIOD)):
             q = self.home + reach * (np.sin(rates * k * PERIOD + phases) - np.sin(phases))
-            y, J, _ = self.true.look(q)
+            y, J, _ = self.true.observe(q)
             valid = np.full(len(y), True)
             valid[list(lost)] = k < 1
             late = y if late is None else np.where(valid, y, late)

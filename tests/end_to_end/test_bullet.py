@@ -16,8 +16,9 @@ from kit.rendered import BARE, HOME, IDEAL, MODEL, UR5
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.bullet import Mechanics
-from servobench.plant.rendered.drives import PHYSICS_STEP
+from servobench.plant.rendered.bullet import BulletSimulation
+from servobench.plant.rendered.drives import PHYSICS_STEP, DriveConfig
+from servobench.plant.rendered.engine import Machine
 from servobench.plant.rendered.plants import build_bullet
 
 
@@ -58,7 +59,8 @@ def test_naming_the_plant_does_not_load_pybullet():
 
 
 def test_motion_under_torques_is_that_of_pybullets_own_engine():
-    mechanics, h, q = Mechanics(MODEL.arm, payload=1.0, assumed_payload=0.0, robot=UR5), PHYSICS_STEP, HOME
+    drives, stops, h, q = DriveConfig(payload=1.0, assumed_payload=0.0), np.full(6, np.pi), PHYSICS_STEP, HOME
+    mechanics = BulletSimulation(Machine(MODEL.arm, UR5, (), drives, 0.0, HOME, (-stops, stops)))
     client, arm, joints, v = mechanics._client, mechanics._arm, list(range(6)), np.zeros(6)
     torque, body = np.array([5.0, -8.0, 10.0, 2.0, 0.5, 0.0]), mechanics.body(HOME, v)
     pybullet.setPhysicsEngineParameter(fixedTimeStep=h, physicsClientId=client)

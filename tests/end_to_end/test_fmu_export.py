@@ -18,7 +18,7 @@ from fmpy.validation import validate_fmu as validate_by_fmpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kit.plants import mismatched, setup
+from kit.plants import mismatched, nominal_ur5, setup
 from servobench.fmus import compile as compiling
 from servobench.fmus import export
 from servobench.fmus.compile import (
@@ -37,7 +37,7 @@ from servobench.fmus.variables import parameters_of
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.robot.arm import SerialArm, rotation_from_rpy, rpy_from_rotation
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import JOINT_NAMES, nominal_ur5
+from servobench.plant.robot.ur5 import JOINT_NAMES
 
 VERSIONS = [2, 3]
 

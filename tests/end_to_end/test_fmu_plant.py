@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from kit.foreign_fmu import build_crane, describe_with
+from kit.plants import nominal_ur5
 from servobench.fmus.compile import this_platform
 from servobench.fmus.ur5_plant import Ur5FmuConfig, build_ur5
 from servobench.plant.bench.bench import Bench
@@ -24,7 +25,7 @@ from servobench.plant.contract.signals import Command
 from servobench.plant.fmu.archive import extract_fmu
 from servobench.plant.fmu.mapping import FmuMapping, JointLimits, LogNames, TruthMapping
 from servobench.plant.fmu.world import FmuConfig, FmuWorld, mapped_entry
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 
 QUIET = FmuConfig(0.0, SensingConfig(0.0))
 START = np.array([0.3, 1.2])

@@ -6,13 +6,14 @@ import pytest
 
 from kit.rendered import BARE, HOME, IDEAL, MODEL, wiggle
 from servobench.plant.contract.faults import FeatureLost
+from servobench.plant.contract.seeds import named_generator
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered import detectors as ball_sight
+from servobench.plant.rendered import detectors
 from servobench.plant.rendered.detection import MARGIN, RED_RANGE, find_patch, locate_ball, whole, window_around
 from servobench.plant.rendered.detectors import DepthCamera
 from servobench.plant.rendered.settings import RenderedConfig
-from servobench.plant.robot import ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera
+from servobench.plant.robot.workspace import BALL_RADIUS
 
 BOXED = RenderedConfig(obstacles=((0.45, 0.05, 0.5, 0.1, 0.1, 0.1),))
 FLANGE_DOWN = np.array([np.pi, -1.6, 1.9, -1.87, -np.pi / 2, 0.0])
@@ -30,7 +31,7 @@ def errors_over_poses(open_scene, noise, count) -> tuple[np.ndarray, int]:
         if patch is not None:
             true = camera.metric_depth(buffer[patch.rows, patch.columns])
             depth = noise.apply(true, (patch.rows, patch.columns), camera, rng)
-            found = locate_ball(patch, depth, camera, ur5.BALL_RADIUS)
+            found = locate_ball(patch, depth, camera, BALL_RADIUS)
             if found is not None:
                 errors.append(found.centre - MODEL.to_camera(scene.ball_position()))
     return np.array(errors), tried
@@ -83,26 +84,31 @@ def test_a_ball_that_is_hidden_at_the_start_is_reported_with_evidence(open_plant
         plant.reset(0)
 
 
-def looks(scene, eye, count):
+def poses(scene, depth_camera, count):
     """Draw poses of arm and camera, half of them with the ball hidden, cut by the border or outside."""
     rng = np.random.default_rng(5)
     for _ in range(count):
         X_BC = MODEL.X_BC.copy()
         X_BC[:3, 3] += rng.uniform(-0.4, 0.4, 3)
         scene.place(HOME + rng.uniform(-1.2, 1.2, 6))
-        yield X_BC, window_around(X_BC[:3, :3].T @ (scene.ball_position() - X_BC[:3, 3]), eye.radius, eye.camera)
+        yield (
+            X_BC,
+            window_around(
+                X_BC[:3, :3].T @ (scene.ball_position() - X_BC[:3, 3]), depth_camera.radius, depth_camera.camera
+            ),
+        )
 
 
 def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_ball(open_scene):
     scene, seen = open_scene(scenery=True, boxes=BOXED.boxes()), 0
-    eye = DepthCamera(scene, BARE, PinholeCamera(), ur5.BALL_RADIUS)
-    for X_BC, window in looks(scene, eye, 30):
-        images = scene.render(eye.camera, X_BC)
+    depth_camera = DepthCamera(scene, BARE, PinholeCamera(), BALL_RADIUS)
+    for X_BC, window in poses(scene, depth_camera, 30):
+        images = scene.render(depth_camera.camera, X_BC)
         patch = find_patch(images[0])
         if window is None:
             assert patch is None
             continue
-        for image, part in zip(images, scene.render(eye.camera, X_BC, window), strict=True):
+        for image, part in zip(images, scene.render(depth_camera.camera, X_BC, window), strict=True):
             np.testing.assert_array_equal(window.cut(image), part)
         if patch is not None:
             seen += 1
@@ -114,26 +120,25 @@ def test_a_window_around_the_ball_has_the_pixels_of_the_image_and_all_of_the_bal
 
 def test_a_ball_is_found_in_its_window_as_in_the_whole_image(open_scene, monkeypatch):
     scene, camera, found = open_scene(scenery=False), PinholeCamera(), 0
-    eyes = [DepthCamera(scene, BARE, camera, ur5.BALL_RADIUS) for _ in range(2)]
-    for eye in eyes:
-        eye.reset(3)
-    for X_BC, _ in looks(scene, eyes[0], 30):
-        one = eyes[0].find(X_BC, scene.ball_position())
+    depth_camera = DepthCamera(scene, BARE, camera, BALL_RADIUS)
+    noise, again = ({name: named_generator(3, name) for name in depth_camera.streams} for _ in range(2))
+    for X_BC, _ in poses(scene, depth_camera, 30):
+        one = depth_camera.find(X_BC, scene.ball_position(), noise)
         with monkeypatch.context() as patched:
-            patched.setattr(ball_sight, "window_around", lambda *_: whole(camera))
-            other = eyes[1].find(X_BC, scene.ball_position())
+            patched.setattr(detectors, "window_around", lambda *_: whole(camera))
+            other = depth_camera.find(X_BC, scene.ball_position(), again)
         assert (one is None) == (other is None)
         if one is not None and other is not None:
             found += 1
             np.testing.assert_array_equal(one.centre, other.centre)
-        states = [[part.bit_generator.state for part in eye.save()] for eye in eyes]
+        states = [[part.bit_generator.state for part in each.values()] for each in (noise, again)]
         assert states[0] == states[1]
     assert 5 < found < 30
 
 
 def test_nothing_in_a_room_but_the_ball_has_its_colour(open_scene):
     scene, camera = open_scene(scenery=True, boxes=BOXED.boxes()), PinholeCamera()
-    for X_BC, window in looks(scene, DepthCamera(scene, BARE, camera, ur5.BALL_RADIUS), 20):
+    for X_BC, window in poses(scene, DepthCamera(scene, BARE, camera, BALL_RADIUS), 20):
         image = np.ascontiguousarray(scene.render(camera, X_BC)[0][..., :3])
         if window is not None:
             window.cut(image)[:] = 255

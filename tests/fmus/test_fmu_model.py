@@ -312,9 +312,9 @@ def test_memory_stays_flat_over_a_thousand_instances(version):
                 instance.start(0.0)
                 advance = instance.stepper(0.05)
                 advance(0.0)
-                state = instance.states.save_bytes()
+                state = instance.save_bytes()
                 advance(0.05)
-                instance.states.restore_bytes(state)
+                instance.restore_bytes(state)
                 instance.close()
 
         live(500)  # until the allocator has what it needs

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kit.plants import nominal_ur5
 from servobench.harness.config.settings import Settings
 from servobench.harness.run import episode
 from servobench.harness.run.episode import carry_out, carry_out_together
@@ -15,7 +16,7 @@ from servobench.harness.run.scenario import Scenario
 from servobench.harness.run.tasks import TASKS
 from servobench.plant.contract.signals import Command, Observation, PlantSpec, Truth
 from servobench.plant.robot.hand_eye import hand_eye_spec
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 
 SPEC = PlantSpec.of_joints(("a", "b"), ("x",), np.full(2, 2.0), np.full(2, -3.0), np.full(2, 3.0), period=0.1)
 STOP, FREE, FAR, NEAR = 3.0, 2.9, 1.0, 0.001

@@ -28,7 +28,7 @@ from servobench.harness.run.resolution import resolve
 from servobench.harness.run.starts import PoseTask, displaced, pose_start
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.cameras.model import EyeModel
+from servobench.plant.cameras.model import SetupModel
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.inverse import closest_distance, reach_pose
@@ -65,10 +65,10 @@ def test_laws_and_estimators_see_a_metre_whatever_the_unit():
     seen = plant.reset(3)
     desired = experiment.scenario.reference.sampled(0.05, 100)
     for controller, unit in zip(pair, (1.0, 1000.0), strict=True):
-        controller.reset(seen.seen_as(seen.joint_position, unit * seen.feature), 0)
+        controller.reset(seen.with_values(seen.joint_position, unit * seen.feature), 0)
     for k in range(40):
         commands = [
-            controller.step(seen.seen_as(seen.joint_position, unit * seen.feature), unit * desired[k : k + 11])
+            controller.step(seen.with_values(seen.joint_position, unit * seen.feature), unit * desired[k : k + 11])
             for controller, unit in zip(pair, (1.0, 1000.0), strict=True)
         ]
         np.testing.assert_allclose(commands[1].joint_velocity, commands[0].joint_velocity, rtol=1e-6, atol=1e-9)
@@ -107,9 +107,9 @@ def test_noise_of_pixels_is_the_same_from_everywhere_and_that_of_the_ball_in_the
 def test_starts_and_targets_are_in_view_and_taught_on_the_true_robot(word, seed):
     run = drawn(word, "random", seed)
     model, reference = run.true, run.scenario.reference
-    assert isinstance(model, EyeModel)
-    assert model.visible(run.scenario.start).all()
-    assert model.in_view(reference.points(0.0)).all()
+    assert isinstance(model, SetupModel)
+    assert model.valid(run.scenario.start).all()
+    assert model.valid_at(reference.points(0.0)).all()
     np.testing.assert_array_equal(reference.at(3.0), model.feature(reference.joint_position))
 
 
@@ -149,7 +149,7 @@ def test_a_circle_of_a_plate_keeps_its_orientation_and_is_in_reach_of_the_arm():
 def test_a_circle_before_the_hand_is_in_view(word):
     run = drawn(word, "circle", 1)
     model, times = run.true, np.linspace(0.0, 10.0, 16)
-    assert model.in_view(run.scenario.reference.points(times)).all()
+    assert model.valid_at(run.scenario.reference.points(times)).all()
 
 
 @pytest.mark.parametrize("word", ["plate", "plate:hand"])
@@ -160,7 +160,7 @@ def test_the_canonical_tasks_displace_the_target_before_the_camera_as_they_say(w
     config = resolve(request(word, task), Settings({})).task
     assert isinstance(config, PoseTask)
     start = pose_start(config, robot, model)
-    assert model.visible(start).all()
+    assert model.valid(start).all()
     pose = np.linalg.inv(model.camera)
     home, away = (model.points(q) @ pose[:3, :3].T + pose[:3, 3] for q in (robot.workspace.home, start))
     D = displaced(config, home.mean(axis=0))
@@ -238,8 +238,8 @@ def test_runs_side_by_side_are_those_of_single_runs(word):
 @pytest.mark.parametrize("task", ["exp1", "exp4", "singular_start"])
 def test_moves_are_drawn_together_until_both_ends_are_in_view(word, task):
     run, robot = drawn(word, task), find_robot("ur5")
-    assert run.true.visible(run.scenario.start).all()
-    assert run.true.in_view(run.scenario.reference.points(0.0)).all()
+    assert run.true.valid(run.scenario.start).all()
+    assert run.true.valid_at(run.scenario.reference.points(0.0)).all()
     config, home = resolve(request(word, task), Settings({})).task, robot.workspace.home
     pairs = (run.scenario.start, config.start), (run.scenario.reference.joint_position, config.target)
     ways = [(q - home, given - home) for q, given in pairs if np.any(np.asarray(given) != home)]
@@ -278,7 +278,7 @@ def test_an_arm_of_four_joints_sees_with_the_others(tmp_path):
 
 OWN = """
 import numpy as np
-from servobench.plant.cameras.eye import Eye
+from servobench.plant.cameras.setups import SensingSetup
 
 
 def measure(points, optics):
@@ -286,7 +286,7 @@ def measure(points, optics):
     return np.stack([np.sqrt((x + 1.0) ** 2 + y**2), y, z], axis=-1)
 
 
-FROM_THE_SIDE = Eye("side", "distance from a pole", ("r", "y", "z"), "m", measure)
+FROM_THE_SIDE = SensingSetup("side", "distance from a pole", ("r", "y", "z"), "m", measure)
 """
 
 
@@ -299,7 +299,7 @@ def test_another_text_of_a_set_up_is_refused_when_a_folder_is_resumed(tmp_path, 
     servobench.compare(["constant"], **asked)
     assert servobench.compare(["constant"], resume=True, **asked)["sensing"].tolist() == ["./side.py"]
     file.write_text(OWN.replace('("r", "y", "z")', '("r", "y", "depth")'))
-    assert find_sensing("./side.py").eye.features == ("r", "y", "depth")
+    assert find_sensing("./side.py").setup.features == ("r", "y", "depth")
     with pytest.raises(ConfigurationError, match=r"folder was begun with another version of side\.py; name another"):
         servobench.compare(["constant"], resume=True, **asked)
 

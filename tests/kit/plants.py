@@ -10,6 +10,7 @@ from servobench.harness.config.registry import plant_names
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.sensing import SensingConfig
 from servobench.plant.robot.catalogue import find_robot
+from servobench.plant.robot.makers import read_calibration
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 from servobench.plant.robot.ur5 import HOME
 
@@ -22,11 +23,21 @@ NEEDS = {"bullet": NEEDS_BULLET, "mujoco": NEEDS_MUJOCO}
 
 
 def plant_parameters(names):
-    """Return names of plants as parameters of a test, each skipped where what it needs is not installed."""
+    """Return names of plants as parameters of a test, each skipped where its packages are not installed."""
     return [pytest.param(name, marks=NEEDS[name]) if name in NEEDS else name for name in names]
 
 
 ALL_PLANTS = plant_parameters(plant_names())
+
+
+def nominal_ur5():
+    """Return the nominal UR5 under its camera."""
+    return find_robot("ur5").nominal
+
+
+def factory_ur5():
+    """Return the arm of the factory calibration of one real UR5."""
+    return read_calibration(None, find_robot("ur5").arm.tool)
 
 
 def mismatched(text, seed=3):
@@ -35,7 +46,7 @@ def mismatched(text, seed=3):
 
 
 def setup(text="none", period=0.05):
-    """Return what a plant is built from, at home."""
+    """Return the setup of a plant at home."""
     return PlantSetup(mismatched(text), np.array(HOME), period)
 
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import yaml
 
+from kit.plants import factory_ur5, nominal_ur5
 from servobench.plant.robot.arm import (
     CALIBRATION_BLOCKS,
     SerialArm,
@@ -12,16 +13,7 @@ from servobench.plant.robot.arm import (
     rpy_from_rotation,
 )
 from servobench.plant.robot.hand_eye import HandEyeModel, hand_eye_spec
-from servobench.plant.robot.ur5 import (
-    DH_A,
-    DH_ALPHA,
-    DH_D,
-    JOINT_NAMES,
-    TOOL,
-    nominal_ur5,
-    ur5_arm,
-    ur5_arm_from_calibration,
-)
+from servobench.plant.robot.ur5 import DH_A, DH_ALPHA, DH_D, JOINT_NAMES, TOOL, ur5_arm
 
 
 def poses(count, n=6, seed=0):
@@ -72,7 +64,7 @@ def test_planar_arm_matches_the_hand_computed_position_and_jacobian():
     np.testing.assert_allclose(arm.ball_jacobian(q), [[-2.0, 0.0], [1.0, 1.0], [0.0, 0.0]], atol=1e-15)
 
 
-@pytest.mark.parametrize("arm", [ur5_arm(), ur5_arm_from_calibration(), odd_arm()])
+@pytest.mark.parametrize("arm", [ur5_arm(), factory_ur5(), odd_arm()])
 def test_jacobian_equals_central_differences(arm):
     model = HandEyeModel(arm, nominal_ur5().X_BC)
     h = 1e-5
@@ -133,7 +125,7 @@ def test_offsets_and_gear_ratios_act_on_the_reported_position():
 
 def test_factory_calibration_is_millimetres_from_the_data_sheet():
     q = poses(200)
-    distance = np.linalg.norm(ur5_arm_from_calibration().ball_position(q) - ur5_arm().ball_position(q), axis=-1)
+    distance = np.linalg.norm(factory_ur5().ball_position(q) - ur5_arm().ball_position(q), axis=-1)
     assert np.median(distance) > 1e-4
     assert distance.max() < 0.01
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kit.plants import NEEDS_BULLET, configure
+from kit.plants import NEEDS_BULLET, configure, nominal_ur5
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.rendered.plants import build_bullet
 from servobench.plant.rendered.settings import RenderedConfig
@@ -14,7 +14,7 @@ from servobench.plant.robot.hand_eye import HandEyeModel
 
 HOME = np.array(ur5.HOME)
 BARE = RenderedConfig(scenery=False)
-MODEL = ur5.nominal_ur5()
+MODEL = nominal_ur5()
 
 
 @pytest.mark.parametrize("height", [0.15, 0.25, 0.35])

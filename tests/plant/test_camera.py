@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from kit.plants import nominal_ur5
 from servobench.plant.robot.camera import DepthNoise, PinholeCamera, view_matrix
-from servobench.plant.robot.ur5 import nominal_ur5
 
 CAMERA = PinholeCamera()
 GRID = tuple(index.ravel() for index in np.indices((100, 200)))

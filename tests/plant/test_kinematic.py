@@ -5,12 +5,12 @@ import warnings
 import numpy as np
 import pytest
 
-from kit.plants import configure
+from kit.plants import configure, nominal_ur5
 from servobench.plant.bench.bench import Bench
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, build_kinematic, discretise_lag
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 
 START = np.array(HOME)
 QUIET = {"feature_noise": 0.0, "command_delay": 0.0}

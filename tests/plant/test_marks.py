@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.optics import CAMERA, Optics, ideal_optics, locate, project
-from servobench.plant.cameras.registry import EYES
+from servobench.plant.cameras.registry import SETUPS
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.rendered.detectors import Lens, as_planned, needs_depth
 from servobench.plant.rendered.engine import Scene
 from servobench.plant.rendered.marks import MARK_COLOURS, disc_centre, find_marks, sphere_centre
@@ -157,6 +157,6 @@ def test_a_camera_as_planned_needs_no_lens():
 
 def test_only_set_ups_whose_features_change_along_a_ray_need_depth():
     wanted = {"position": True, "pixel": False, "stereo": False, "plate": False}
-    assert {name: needs_depth(eye, ideal_optics(CAMERA, eye.cameras)) for name, eye in EYES.items()} == wanted
-    ratio = Eye("ratio", "", ("a",), "1", lambda points, _: points[..., 0, 0, :1] / points[..., 0, 0, 2:])
+    assert {name: needs_depth(eye, ideal_optics(CAMERA, eye.cameras)) for name, eye in SETUPS.items()} == wanted
+    ratio = SensingSetup("ratio", "", ("a",), "1", lambda points, _: points[..., 0, 0, :1] / points[..., 0, 0, 2:])
     assert not needs_depth(ratio, ideal_optics(CAMERA, 1))

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kit.plants import factory_ur5, nominal_ur5
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import MAX_TILT, Magnitude, Mismatch, parse_magnitudes, sample_mismatch
-from servobench.plant.robot.ur5 import WORKSPACE_CENTRE, nominal_ur5, ur5_arm_from_calibration
+from servobench.plant.robot.workspace import CENTRE
 
 POSES = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 6))
 
@@ -52,7 +53,7 @@ def test_a_turned_camera_turns_by_the_named_angle_and_still_sees_the_workspace(a
         R = nominal.X_BC[:3, :3].T @ true.X_BC[:3, :3]
         assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(math.radians(angle), abs=1e-6)
         assert math.acos(min(R[2, 2], 1.0)) <= MAX_TILT + 1e-9
-        np.testing.assert_allclose(true.to_camera(WORKSPACE_CENTRE), nominal.to_camera(WORKSPACE_CENTRE), atol=1e-12)
+        np.testing.assert_allclose(true.to_camera(CENTRE), nominal.to_camera(CENTRE), atol=1e-12)
 
 
 def test_a_larger_magnitude_goes_further_in_the_same_direction():
@@ -104,7 +105,7 @@ def test_an_axis_is_put_on_top_of_a_mismatch():
 
 def test_factory_takes_the_arm_of_the_calibration_file():
     true, _ = sample_mismatch(Mismatch.parse("factory"), find_robot("ur5"), 0)
-    np.testing.assert_allclose(true.arm.ball_position(POSES), ur5_arm_from_calibration().ball_position(POSES))
+    np.testing.assert_allclose(true.arm.ball_position(POSES), factory_ur5().ball_position(POSES))
 
 
 def test_a_gear_ratio_scales_the_motion_but_not_the_reported_position():
@@ -140,7 +141,7 @@ def test_a_camera_that_is_moved_keeps_the_workspace_in_view(seed):
     assert turn.magnitude() == pytest.approx(np.radians(120.0))
     tilt = np.arccos(model.X_BC[:3, 2] @ moved.X_BC[:3, 2])
     assert tilt <= np.radians(30.0) + 1e-9
-    np.testing.assert_allclose(model.to_camera(WORKSPACE_CENTRE), moved.to_camera(WORKSPACE_CENTRE), atol=1e-12)
+    np.testing.assert_allclose(model.to_camera(CENTRE), moved.to_camera(CENTRE), atol=1e-12)
 
 
 def test_without_a_move_there_is_no_moved_robot():

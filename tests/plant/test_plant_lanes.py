@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from kit.plants import configure, mismatched
+from kit.plants import configure, mismatched, nominal_ur5
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.plant import PlantSetup
 from servobench.plant.contract import lanes
@@ -15,7 +15,7 @@ from servobench.plant.contract.faults import PlantDiverged
 from servobench.plant.contract.signals import Command
 from servobench.plant.kinematic import KinematicConfig, KinematicWorld
 from servobench.plant.robot.hand_eye import TrueJacobian
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 
 SEEDS = (11, 4, 7)
 MODELS = [mismatched("severe+gear_ratio=5%", seed) for seed in SEEDS]

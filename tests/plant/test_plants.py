@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kit.plants import ALL_PLANTS
+from kit.plants import ALL_PLANTS, nominal_ur5
 from servobench.harness.check.plants import check_plant
 from servobench.harness.config.registry import find_plant
 from servobench.plant.bench.plant import PlantEntry, PlantSetup
@@ -13,7 +13,7 @@ from servobench.plant.contract.sensing import vary_sensing
 from servobench.plant.contract.signals import Command
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
-from servobench.plant.robot.ur5 import HOME, nominal_ur5
+from servobench.plant.robot.ur5 import HOME
 
 PERIOD = 0.05
 COMMANDS = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 6))

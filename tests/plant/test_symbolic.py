@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from kit.plants import factory_ur5, nominal_ur5
 from servobench.plant.cameras.symbolic import feature_and_jacobian, geometry_of, symbolic_feature
 from servobench.plant.robot.arm import SerialArm
 from servobench.plant.robot.hand_eye import HandEyeModel
-from servobench.plant.robot.ur5 import nominal_ur5, ur5_arm_from_calibration
 
 
 def random_model(seed, n=6):
@@ -28,7 +28,7 @@ def random_model(seed, n=6):
 def models():
     nominal = nominal_ur5()
     random = [random_model(seed, n) for seed, n in enumerate((6, 6, 6, 2, 3, 7, 8))]
-    return [nominal, HandEyeModel(ur5_arm_from_calibration(), nominal.X_BC), *random]
+    return [nominal, HandEyeModel(factory_ur5(), nominal.X_BC), *random]
 
 
 @pytest.mark.parametrize("model", models())

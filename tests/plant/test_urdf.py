@@ -3,6 +3,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from kit.plants import factory_ur5
 from servobench.plant.rendered.urdf import arm_mechanics, arm_urdf, bench_files, rectangles_obj, rpy_along, sphere_obj
 from servobench.plant.robot import ur5
 from servobench.plant.robot.arm import SerialArm
@@ -26,7 +27,11 @@ def perturbed_ur5() -> SerialArm:
     )
 
 
-ARMS = {"nominal": ur5.ur5_arm, "factory": ur5.ur5_arm_from_calibration, "perturbed": perturbed_ur5}
+ARMS = {
+    "nominal": ur5.ur5_arm,
+    "factory": factory_ur5,
+    "perturbed": perturbed_ur5,
+}
 
 
 @pytest.fixture(params=ARMS)

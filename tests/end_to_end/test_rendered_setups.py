@@ -8,11 +8,11 @@ import pytest
 from kit.rendered import IDEAL
 from servobench.harness.config.registry import find_plant, scene_of
 from servobench.plant.bench.plant import PlantSetup
-from servobench.plant.cameras.eye import Eye
 from servobench.plant.cameras.registry import Sensing
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.contract.faults import FeatureLost
 from servobench.plant.contract.signals import Command
-from servobench.plant.rendered.detectors import open_sight
+from servobench.plant.rendered.detectors import open_detector
 from servobench.plant.rendered.room import Rig, Room
 from servobench.plant.rendered.settings import rendered_config
 from servobench.plant.robot.catalogue import find_robot
@@ -30,7 +30,7 @@ def true_model(word, robot=UR5):
 
 
 @pytest.fixture
-def open_eye(engine):
+def open_setup(engine):
     """A builder of noiseless plants under a sensing set-up, which are closed after the test."""
     plants = []
 
@@ -47,27 +47,27 @@ def open_eye(engine):
 def test_what_is_found_is_where_the_closed_form_has_it_and_no_disc_is_taken_for_another(word, engine):
     model, rng = true_model(word), np.random.default_rng(5)
     scene = scene_of(engine)(Room(model.arm, scenery=False, robot=UR5, rig=Rig.of(model, UR5)))
-    sight, errors, poses = open_sight(model, scene, IDEAL, UR5), [], 0
-    sight.reset(0)
+    detector, errors, poses = open_detector(model, scene, IDEAL, UR5), [], 0
+    detector.reset(0)
     while poses < 8:
         q = rng.uniform(UR5.workspace.lower, UR5.workspace.upper)
-        true, _, in_view = model.look(q)
+        true, _, in_view = model.observe(q)
         if not in_view.all():
             continue
         poses += 1
         scene.place(model.arm.joint_angle(q))
-        found, seen = sight.see(model, q), sight.visible()
+        found, seen = detector.measure(model, q)
         errors += [np.linalg.norm(each) for each in (found - true)[seen].reshape(-1, 2)]
     scene.close()
-    assert len(errors) > 0.6 * poses * model.eye.m / 2
+    assert len(errors) > 0.6 * poses * model.setup.m / 2
     assert np.median(errors) <= 0.2
     assert max(errors) < 5.0  # discs are 30 px apart or more
 
 
 @pytest.mark.parametrize("word", [*IN_PIXELS, "position:hand"])
-def test_a_plant_sees_its_target_from_the_start_and_follows_it(word, open_eye):
+def test_a_plant_sees_its_target_from_the_start_and_follows_it(word, open_setup):
     model = true_model(word)
-    plant = open_eye(model)
+    plant = open_setup(model)
     observation = plant.reset(0)
     assert observation.feature_valid
     for _ in range(4):
@@ -75,30 +75,30 @@ def test_a_plant_sees_its_target_from_the_start_and_follows_it(word, open_eye):
     truth = plant.truth()
     np.testing.assert_allclose(truth.feature, model.feature(observation.joint_position), atol=1e-9)
     assert np.linalg.norm(observation.feature - truth.feature) < (0.003 if word == "position:hand" else 1.0)
-    assert plant.picture().shape == (240, 320 * model.eye.cameras, 3)
+    assert plant.picture().shape == (240, 320 * model.setup.cameras, 3)
 
 
-def test_another_arm_carries_the_plate_at_its_own_scale(open_eye):
+def test_another_arm_carries_the_plate_at_its_own_scale(open_setup):
     panda, model = find_robot("panda"), true_model("plate", find_robot("panda"))
-    plant = open_eye(model, rendered_config(panda), panda.workspace.home, panda)
+    plant = open_setup(model, rendered_config(panda), panda.workspace.home, panda)
     assert plant.reset(0).feature_valid
 
 
-def test_a_hidden_disc_is_lost_alone_and_held(open_eye):
+def test_a_hidden_disc_is_lost_alone_and_held(open_setup):
     model = true_model("plate")
     points = model.points(HOME)
     towards = model.cameras[0][:3, 3] - points[2]
     box = (*(points[2] + 0.1 * towards), 0.03, 0.03, 0.03)
-    plant = open_eye(model, replace(IDEAL, obstacles=(box,), room_contact=False))
+    plant = open_setup(model, replace(IDEAL, obstacles=(box,), room_contact=False))
     with pytest.raises(FeatureLost, match="u3, v3 cannot be seen at the start"):
         plant.reset(0)
-    sight = plant.world
-    np.testing.assert_array_equal(sight.visible(), [True] * 4 + [False] * 2 + [True] * 2)
-    assert np.isfinite(sight.see()).all()
+    world = plant.world
+    np.testing.assert_array_equal(world.visible(), [True] * 4 + [False] * 2 + [True] * 2)
+    assert np.isfinite(world.see()).all()
 
 
-def test_a_saved_state_goes_on_with_the_same_bits(open_eye):
-    plant = open_eye(true_model("stereo"), replace(IDEAL, colour_noise=3.0))
+def test_a_saved_state_goes_on_with_the_same_bits(open_setup):
+    plant = open_setup(true_model("stereo"), replace(IDEAL, colour_noise=3.0))
     plant.reset(4)
     turn = Command(np.full(6, 0.2))
     plant.step(turn)
@@ -109,13 +109,13 @@ def test_a_saved_state_goes_on_with_the_same_bits(open_eye):
     assert np.std(np.subtract(first, [plant.step(turn).feature for _ in range(3)])) > 0.0
 
 
-def test_what_cannot_be_rendered_is_refused(open_eye):
+def test_what_cannot_be_rendered_is_refused(open_setup):
     model = true_model("pixel")
     with pytest.raises(ValueError, match="the images of pixel have 320 x 240 px and 60 deg"):
-        open_eye(model, replace(IDEAL, width=640))
-    two = Eye("two", "", ("a", "b", "c", "d"), "px", model.eye.measure, target=((0.0,) * 3, (0.1, 0.0, 0.0)))
+        open_setup(model, replace(IDEAL, width=640))
+    two = SensingSetup("two", "", ("a", "b", "c", "d"), "px", model.setup.measure, target=((0.0,) * 3, (0.1, 0.0, 0.0)))
     with pytest.raises(ValueError, match="a ball, of one point, or a plate with three or four discs"):
-        open_eye(replace(model, eye=two, target=np.array(two.target)))
-    deep = replace(model.eye, name="deep", measure=lambda points, optics: optics.focal * points[..., 0, 0, :2])
+        open_setup(replace(model, setup=two, target=np.array(two.target)))
+    deep = replace(model.setup, name="deep", measure=lambda points, optics: optics.focal * points[..., 0, 0, :2])
     with pytest.raises(ValueError, match="sensing deep needs depth, and the intrinsics"):
-        open_eye(replace(model, eye=deep))
+        open_setup(replace(model, setup=deep))

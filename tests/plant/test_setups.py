@@ -10,26 +10,26 @@ import numpy as np
 import pytest
 
 from kit.robots import FOUR_JOINTS
-from servobench.plant.cameras.eye import Eye
-from servobench.plant.cameras.model import NEAREST, EyeModel
+from servobench.plant.cameras.model import NEAREST, SetupModel
 from servobench.plant.cameras.optics import CAMERA, Optics, in_image, locate, project
 from servobench.plant.cameras.placement import HAND_DISTANCE, draw_cameras
-from servobench.plant.cameras.registry import EYES, FIXED, HAND, Sensing
+from servobench.plant.cameras.registry import FIXED, HAND, SETUPS, Sensing
+from servobench.plant.cameras.setups import SensingSetup
 from servobench.plant.cameras.symbolic import symbolic_feature
 from servobench.plant.contract.lanes import stack
 from servobench.plant.robot.catalogue import find_robot
 from servobench.plant.robot.mismatch import Mismatch, sample_mismatch
 
-WORDS = [str(Sensing(eye, mount)) for eye in EYES.values() for mount in (FIXED, HAND)]
+WORDS = [str(Sensing(eye, mount)) for eye in SETUPS.values() for mount in (FIXED, HAND)]
 MODELS = WORDS[1:]  # the first one is the arm's own model, which has tests of its own
 SEVERE = Mismatch.parse("severe+gear_ratio=5%")
 
 
-def true_model(word: str, seed: int = 0, mismatch: Mismatch = SEVERE, robot: str = "ur5") -> EyeModel:
+def true_model(word: str, seed: int = 0, mismatch: Mismatch = SEVERE, robot: str = "ur5") -> SetupModel:
     arm = find_robot(robot)
     true, sample = sample_mismatch(mismatch, arm, seed)
     model, _ = Sensing.parse(word).true(arm, true, sample, mismatch, seed)
-    assert isinstance(model, EyeModel)
+    assert isinstance(model, SetupModel)
     return model
 
 
@@ -47,7 +47,7 @@ def test_the_jacobian_is_that_of_casadi_and_of_finite_differences(word):
     derivative = casadi.Function("J", [q], [casadi.jacobian(function(q), q)])
     checked = 0
     for posture in postures(40):
-        y, J, seen = model.look(posture)
+        y, J, seen = model.observe(posture)
         if not seen.all():
             continue
         checked += 1
@@ -67,7 +67,7 @@ def test_interaction_matrix_and_motions_of_points_make_the_jacobian_of_casadi(wo
     jacobian = casadi.Function("J", [x := casadi.SX.sym("q", 6)], [casadi.jacobian(q(x), x)])
     for posture in postures(10):
         points, motions = model.point_motions(posture)
-        if (points[..., 2] < NEAREST * model.distance).any() or not model.visible(posture).all():
+        if (points[..., 2] < NEAREST * model.distance).any() or not model.valid(posture).all():
             continue
         made = model.interaction(model.feature(posture), points[..., 2]) @ motions
         np.testing.assert_allclose(made.reshape(-1, 6), np.array(jacobian(posture)), rtol=1e-6, atol=1e-6)
@@ -127,7 +127,7 @@ def test_the_planned_cameras_see_the_target_in_the_middle_at_home(word, robot):
     arm = find_robot(robot)
     model = Sensing.parse(word).nominal(arm)
     home = arm.workspace.home
-    assert model.visible(home).all()
+    assert model.valid(home).all()
     middle = model.points(home).mean(axis=0)
     for pose in model.cameras:
         ahead = (middle - pose[:3, 3]) @ pose[:3, :3]
@@ -142,7 +142,9 @@ def test_a_metre_across_the_sight_changes_a_pixel_by_the_scale(word):
     model = Sensing.parse(word).nominal(find_robot("ur5"))
     pose, step = model.cameras[0], 1e-6
     ahead = pose[:3, 3] + model.distance * pose[:3, 2]
-    there, here = (model.seen((ahead + side * pose[:3, 0])[None].repeat(len(model.target), 0)) for side in (step, 0.0))
+    there, here = (
+        model.feature_at((ahead + side * pose[:3, 0])[None].repeat(len(model.target), 0)) for side in (step, 0.0)
+    )
     np.testing.assert_allclose((there - here)[0] / step, model.channel.scale, rtol=1e-6)
 
 
@@ -161,9 +163,9 @@ def test_cameras_on_the_hand_do_not_see_how_the_base_stands():
 def test_a_lane_has_the_bits_of_a_single_run(word):
     models = [true_model(word, seed) for seed in range(3)]
     q = postures(3)
-    together = stack(models).look(q)
+    together = stack(models).observe(q)
     for lane, (model, posture) in enumerate(zip(models, q, strict=True)):
-        for many, one in zip(together, model.look(posture), strict=True):
+        for many, one in zip(together, model.observe(posture), strict=True):
             np.testing.assert_array_equal(many[lane], one)
 
 
@@ -179,7 +181,7 @@ def test_only_the_disc_that_leaves_the_image_is_lost_and_none_is_seen_from_behin
     pose = model.cameras[0]
 
     def seen(points: np.ndarray) -> list[bool]:
-        return model.in_view(points @ pose[:3, :3].T + pose[:3, 3]).tolist()
+        return model.valid_at(points @ pose[:3, :3].T + pose[:3, 3]).tolist()
 
     square = np.array([[-0.1, -0.1, 0.65], [0.1, -0.1, 0.65], [0.1, 0.1, 0.65], [-0.1, 0.1, 0.65]])
     assert all(seen(square))
@@ -192,7 +194,7 @@ def test_a_camera_that_loses_the_ball_makes_its_own_features_invalid_only():
     model = Sensing.parse("stereo").nominal(find_robot("ur5"))
     pose = model.cameras[0]
     high = pose[:3, 3] - 0.3 * pose[:3, 2]  # behind the camera above, before the one in front
-    assert model.in_view(high[None])[:2].tolist() == [False, False]
+    assert model.valid_at(high[None])[:2].tolist() == [False, False]
 
 
 def test_draws_of_the_optics_stay_within_their_magnitudes_and_do_not_depend_on_the_number_of_cameras():
@@ -228,7 +230,7 @@ def test_a_camera_that_is_moved_turns_about_what_it_looks_at(word):
     model = Sensing.parse(word).nominal(robot)
     moved = model.turned(np.array([0.0, 0.0, 0.7]), robot.workspace.centre)
     pivot = model.pivot(robot.workspace.centre)
-    np.testing.assert_allclose(moved.seen(pivot[None])[:2], model.seen(pivot[None])[:2], rtol=1e-9)
+    np.testing.assert_allclose(moved.feature_at(pivot[None])[:2], model.feature_at(pivot[None])[:2], rtol=1e-9)
     np.testing.assert_array_equal(moved.cameras[1:], model.cameras[1:])
     assert not np.allclose(moved.camera, model.camera)
 
@@ -262,7 +264,7 @@ def test_a_plate_needs_six_joints(tmp_path):
 
 
 def test_features_without_a_derivative_are_differentiated():
-    exact = EYES["pixel"]
+    exact = SETUPS["pixel"]
     numeric = replace(exact, rates=None)
     rng = np.random.default_rng(0)
     points = rng.normal(size=(4, 1, 1, 3)) * 0.2 + [0.0, 0.0, 1.0]
@@ -274,5 +276,5 @@ def test_features_without_a_derivative_are_differentiated():
 
 
 def test_a_set_up_is_a_value_that_can_be_compared():
-    assert Eye("pixel", "", ("u",), "px", project) != EYES["pixel"]
-    assert Sensing.parse("pixel") == Sensing(EYES["pixel"])
+    assert SensingSetup("pixel", "", ("u",), "px", project) != SETUPS["pixel"]
+    assert Sensing.parse("pixel") == Sensing(SETUPS["pixel"])

@@ -1,0 +1,124 @@
+"""Tasks of users: a file, a module or a published entry point brings one, and each refusal is one line."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import servobench
+from kit.command import judged
+from kit.command import servobench as command
+from kit.documents import blocks
+from kit.own import write
+from servobench.harness.config.registry import offering
+from servobench.harness.config.settings import ConfigurationError
+from servobench.harness.run import tasks
+from servobench.harness.run.tasks import TASKS, choose_task, find_task
+
+PAGE = Path(__file__).parents[2] / "docs" / "plants.md"
+(SPIRAL,) = (block for block in blocks(PAGE.read_text(encoding="utf-8"), "python") if "class Spiral" in block)
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+WRONG = "from servobench import TaskEntry\nENTRY = TaskEntry('wrong', 'a number', 3)"
+
+
+def test_a_task_of_a_file_is_carried_out_with_its_settings_and_recorded(tmp_path):
+    write(tmp_path, SPIRAL, "spiral.py")
+    run = servobench.run("ukf_mfac", task="./spiral.py", seed=1, settings={"Spiral": {"duration": 2.0}})
+    assert (run.row["task"], run.row["status"], run.row["periods"]) == ("Spiral", "completed", 40)
+    assert run.row["run_id"] == "kinematic-ukf_mfac-Spiral-moderate-1"
+    reached = run.steps.filter(regex="^reference_").to_numpy()[-1]
+    np.testing.assert_allclose(np.hypot(*reached[:2]), 0.1, rtol=0.05)
+
+
+def test_worker_processes_carry_out_the_same_task_and_the_manifest_names_its_file(tmp_path):
+    write(tmp_path, SPIRAL, "spiral.py")
+    tables = [
+        servobench.compare(["constant"], tasks=["./spiral.py", "exp1"], seeds=2, workers=workers, out=out,
+                           settings={"exp1": {"duration": 1.0}})
+        for workers, out in ((1, "one"), (2, "two"))
+    ]  # fmt: skip
+    pd.testing.assert_frame_equal(*map(judged, tables), check_exact=True)
+    manifest = json.loads((tmp_path / "two" / "manifest.json").read_text())
+    assert manifest["own_tasks"]["Spiral"]["place"] == "./spiral.py"
+    assert "spiral.py" in " ".join(manifest["files"])
+
+
+def test_the_command_line_takes_a_task_of_a_file_and_shows_its_settings(tmp_path, monkeypatch, capsys):
+    write(tmp_path, SPIRAL, "spiral.py")
+    assert command(monkeypatch, "tasks", "./spiral.py") == 0
+    assert "Spiral.radius = 0.1" in capsys.readouterr().out
+    options = ("--plants", "kinematic", "--controllers", "constant", "--tasks", "round=./spiral.py", "--out", "runs")
+    assert command(monkeypatch, "compare", *options, "--set", "round.radius=0.2") == 0
+    assert servobench.load("runs").runs["task"].unique().tolist() == ["round"]
+
+
+def test_a_task_fits_itself_to_another_robot(tmp_path):
+    write(tmp_path, SPIRAL, "spiral.py")
+    run = servobench.run("constant", task="./spiral.py", robot="ur3e", mismatch="none")
+    assert run.row["status"] == "completed"
+    assert run.steps.filter(regex="^reference_x").to_numpy().max() < 0.09
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "words"),
+    [
+        (SPIRAL, "./spirals.py", "there is no file ./spirals.py: did you mean 'spiral.py'?"),
+        ("x = 1", "./spiral.py", "./spiral.py defines no task: no subclass of servobench.Task and no ENTRY"),
+        (SPIRAL.replace("radius: float = 0.1", "radius: float"), "./spiral.py", "of Spiral needs a default; radius"),
+        (SPIRAL.replace("def scenario", "def scenery"), "./spiral.py", "class Spiral lacks scenario, which it must"),
+        (SPIRAL, "circle=./spiral.py", "a task called 'circle' exists already; give yours another name"),
+        (SPIRAL, "kinematic=./spiral.py", "a plant called 'kinematic' exists already"),
+        (SPIRAL, "./spiral.py:Helix", "./spiral.py has no 'Helix'"),
+        (WRONG, "./spiral.py", "the settings of a task must be a dataclass below Task, got int"),
+        (SPIRAL, "spiral", "did you mean your file './spiral.py'?"),
+        (SPIRAL, "exp9", "unknown task 'exp9'"),
+    ],
+    ids=range(10),
+)  # fmt: skip
+def test_a_task_that_cannot_be_used_is_refused_in_a_line(tmp_path, text, place, words):
+    write(tmp_path, text, "spiral.py")
+    with offering(), pytest.raises(ConfigurationError, match=re.escape(words)) as refused:
+        choose_task(place)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_task_that_fails_to_make_its_scenario_is_refused_with_its_reason(tmp_path):
+    broken = SPIRAL.replace("        times =", '        raise ValueError("the spiral is too tight")\n        times =')
+    write(tmp_path, broken, "spiral.py")
+    with pytest.raises(ConfigurationError, match="task Spiral: the spiral is too tight"):
+        servobench.run("constant", task="./spiral.py")
+
+
+def test_a_published_task_is_found_by_its_name(tmp_path, monkeypatch):
+    write(tmp_path, SPIRAL, "spirals.py")
+    information = tmp_path / "spirals-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: spirals\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(
+        "[servobench.tasks]\nspiral = spirals:Spiral\ncircle = spirals:Spiral\nlost = spirals:Lost\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for function in (tasks._published, tasks._load):
+        function.cache_clear()
+    try:
+        assert find_task("spiral").summary == "A spiral from the middle of the image outwards."
+        assert find_task("circle") is TASKS["circle"]
+        with pytest.raises(ConfigurationError, match=r"task 'lost' \(spirals:Lost\) cannot be loaded"):
+            find_task("lost")
+        run = servobench.run("constant", task="spiral")
+        assert run.row["status"] == "completed"
+    finally:
+        monkeypatch.undo()
+        for function in (tasks._published, tasks._load):
+            function.cache_clear()
